@@ -20,7 +20,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from walop_jax.model.cameras import DetectorPart, ExposurePart, GhostPart, Mixing, Transmission
-from walop_jax.model.effects.change import KINDS, OPPOSITE, AtPoint, Change, Kind, Scalar, Term, in_exposures
+from walop_jax.model.effects.change import (
+    KINDS,
+    OPPOSITE,
+    AtPoint,
+    Change,
+    Grows,
+    Kind,
+    Scalar,
+    Term,
+    in_exposures,
+)
 from walop_jax.model.effects.factors import COUNTS, EXPOSURE, FIELD, WAVELENGTH
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Component, unknown_name
@@ -136,8 +146,6 @@ def stage_of(change: Change) -> str:
 def _patch(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """The instrument with changes that act at one stage."""
     stage = stage_of(terms[0][0])
-    for change, _ in terms:
-        change.grows_only(*_GROWS.get(stage, ()), angle=None)
     if stage in ADDED:
         return instrument.with_part("detectors", OfDetectors.of(instrument, terms, stage=stage))
     if stage == "throughput":
@@ -155,7 +163,7 @@ def _patch(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return instrument.with_part("mixing", CrossTalk(tuple(size for _, size in terms), pairs))
 
 
-_GROWS: Mapping[str, tuple[str, ...]] = {
+_WITH: Mapping[str, tuple[str, ...]] = {
     "square": (COUNTS, EXPOSURE),
     "reported": (EXPOSURE,),
     "median": (EXPOSURE,),
@@ -163,12 +171,18 @@ _GROWS: Mapping[str, tuple[str, ...]] = {
     "throughput": (FIELD,),
     "counts": (FIELD, EXPOSURE),
 }
+
+
+def _grows(instrument: Instrument, change: Change) -> Grows:
+    return Grows(_WITH.get(stage_of(change), ()), None)
+
+
 _OF_GAINS = "a lamp that does not change, seen by all cameras in turn"
 KINDS |= {
-    "gain": Kind("share", _patch, stage_of, _OF_GAINS),
-    "reported gain": Kind("share", _patch, stage_of, _OF_GAINS),
-    "afterglow": Kind("share", _patch, stage_of, "a dark exposure after a bright one"),
-    "light": Kind("share", _patch, stage_of, "the same field points at another flux, and darks"),
+    "gain": Kind("share", _patch, stage_of, _OF_GAINS, _grows),
+    "reported gain": Kind("share", _patch, stage_of, _OF_GAINS, _grows),
+    "afterglow": Kind("share", _patch, stage_of, "a dark exposure after a bright one", _grows),
+    "light": Kind("share", _patch, stage_of, "the same field points at another flux, and darks", _grows),
 }
 
 

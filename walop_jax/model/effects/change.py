@@ -55,18 +55,29 @@ AMPLITUDES = {
 """Amplitudes of changes, by the parameter of `described` that holds them."""
 
 
+class Grows(NamedTuple):
+    """Dependences that a change may have (`Factor.depends_on`), and which of angles and single exposures.
+
+    Of angles that of one element, by the prefix of its columns; None: of any, and in single exposures as well.
+    """
+
+    allowed: tuple[str, ...] = ()
+    angle: str | None = ""
+
+
 @dataclasses.dataclass(frozen=True)
 class Kind:
     """A kind of change: one of `AMPLITUDES`, what changes of some amplitudes make of an instrument, what would show it.
 
-    Changes for which `patch` and `together` are equal are patched together. `patch` raises `NoSuchPlaceError` where an
-    instrument has no such place, ValueError for a change that cannot be made.
+    Changes for which `patch` and `together` are equal are patched together. `patch` and `grows` raise
+    `NoSuchPlaceError` where an instrument has no such place, ValueError for a change that cannot be made.
     """
 
     parameter: str
     patch: Callable[[Instrument, Sequence[Term]], Instrument]
     together: Callable[[Change], Hashable] = lambda change: change
     test: str = ""
+    grows: Callable[[Instrument, Change], Grows] = lambda instrument, change: Grows()
 
 
 KINDS: dict[str, Kind] = {}
@@ -141,12 +152,9 @@ class Change:
         """Product of its factors for a ray, in an element that stands at `angle` (deg)."""
         return self.factor(_InTrain(ray, angle))
 
-    def grows_only(self, *allowed: str, angle: str | None = "") -> None:
-        """Raise ValueError for a factor that would be left out: one that depends on nothing of `allowed` (`Factor`).
-
-        Of harmonics those of another element than `angle` (None: of any) would be; of single exposures those where
-        `angle` is not None, since the optics know no exposures.
-        """
+    def check_factors(self, instrument: Instrument) -> None:
+        """Raise ValueError for a factor that the kind would leave out."""
+        allowed, angle = KINDS[self.kind].grows(instrument, self)
         for one in self.grows_with:
             known = angle is None or (one.form in ("cos", "sin") and one.given[-1] == angle)
             single = one.form in ("cos", "sin", "exposure")
@@ -207,6 +215,7 @@ def patched(instrument: Instrument, terms: Iterable[Term]) -> Instrument:
     """The instrument with changes of some amplitudes; those of one place that act together are combined."""
     together: dict[tuple[Any, Hashable], list[Term]] = {}
     for change, size in terms:
+        change.check_factors(instrument)
         kind = KINDS[change.kind]
         together.setdefault((kind.patch, kind.together(change)), []).append((change, size))
     for (patch, _), some in together.items():
@@ -234,7 +243,7 @@ class _InTrain:
         return getattr(known, name)
 
     def angle(self, prefix: str) -> Any:
-        """That of the element itself, the only one that the optics know (`Change.grows_only`)."""
+        """That of the element itself, the only one that the optics know (`Grows`)."""
         return jnp.deg2rad(self.axis)
 
 

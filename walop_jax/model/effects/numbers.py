@@ -6,7 +6,7 @@ from collections.abc import Hashable, Sequence
 
 import jax.numpy as jnp
 
-from walop_jax.model.effects.change import BAND, KINDS, SKY, Change, Kind, Term, add
+from walop_jax.model.effects.change import BAND, KINDS, SKY, Change, Grows, Kind, Term, add
 from walop_jax.model.effects.factors import EXPOSURE, FIELD, WAVELENGTH
 from walop_jax.model.elements import WavePlate
 from walop_jax.model.elements.wave_plate import Grown
@@ -20,9 +20,15 @@ OF_SOURCES = ("polarisation q", "polarisation u", "polarisation")
 def _number(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """Add to a number of the polariser; it has the name of the kind."""
     for change, size in terms:
-        change.grows_only()
         instrument = instrument.changed(change.place, **{change.kind: add(size)})
     return instrument
+
+
+def _with_ray(instrument: Instrument, change: Change) -> Grows:
+    """Plates with what a ray knows, and with their own angle."""
+    holders = [p for p in instrument.places(WavePlate) if f"{change.place}.".startswith(f"{p}.")]
+    moves = instrument.element(holders[0]).moves if holders else None
+    return Grows((FIELD, WAVELENGTH, EXPOSURE), moves or "")
 
 
 def _of_plate(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -31,9 +37,6 @@ def _of_plate(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
         if not change.factors:
             instrument = instrument.changed(change.place, **{change.kind: add(size)})
             continue
-        holders = [p for p in instrument.places(WavePlate) if f"{change.place}.".startswith(f"{p}.")]
-        moves = instrument.element(holders[0]).moves if holders else None
-        change.grows_only(FIELD, WAVELENGTH, EXPOSURE, angle=moves or "")
         grown = Grown(size, jnp.zeros(()), change)
         instrument = instrument.changed(change.place, grown=lambda there, one=grown: (*there, one))
     return instrument
@@ -42,7 +45,6 @@ def _of_plate(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 def _of_instrument(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """Add to a number of the instrument as a whole, at the only place that it has."""
     for change, size in terms:
-        change.grows_only()
         place, field = {"shift": (BAND, "filter_shift"), "rotator": (SKY, "rotator_zero")}[change.kind]
         if change.place != place:
             raise unknown_name(f"place of {change.kind}", change.place, (place,))
@@ -60,8 +62,6 @@ def _polarised(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     change, size = terms[0]
     if change.place != SKY:
         return _of_star(instrument, terms)
-    for one, _ in terms:
-        one.grows_only(*([] if change.kind == "polarisation" else [EXPOSURE]), angle=None)
     if change.kind == "polarisation":
         return instrument.changed("sky", missing=lambda p: -size if p is None else p - size)
     positions = tuple(dict.fromkeys(one.number for one, _ in terms))
@@ -73,10 +73,14 @@ def _polarised(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return instrument.changed("sky", patches=lambda there: here if there is None else there.joined(here))
 
 
+def _of_patch(instrument: Instrument, change: Change) -> Grows:
+    """Of one patch of the sky, which is an exposure."""
+    return Grows((EXPOSURE,), None) if change.place == SKY and change.kind != "polarisation" else Grows()
+
+
 def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     names = [name.replace(" ", "_") for name in instrument.standard.names]
     for change, size in terms:
-        change.grows_only()
         axis = change.kind.removeprefix("polarisation").strip()
         if change.place not in names or not axis:
             known = [f"polarisation q of {name}" for name in names]
@@ -91,11 +95,11 @@ def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 NUMBERS = {"axis": "angle", "cut": "angle", "thickness": "length", "thermal": "number"}
 """Kinds that are numbers of wave plates, of layers of them (µm, deg), and their amplitudes."""
-KINDS |= {name: Kind(amplitude, _of_plate) for name, amplitude in NUMBERS.items()}
+KINDS |= {name: Kind(amplitude, _of_plate, grows=_with_ray) for name, amplitude in NUMBERS.items()}
 KINDS |= {name: Kind("share", _number) for name in ("extinction", "ellipticity")}
 _OF_BAND = "narrow bands beside the broad one"  # filters wider than `light.BROAD` are displaced
 KINDS["shift"] = Kind("wavelength", _of_instrument, test=_OF_BAND)
 _OF_ROTATOR = "a polariser aligned in the laboratory: an independent zero of the angle"
 KINDS["rotator"] = Kind("angle", _of_instrument, test=_OF_ROTATOR)
 _OF_SOURCE = "the same patch or star again at another ROTATOR angle"
-KINDS |= {name: Kind("share", _polarised, _patches, _OF_SOURCE) for name in OF_SOURCES}
+KINDS |= {name: Kind("share", _polarised, _patches, _OF_SOURCE, _of_patch) for name in OF_SOURCES}

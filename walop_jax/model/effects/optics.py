@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.model import mueller
-from walop_jax.model.effects.change import KINDS, AtPoint, Change, Kind, Scalar, Term, in_exposures
+from walop_jax.model.effects.change import KINDS, AtPoint, Change, Grows, Kind, Scalar, Term, in_exposures
 from walop_jax.model.effects.factors import EXPOSURE, FIELD, PLAIN, SHAPE, WAVELENGTH
 from walop_jax.model.elements import AddedPolarisation, AirGap
 from walop_jax.model.elements.base import Element, Mueller
@@ -140,17 +140,23 @@ def _beside(instrument: Instrument, element: Element, change: Change) -> Instrum
     return instrument.inserted(element, **{"before" if change.where == "ahead of" else "after": change.place})
 
 
+def _grows(instrument: Instrument, change: Change) -> Grows:
+    """Optics with what a ray knows, and with the angle of the element that they are of; the polariser by exposure."""
+    if change.where != "of":
+        return Grows((FIELD, WAVELENGTH, EXPOSURE))
+    polariser = instrument.polariser
+    if polariser is not None and change.place == polariser.name:
+        return Grows((FIELD, EXPOSURE), None)
+    return Grows((FIELD, WAVELENGTH, EXPOSURE), instrument.element(change.place).moves or "")
+
+
 def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """One more element at the place; of an element that moves, or of the polariser: in the beam only when it is."""
     change, polariser = terms[0][0], instrument.polariser
     if change.where == "of" and polariser is not None and change.place == polariser.name:
-        for one, _ in terms:
-            one.grows_only(FIELD, EXPOSURE, angle=None)
         film = PolariserFilm(**_columns(terms))
         return instrument.changed(change.place, films=lambda films: (*films, film))
     moves = instrument.element(change.place).moves if change.where == "of" else None
-    for one, _ in terms:
-        one.grows_only(FIELD, WAVELENGTH, EXPOSURE, angle=moves or "")
     return _beside(instrument, Terms(name="described", moves=moves, **_columns(terms)), change)
 
 
@@ -158,31 +164,37 @@ def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """(0, q, u, 0) per unit of light added, as mirrors of a telescope do to weakly polarised light."""
     own: dict[str, Any] = {"q": jnp.zeros(()), "u": jnp.zeros(())}
     for one, size in terms:
-        one.grows_only()
         own[one.kind[-1]] = own[one.kind[-1]] + size
     return _beside(instrument, AddedPolarisation(name="described", **own), terms[0][0])
 
 
 def _displaced(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    for change, _ in terms:
-        change.grows_only(FIELD, EXPOSURE)
     return instrument.inserted(Displaced(name="described", **_columns(terms)), before=terms[0][0].place)
 
 
 def _fringes(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     for change, size in terms:
-        change.grows_only(SHAPE)
         instrument = with_air_gap(instrument, change.place, size, jnp.asarray(change.gap))
     return instrument
 
 
-KINDS |= {f"retardance {axis}": Kind("retardance", _optics, _at) for axis in AXES}
-KINDS |= {f"diattenuation {axis}": Kind("share", _optics, _at) for axis in AXES}
-KINDS |= {"depolarisation": Kind("share", _optics, _at), "turn": Kind("angle", _optics, _at)}
+_OPTICAL = {f"retardance {axis}": "retardance" for axis in AXES} | {
+    "depolarisation": "share",
+    "turn": "angle",
+}
+_OPTICAL |= {f"diattenuation {axis}": "share" for axis in AXES}
+KINDS |= {name: Kind(amplitude, _optics, _at, grows=_grows) for name, amplitude in _OPTICAL.items()}
 KINDS |= {f"added polarisation {axis}": Kind("share", _added, _at) for axis in "qu"}
 _OF_FIELD = "the same angles at several hour angles, and a star at known pixels in each"
 KINDS |= {
-    name: Kind("displacement", _displaced, lambda change: change.place, _OF_FIELD) for name in DISPLACEMENTS
+    name: Kind(
+        "displacement",
+        _displaced,
+        lambda change: change.place,
+        _OF_FIELD,
+        lambda *_: Grows((FIELD, EXPOSURE)),
+    )
+    for name in DISPLACEMENTS
 }
 _OF_FRINGES = "narrow bands a nanometre apart, or the same band at another temperature"
-KINDS["fringes"] = Kind("share", _fringes, test=_OF_FRINGES)
+KINDS["fringes"] = Kind("share", _fringes, test=_OF_FRINGES, grows=lambda *_: Grows((SHAPE,)))
