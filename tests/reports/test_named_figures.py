@@ -20,9 +20,10 @@ from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model import mueller
 from walop_jax.paper.wavelength import plate_retardances, retardance
-from walop_jax.reports.named import FIGURES, FigureSource, draw, possible
+from walop_jax.reports.named import FIGURES, draw, possible
 from walop_jax.reports.paper_figures import retardance_figure, retardance_wavelength_figure
 from walop_jax.reports.posterior_figures import informed
+from walop_jax.reports.run import FigureSource
 from walop_jax.reports.style import element_kind
 from walop_jax.simulation.simulate import simulate
 

@@ -58,8 +58,9 @@ def plot(
     """
     from walop_jax import Run
     from walop_jax.io.atomic import check_output
-    from walop_jax.reports.named import FIGURES, FigureSource, draw, possible
+    from walop_jax.reports.named import FIGURES, draw, possible
     from walop_jax.reports.posterior_figures import save_figure
+    from walop_jax.reports.run import FigureSource
     from walop_jax.reports.style import Canvas
 
     catalogue = catalogue_of(effects)

@@ -138,8 +138,9 @@ def _writers(product: Calibration, posterior: PosteriorSample) -> Writers:
     from walop_jax.io.plain_tables import write_table
     from walop_jax.io.text import json_text
     from walop_jax.posterior import write_posterior
-    from walop_jax.reports.named import FigureSource, draw
+    from walop_jax.reports.named import draw
     from walop_jax.reports.posterior_figures import save_figure
+    from walop_jax.reports.run import FigureSource
 
     intervals = posterior.to_table()
     figures = FigureSource.of(posterior)

@@ -3,133 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from walop_jax.calibration import PRODUCT, Calibration, MatrixMaps
-from walop_jax.diagnosis.figure_data import FIGURE_DATA, DiagnosisFigureData, figure_data, read_figure_data
-from walop_jax.diagnosis.findings import Diagnosis
-from walop_jax.diagnosis.limits_found import DetectionLimits
-from walop_jax.fit.refit import FitResult
+from walop_jax.calibration import PRODUCT
+from walop_jax.diagnosis.figure_data import FIGURE_DATA
 from walop_jax.io.errors import fail, nearest
-from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.paper.polynomial import TERMS
-from walop_jax.posterior import PosteriorSample, Run
 from walop_jax.posterior.files import LIMITS, POSTERIOR
 from walop_jax.reports import diagnosis_figures, figures, paper_figures, posterior_figures
-from walop_jax.reports.run import read_limits
-from walop_jax.reports.style import PAGE, AnyFigure, Canvas
+from walop_jax.reports.run import FigureSource
+from walop_jax.reports.style import AnyFigure
 from walop_jax.reports.wording import PLATES, listed
 from walop_jax.science.field_accuracy import field_accuracy
-
-Drawable = FitResult | Calibration | Diagnosis | PosteriorSample | Run
-_IN_MEMORY = {PRODUCT: "product", POSTERIOR: "posterior", FIGURE_DATA: "figure_data"}
-"""Attributes in which a result in memory holds what the file of a run would."""
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class FigureSource(Run):
-    """The run that a figure is drawn from; what it needs and is not there is a `DataError`.
-
-    `parameters` are coefficients by name; `place` (deg) is a field point; `step` numbers the effects of a diagnosis;
-    `reference` are values to be marked, by name; `canvas` is where to draw.
-    """
-
-    parameters: tuple[str, ...] = ()
-    place: tuple[float, float] = (0.0, 0.0)
-    step: int = 1
-    reference: Mapping[str, float] | None = None
-    canvas: Canvas = PAGE
-
-    @classmethod
-    def of(cls, given: Drawable, **options: Any) -> FigureSource:
-        """Source of the figures of a result in memory, or of the folder of a run."""
-        if isinstance(given, Run):
-            return cls(given.folder, given.catalogue, given.data, **options)
-        made = cls(Path("in memory"), **options)
-        held: dict[str, Any] = {"documents": {}, "product": None, "calibration": None, "posterior": None}
-        if isinstance(given, PosteriorSample):
-            held |= {"posterior": given.to_arviz(), "sample": given}
-            model = None if given.likelihood is None else given.likelihood.model
-            held["prior_width"] = (
-                {} if model is None else {p.name: p.width or np.nan for p in model.parameters}
-            )
-        if isinstance(given, Diagnosis):
-            held["figure_data"] = figure_data(given)
-        fit = given.after if isinstance(given, Diagnosis) else given
-        if isinstance(fit, FitResult):
-            held |= {"calset": fit.calset, "likelihood": fit.likelihood}
-            fit = Calibration.from_fit(fit)
-        if isinstance(fit, Calibration):
-            held |= {"product": fit, "calibration": fit}
-        vars(made).update(held)
-        return made
-
-    def __contains__(self, name: str) -> bool:
-        """True where a file is there, or what it would hold is in memory."""
-        if "documents" in vars(self):
-            return vars(self).get(_IN_MEMORY.get(name, "")) is not None
-        return super().__contains__(name)
-
-    def wanted(self, name: str, advice: str) -> Path:
-        """As for any run; what is held in memory has no file."""
-        if "documents" not in vars(self):
-            return super().wanted(name, advice)
-        if name not in self:
-            raise fail(f"there is no {name} of this result in memory", advice=advice)
-        return self.folder / name
-
-    @functools.cached_property
-    def sample(self) -> PosteriorSample | None:
-        """A posterior in memory, which has the walkers as well."""
-        return None
-
-    @functools.cached_property
-    def figure_data(self) -> DiagnosisFigureData:
-        """Data of the figures of a diagnosis."""
-        return read_figure_data(self.wanted(FIGURE_DATA, "it comes with walop-jax diagnose"))
-
-    @functools.cached_property
-    def prior_width(self) -> Mapping[str, float]:
-        """Widths of the priors by name, as far as they are known."""
-        return {} if self.product is None else self.product.prior_width
-
-    @property
-    def examined(self) -> int:
-        """Number of the comparison of a diagnosis that is asked for."""
-        count = len(self.figure_data.comparisons) - 1
-        if self.step > count:
-            found = f"the diagnosis added {count or 'no'} effect{'s' if count != 1 else ''}"
-            raise fail(
-                f"step {self.step}: {found}", advice="step 0 compares the starting with the final model"
-            )
-        return self.step
-
-    @functools.cached_property
-    def likelihood(self) -> Likelihood:
-        """The likelihood of the data of the run under its model."""
-        return Likelihood.of(self.calset, self.rebuilt.model)
-
-    @property
-    def maps(self) -> MatrixMaps:
-        """The maps of the file, which need no model."""
-        return self.stored.maps
-
-    @property
-    def stored(self) -> Calibration:
-        """The calibration as its file holds it."""
-        self.wanted(PRODUCT, "give the RUN of walop-jax refit or diagnose")
-        assert self.product is not None
-        return self.product
-
-    @property
-    def limits(self) -> DetectionLimits:
-        """The detection limits of the data."""
-        return read_limits(self.wanted(LIMITS, "run walop-jax limits -o RUN first"))
 
 
 def _accuracy(source: FigureSource) -> AnyFigure:

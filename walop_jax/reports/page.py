@@ -36,7 +36,7 @@ from walop_jax.plans.plan import PLANNED
 from walop_jax.posterior.files import COMPARISON, EPOCH, LIMITS
 from walop_jax.posterior.result import interval_in_words
 from walop_jax.reports import diagnosis_figures, figures, survey_figures
-from walop_jax.reports.named import FigureSource, draw
+from walop_jax.reports.named import draw
 from walop_jax.reports.posterior_figures import unit_in_words
 from walop_jax.reports.run import RunContents, read_limits
 from walop_jax.reports.wording import (
@@ -102,7 +102,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
     quality = Quality(int(summary.get("quality", 0)))
     return {
         "run": run,
-        "name": run.folder.resolve().name,
+        "name": run.source.folder.resolve().name,
         "instrument": summary.get("instrument", "WALOP"),
         "summary": summary,
         "diagnosis": diagnosis,
@@ -143,7 +143,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
 
 def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
     """Next steps: words and a command line."""
-    name = run.folder.resolve().name
+    name = run.source.folder.resolve().name
     sets = " ".join(str(entry["path"]) for entry in run.summary["inputs"]) or "CALSET"
     steps = [("correct stars", f"walop-jax apply {name} STARS.fits -o OUT.fits")] if trusted else []
     if run.diagnosis is None:
@@ -233,10 +233,10 @@ def _figures(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, str]
         made["matrix"] = figures.matrix_maps_figure(run.product.maps)
         made["errors"] = figures.matrix_errors_figure(run.product.maps)
         if run.product.residuals is not None:
-            made["residual_map"] = draw("residual-map", FigureSource(run.folder, data=run.data))
+            made["residual_map"] = draw("residual-map", run.source)
     if run.diagnosis is None and run.product is not None:
         with contextlib.suppress(ValueError, OSError):  # data that are not there: the page says so
-            made["fit_residuals"] = draw("residuals", FigureSource(run.folder, data=run.data))
+            made["fit_residuals"] = draw("residuals", run.source)
     if run.figure_data is not None:
         data = run.figure_data
         whole = data.comparisons[0]
