@@ -82,8 +82,10 @@ def test_a_plan_for_an_instrument_of_ones_own(call, tmp_path, monkeypatch):
     call("refit", "set.fits", "--instrument", "own.toml", "-o", "RUN")
     assert call("plot", "RUN", "modulation", "-o", "angles.png").exit_code == 0
     assert design_of("RUN").description.strip() == OWN.strip()
-    told = call("plan", "RUN", "--minutes", 20, "--criterion", "window.axis", "-o", "P").stderr
-    assert "where WIN may stand is not known; say moving = { WIN = [0, 22.5, 45] } in a plan" in told
+    told = call("plan", "RUN", "--minutes", 20, "--criterion", "window.delta", "-o", "P").stdout
+    assert "Moon patches are left out: the site is not known" in told
+    stops = json.loads(Path("P/plan.json").read_text())["exposures"]
+    assert {stop["positions"]["WIN"] for stop in stops} <= {0.0, 45.0}  # where it stood in the run
     told = call("compare", "set.fits", "--instrument", "RUN", "-o", "C").stderr
     assert "Paper II has a method for two arms of two cameras, which OWN is not" in told
     call("plan", "plan.toml", "--minutes", 20, "--criterion", "window.delta", "-o", "P")

@@ -12,6 +12,7 @@ from small_run import SEED, SMALL
 from walop_jax.data.calset import checked, from_arrays
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.fit.model_file import base_model
 from walop_jax.io.errors import DataError
 from walop_jax.simulation.simulate import simulate
 
@@ -49,6 +50,20 @@ def made(**changes) -> CalibrationSet:
 def test_what_belongs_to_another_instrument_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         made(**changes)
+
+
+def test_an_element_that_the_instrument_has_not_is_no_column_to_pass_over():
+    with pytest.raises(
+        ValueError, match="HPW_ANGLE is given, but the instrument has no .*; did you mean 'CHWP'"
+    ):
+        base_model(made(hpw_angle=22.5))
+
+
+@pytest.mark.parametrize("changes", [{"prior": (15.6, -0.1)}, {"start": np.nan}, {"scale": 0.0}])
+def test_values_of_a_parameter_that_mean_nothing_are_refused(changes):
+    (field,) = changes
+    with pytest.raises(ValueError, match=rf"parameter pupil\.magnification: {field} = .* must be"):
+        base_model(made()).change("pupil.magnification", **changes)
 
 
 def test_arrays_come_back():

@@ -103,6 +103,8 @@ def test_figures_go_into_axes_and_hold_fonts_that_journals_take(fitted):
     assert b"/CIDFontType2" in stream.getvalue()
     with pytest.raises(TypeError, match="colour"):
         walop.plot(calibration, "matrix", colour="red")
+    with pytest.raises(TypeError, match=r"\bax\b"):
+        walop.plot(calibration, "matrix", ax=np.array([right, right]))
 
 
 def test_modulation_is_that_of_the_data(fitted):

@@ -11,9 +11,11 @@ from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, ObservingPlan
+    from walop_jax.data.records import Exposures
     from walop_jax.plans.plan import ExposurePlan
 
 PLAN, INSTRUMENT = "plan.toml", "instrument.toml"
+MOST_ANGLES = 24  # of a moving element, where a plan takes them from a run
 
 FOLDER = Option(f"Folder for {PLAN} and plan.json; without it the plan is printed only.", "RUN", Path, "-o")
 What = Annotated[
@@ -102,13 +104,12 @@ def plan(
     if candidates is not None:
         could = candidates
     elif could == "" and known is not None:
-        further = [one for one in known.design.moving() if one != CALIBRATION_PLATE]
-        if further:
-            raise fail(
-                f"where {' and '.join(further)} may stand is not known",
-                advice=f"say moving = {{ {further[0]} = [0, 22.5, 45] }} in a plan, and give --candidates PLAN.toml",
-            )
-        could = ObservingPlan(known.design) if known.design.description else known.instrument
+        moving = {
+            prefix: _stood_at(known.exposures, prefix)
+            for prefix in known.design.moving()
+            if prefix != CALIBRATION_PLATE
+        }
+        could = ObservingPlan(known.design if known.design.description else known.instrument, moving=moving)
     if not minutes > 0:
         raise fail("nothing can be observed in no time", advice="give --minutes")
     wanted = (
@@ -141,6 +142,20 @@ def plan(
         files=files,
         saved_as=PLANNED,
     )
+
+
+def _stood_at(exposures: Exposures, prefix: str) -> tuple[float | None, ...]:
+    """Angles (deg, None: out) at which a moving element stood in the exposures of a calibration."""
+    import numpy as np
+
+    position = exposures.position(prefix)
+    stood = np.unique(np.where(position.inside, np.mod(position.angle, 360.0).round(3), np.nan))
+    if len(stood) > MOST_ANGLES:
+        raise fail(
+            f"{prefix} stood at {len(stood)} angles, more than could be tried",
+            advice=f"say moving = {{ {prefix} = [0, 22.5, 45] }} in a plan, and give --candidates PLAN.toml",
+        )
+    return tuple(float(angle) if np.isfinite(angle) else None for angle in stood)
 
 
 def _alike(run: Path, known: Calibration) -> tuple[Any, ...]:

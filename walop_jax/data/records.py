@@ -54,6 +54,11 @@ class Site:
     longitude: float
     elevation: float
 
+    @property
+    def known(self) -> bool:
+        """True if all three numbers are finite."""
+        return bool(np.isfinite([self.latitude, self.longitude, self.elevation]).all())
+
 
 WAVELENGTHS = (0.2, 20.0)
 """Light of a camera (µm), from the ultraviolet to the thermal infrared."""

@@ -148,7 +148,8 @@ class Settings:
         known = tuple(moving)
         for prefix, angle in self.positions.items():
             if prefix not in known and np.isfinite(angle).any():
-                raise ValueError(f"the instrument has no moving element {prefix!r}; {nearest(prefix, known)}")
+                what = f"{prefix}_ANGLE is given, but the instrument has no moving element {prefix!r}"
+                raise ValueError(f"{what}; {nearest(prefix, known)}")
 
     # ----------------------------------------------------------------------------------- rows that agree
 

@@ -39,7 +39,8 @@ from typing import Any
 
 import tomlkit
 
-from walop_jax.data.records import CalibrationSet, Sources
+from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet, Sources
+from walop_jax.data.settings import Settings
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import parse_toml
@@ -231,7 +232,7 @@ def base_model(
 
     `instrument` is the one as designed, needed where its name is not one that comes with the package; `plates` and
     `throughput_degree` replace what it says. Raises `DataError` for an instrument that nobody knows, and ValueError
-    for one of another name than the set's.
+    for one of another name than the set's, or without a moving element that the set has in the beam.
 
     >>> walop.base_model(calset)["pupil.magnification"].prior
     (15.63, 0.05)
@@ -252,6 +253,8 @@ def base_model(
         raise ValueError(
             f"{instrument.name} has {len(instrument.cameras)} cameras, the data have {calset.cameras}"
         )
+    present = Settings.of(calset.exposures, (CALIBRATION_PLATE, *calset.exposures.moving))
+    present.check_moving(instrument.patched().moving())
     instrument = adapted(
         instrument,
         standards=list(zip(names, sources.q, sources.u, strict=True)),

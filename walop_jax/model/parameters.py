@@ -77,15 +77,22 @@ class Parameter:
         """Itself. Raises ValueError for a name that files could not hold, and for numbers that mean nothing."""
         if not NAME.fullmatch(self.name):
             raise ValueError(f"parameter {self.name!r}: a name has letters, digits and _ . + - * only")
-        if not np.isfinite(self.start):
-            raise ValueError(f"parameter {self.name}: start value {self.start} is not finite")
-        if self.prior is not None and not (np.isfinite(self.prior[0]) and self.prior[1] > 0):
-            raise ValueError(
-                f"parameter {self.name}: prior {self.prior} needs a finite mean and a width above 0"
-            )
-        if not self.scale > 0:
-            raise ValueError(f"parameter {self.name}: scale {self.scale} must be above 0")
+        if not _finite(self.start):
+            raise ValueError(f"parameter {self.name}: start = {self.start!r} must be a finite number")
+        if self.prior is not None:
+            both = isinstance(self.prior, tuple) and len(self.prior) == 2 and all(map(_finite, self.prior))
+            if not both or self.prior[1] <= 0:
+                raise ValueError(
+                    f"parameter {self.name}: prior = {self.prior!r} must be None, or the tuple (mean, standard "
+                    "deviation), finite and the second above 0"
+                )
+        if not (_finite(self.scale) and self.scale > 0):
+            raise ValueError(f"parameter {self.name}: scale = {self.scale!r} must be a number above 0")
         return self
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and bool(np.isfinite(value))
 
 
 def param(

@@ -90,12 +90,12 @@ class Model:
         return np.array([i for i, part in enumerate(parts) if part.startswith(f"{component}.")], int)
 
     def change(self, name: str, **changes: Any) -> Model:
-        """The model with fields of one parameter replaced."""
+        """The model with fields of one parameter replaced. Raises ValueError for values that mean nothing."""
         i = self.index(name)
         for field in changes:
             if field not in Parameter.__dataclass_fields__:
                 raise unknown_name("field of a parameter", field, Parameter.__dataclass_fields__)
-        changed = dataclasses.replace(self.parameters[i], **changes)
+        changed = dataclasses.replace(self.parameters[i], **changes).checked()
         return dataclasses.replace(
             self, parameters=(*self.parameters[:i], changed, *self.parameters[i + 1 :])
         )

@@ -233,7 +233,9 @@ class Could:
         """Numbers of what is up in the dark, and what to say of the rest."""
         if not total:
             return (), []
-        plan = self.plan
+        plan, what = self.plan, "Moon patches" if kind == "moon" else "standards"
+        if not plan.site.known:
+            return (), [f"{what} are left out: the site is not known; the description says it under [site]"]
         e = dataclasses.replace(
             plan,
             stops=tuple(Stop(None, plan.filter_names[0], kind=kind, number=i) for i in range(total)),
@@ -245,7 +247,6 @@ class Could:
         up = tuple(np.flatnonzero(high & dark).tolist())
         if len(up) == total:
             return up, []
-        what = "Moon patches" if kind == "moon" else "standards"
         why = "it is not dark" if not dark.all() else f"they are below {self.altitude:g}°"
         return up, [f"{total - len(up)} of {total} {what} are left out: {why}{self._better()}"]
 

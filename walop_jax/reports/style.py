@@ -58,6 +58,11 @@ class Canvas:
     ax: Axes | None = None
     figsize: tuple[float, float] | None = None
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.ax, Axes | None):
+            kind = type(self.ax).__name__
+            raise TypeError(f"ax: give one Axes of matplotlib, for instance ax=axes[0, 0], not {kind}")
+
     def figure(self, width: float, height: float) -> Any:
         """An empty figure; usual sizes in inches. Raises ValueError for axes that stand in no grid."""
         if self.ax is None:

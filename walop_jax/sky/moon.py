@@ -76,7 +76,7 @@ def body_direction(
             column="MJD",
             advice="subtract 2400000.5 from a Julian Date",
         )
-    if not np.all(np.isfinite([site.latitude, site.longitude, site.elevation])):
+    if not site.known:
         raise fail(
             "the site is not known", column="SITELAT, SITELONG, SITEELEV", advice="add them to the header"
         )
