@@ -54,7 +54,7 @@ def test_what_belongs_to_another_instrument_is_refused(changes, message):
 
 def test_an_element_that_the_instrument_has_not_is_no_column_to_pass_over():
     with pytest.raises(
-        ValueError, match="HPW_ANGLE is given, but the instrument has no .*; did you mean 'CHWP'"
+        ValueError, match=r"HPW_ANGLE is given, but the instrument has no .*; did you mean 'CHWP'"
     ):
         base_model(made(hpw_angle=22.5))
 
