@@ -16,7 +16,8 @@ from walop_jax.fit.refit import fit
 from walop_jax.instruments.description import parsed
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS
-from walop_jax.model.instrument import build
+from walop_jax.model.effects.change import Change
+from walop_jax.model.instrument import build, nominal_instrument
 from walop_jax.model.specification import effect_context
 from walop_jax.simulation.simulate import simulate
 
@@ -131,3 +132,23 @@ def test_grammar_of_another_instrument():
     assert "axis of main.plate.second" in said
     assert "light of left in right" in said
     assert not any("half1" in name or "O1" in name or "ahead of" in name for name in said)
+
+
+def test_steps_part_the_exposures_evenly_and_are_dated_between():
+    """Midway between exposures; of many exposures every fourth time at first, then all times of the neighbourhood."""
+    few = builders.exposures(*({"mjd": 61000.0 + hour / 24.0} for hour in (0, 1, 3, 4)))
+    assert candidates.starts_of_steps(few) == pytest.approx([0.5, 2.0, 3.5], abs=1e-6)
+    assert candidates.step_from(few, 2.0) == "hours 2.0 to 4.5"
+    instrument = nominal_instrument("WALOP-SOUTH")
+    many = builders.exposures(
+        *({"mjd": 61000.0 + hour / 24.0, "clp_angle": 3.0 * hour} for hour in range(65))
+    )
+    said = [p.group[0].sentences[0] for p in candidates.sentences(instrument, many, 25)]
+    steps = [text for text in said if text.startswith("axis of half1.plate * hours ")]
+    assert steps == [f"axis of half1.plate * hours {hour}.5 to 64.5" for hour in range(2, 64, 4)]
+    near = candidates.later_or_earlier(Change.parsed(steps[5]), many)
+    assert [change.text for change in near] == [
+        f"axis of half1.plate * hours {hour}.5 to 64.5" for hour in range(18, 27)
+    ]
+    assert candidates.later_or_earlier(Change.parsed("axis of half1.plate * hours"), many) == []
+    assert candidates.later_or_earlier(Change.parsed("axis of half1.plate * hours 1 to 2"), many) == []

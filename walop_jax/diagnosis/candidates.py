@@ -44,7 +44,7 @@ from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.etalon import GAPS, QUARTER
 from walop_jax.model.effects.numbers import OF_SOURCES
 from walop_jax.model.effects.optics import DISPLACEMENTS
-from walop_jax.model.elements import Polariser, PupilMapping, WavePlate
+from walop_jax.model.elements import Element, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.ray import CONDITIONS
@@ -176,6 +176,8 @@ def _fringes(change: Change) -> Iterator[Sentence]:
 LINEAR = ("diattenuation", "retardance")
 ALONE = ("diattenuation v", "retardance v", "depolarisation")
 NIGHT = 8.0  # hours without an exposure that part two nights
+STEPS = 16  # times of a step that are looked at first
+AFTER = 0.5  # hours behind the last exposure that a step ends
 HARMONICS = (1, 2)
 HARMONICS_OF_ENCODER = (1, 2, 3, 4, 5, 6)
 
@@ -225,6 +227,44 @@ def beside_names(
         else:
             alone.append(probe)
     return alone, parts
+
+
+# ------------------------------------------------------------------------------------------- steps within a night
+
+
+def hours_since_first(exposures: Exposures) -> Float[np.ndarray, " e"]:
+    """Hours since the first exposure."""
+    return (exposures.mjd - exposures.mjd.min()) * 24.0
+
+
+def starts_of_steps(exposures: Exposures) -> Float[np.ndarray, " s"]:
+    """Hours at which something may have changed: midway between exposures."""
+    hours = np.unique(hours_since_first(exposures))
+    return (hours[1:] + hours[:-1]) / 2.0
+
+
+def step_from(exposures: Exposures, start: float) -> str:
+    """The factor that is 1 from a time (hours) until the last exposure."""
+    return f"hours {_hours(start)} to {_end(exposures)}"
+
+
+def _end(exposures: Exposures) -> str:
+    return _hours(hours_since_first(exposures).max() + AFTER)
+
+
+def _hours(time: float) -> str:
+    return str(round(float(time), 4))  # to 0.4 s
+
+
+def later_or_earlier(sentence: Sentence, exposures: Exposures) -> list[Sentence]:
+    """The same step at every time between those of the steps beside it; none for what is no step."""
+    if len(sentence.factors) != 1 or not sentence.factors[0].endswith(f" to {_end(exposures)}"):
+        return []
+    starts = starts_of_steps(exposures)
+    at = int(np.argmin(np.abs(starts - float(sentence.grows_with[0].given[0]))))
+    reach = -(-len(starts) // STEPS)
+    near = starts[max(at - reach, 0) : at + reach + 1]
+    return [dataclasses.replace(sentence, factors=(step_from(exposures, start),)) for start in near]
 
 
 # -------------------------------------------------------------------------------------------------- the grammar
@@ -282,11 +322,19 @@ class _Asked:
         if self.kelvin:
             yield "kelvin"
 
+    def steps(self) -> Iterator[str]:
+        """From a time until the end: times that part the exposures evenly (`later_or_earlier` has those between)."""
+        if not self.hours:
+            return
+        starts = starts_of_steps(self.exposures)
+        for number in np.unique((np.arange(STEPS) + 0.5) / STEPS * len(starts) // 1).astype(int):
+            yield step_from(self.exposures, starts[number])
+
     def nights(self) -> Iterator[str]:
         """Every night, where there are several."""
         if not self.hours:
             return
-        hours = np.sort((self.exposures.mjd - self.exposures.mjd.min()) * 24.0)
+        hours = np.sort(hours_since_first(self.exposures))
         first = np.flatnonzero(np.diff(hours, prepend=-np.inf) > NIGHT)
         if len(first) < 2:
             return
@@ -306,20 +354,28 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
                 yield _times(base, "colour")
             for factor in asked.slow():
                 yield _times(base, factor)
-    for element in instrument.train():
-        if (
-            element.moves
-            and not isinstance(element, Polariser)
-            and exposures.position(element.moves).inside.any()
-        ):
-            for base in _families("of", element.name):
-                for pair in asked.harmonics(element.moves, HARMONICS):
-                    yield _times(base, *pair)
+    for element in _turning(instrument, exposures):
+        if element is instrument.polariser:
+            continue
+        for base in _families("of", element.name):
+            for pair in asked.harmonics(element.moves, HARMONICS):
+                yield _times(base, *pair)
+        for step in asked.steps():
+            yield (Sentence("turn", "of", element.name, (step,)),)
     yield from _of_plates(instrument, exposures, asked)
     yield from _of_cameras(instrument, asked)
     yield from _of_field_and_band(instrument, asked)
     yield from _of_sources(instrument, asked)
     yield from _together(instrument, asked)
+
+
+def _turning(instrument: Instrument, exposures: Exposures) -> list[Element]:
+    """Elements of the common train that move, the polariser first, and are in the beam in some exposure."""
+    return [
+        element
+        for element in instrument.train()
+        if element.moves and exposures.position(element.moves).inside.any()
+    ]
 
 
 def _times(base: tuple[Sentence, ...], *factors: str) -> tuple[Sentence, ...]:
@@ -361,8 +417,8 @@ def _of_polariser(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sente
             yield _times(base, factor)
     for pair in asked.harmonics(polariser.moves, (1,)) if asked.over_field else ():
         yield _times(_times(turn, *pair), "x", "y")  # a beam that wanders over a film that is not uniform
-    for night in asked.nights():
-        yield _times(turn, night)
+    for span in (*asked.nights(), *asked.steps()):
+        yield _times(turn, span)
 
 
 def places(instrument: Instrument, exposures: Exposures) -> Iterator[tuple[str, str, bool]]:
@@ -398,6 +454,8 @@ def _of_plates(instrument: Instrument, exposures: Exposures, asked: _Asked) -> I
         if plate.moves is not None and not exposures.position(plate.moves).inside.any():
             continue
         yield (Sentence("axis", "of", place),)
+        for step in asked.steps():
+            yield (Sentence("axis", "of", place, (step,)),)
         warm.append(Sentence("thermal", "of", place))
         layers = [f"{place}.{layer.name}" for layer in plate.layers]
         yield tuple(Sentence("thickness", "of", layer) for layer in layers)
@@ -470,15 +528,14 @@ def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence,
 
 def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
     cameras, e = instrument.cameras.names, asked.exposures
-    polariser = instrument.polariser
-    prefixes = [polariser.moves] if polariser is not None and polariser.moves and e.clp_in.any() else []
+    prefixes = list(dict.fromkeys(one.moves for one in _turning(instrument, e) if one.moves))
     for camera in cameras:
         gain = (Sentence("gain", "of", camera),)
         yield _times(gain, "counts")
         for prefix in prefixes:
             for pair in asked.harmonics(prefix, HARMONICS_OF_ENCODER):
                 yield _times(gain, *pair)
-        for factor in (*asked.slow(), *asked.nights()):
+        for factor in (*asked.slow(), *asked.nights(), *asked.steps()):
             yield _times(gain, factor)
         if asked.over_field and len(e) <= limits.FREE_EXPOSURES:
             for number in range(len(e)):

@@ -357,7 +357,7 @@ class Evidence:
         length, limit = len(item.score.amplitudes), self.policy.separation * self.floor
         alike = {p.name for p in self.sentences if len(p.widths) <= length and apart[p.name] < limit}
         others = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
-        others = [r for r in others if not set(own) & set(said_by(r.probe))]
+        others = [r for r in others if r.probe is not item.probe and not set(own) & set(said_by(r.probe))]
         return tuple(r.probe.name for r in others[: self.policy.most_classes])
 
     def held_in_part(self, item: Ranked) -> tuple[str, ...]:

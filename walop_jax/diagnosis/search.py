@@ -303,10 +303,11 @@ def predicts_unseen(
     One Gauss–Newton step of everything, with and without the terms, from all data but those of a unit gives the
     density of that unit, ln p = −½ (dᵀΣ⁻¹d + ln det Σ), Σ = s² (1 + A H⁻¹ Aᵀ): it is broad where the step leaves it
     open, and s² is the χ²/dof that a model leaves, 1 or more. Units are states (exposures that differ in nothing but
-    the filter; not where the terms are about single ones), and the cells of the field. The mean gain must exceed
-    `least` times its standard error over the units, for both: a term that only follows what each setting of an element
-    does by itself predicts the field, and no other setting. Nor must it bend the rest of the model: the mean of dᵀd
-    over the states must not grow, where a density may become more probable by being broader alone.
+    the filter; not where the terms are about single ones), and the cells of the field, where there are several. The
+    mean gain must exceed `least` times its standard error over the units, for both: a term that only follows what each
+    setting of an element does by itself predicts the field, and no other setting. Nor must it bend the rest of the
+    model: the mean of dᵀd over the states must not grow, where a density may become more probable by being broader
+    alone.
 
     Symbols     d prediction error of the unit, A its rows of the Jacobian, H normal matrix of all others and priors
     """
@@ -320,6 +321,8 @@ def predicts_unseen(
     if of_states:
         units["states"] = states(calset)[design.exposure]
     for kind, unit in units.items():
+        if kind == "cells" and len(np.unique(unit)) < 2:
+            continue
         before = _predictions(design.jacobian, design.residual, unit, design.projector.free)
         after = _predictions(rows, residual, unit, design.projector.free)
         gain, closer = (after - before).T
@@ -423,7 +426,7 @@ def _next(state: Evidence, judge: Any, policy: Policy) -> Trial | None:
     """The addition with the highest evidence that is worth telling and confirmed; None where there is none."""
     waiting = [trial for trial in linear_trials(state, policy) if _promising(state, trial, policy)]
     tried, ready = list(waiting), []
-    others_asked = False
+    others_asked = sentences_asked = False
     while True:
         new = []
         while waiting and judge.time_left():
@@ -437,6 +440,12 @@ def _next(state: Evidence, judge: Any, policy: Policy) -> Trial | None:
             reach = 2.0 * error if error > policy.linear_good else 0.0
             if trial.noise or not waiting or trial.linear - waiting[0].linear >= reach:
                 break
+        if not (new or sentences_asked):  # names that came first by linear steps that were not to be believed
+            sentences_asked = True
+            waiting = _sentences_behind(state, tried, policy)
+            tried += waiting
+            if waiting:
+                continue
         missing = state.chi2 - state.dof
         explained = any(t.noise or state.chi2 - t.left > policy.good_share * missing for t in new)
         if not others_asked and not explained and (state.poor or not new):
@@ -450,6 +459,13 @@ def _next(state: Evidence, judge: Any, policy: Policy) -> Trial | None:
                 return _with_rivals(state, trial, tried, policy)
         if not waiting or not judge.time_left():
             return None
+
+
+def _sentences_behind(state: Evidence, tried: Sequence[Trial], policy: Policy) -> list[Trial]:
+    """The leading sentences that are promising, without those that were tried."""
+    known = [trial.item for trial in tried]
+    some = [item for item in state.significant_sentences if item not in known][: policy.most_sentences]
+    return [one for one in (linear_trial(state, item) for item in some) if _promising(state, one, policy)]
 
 
 def _with_rivals(state: Evidence, trial: Trial, tried: Sequence[Trial], policy: Policy) -> Trial:

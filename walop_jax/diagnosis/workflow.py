@@ -60,6 +60,7 @@ from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.stand_in import in_field_points
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.columns import columns
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.compiled import forget_programs
@@ -247,7 +248,7 @@ class Refit:
         if item.effect is Described:
             if not self._hopeful(state, item):
                 return None
-            said = shortest(item, self.policy.most_together)
+            said = self._dated(state, shortest(item, self.policy.most_together))
             found = try_sentences(self.fit, said, self.context, len(state.sentences))
         else:
             shapes = sum(probe.effect is item.effect for probe in state.probes)
@@ -255,6 +256,18 @@ class Refit:
         if found.fit is None or not found.fit.converged:
             return None
         return dataclasses.replace(found, item=item, linear=trial.linear)
+
+    def _dated(self, state: Examination, said: Described) -> Described:
+        """A step at the time at which it explains most, by linear steps; whatever else as it is."""
+        (change, *more) = (change for change, _ in said.terms())
+        times = [] if more else candidates.later_or_earlier(change, self.calset.exposures)
+        if not times:
+            return said
+        own = columns(self.fit.likelihood, self.fit.values, [[(1.0, one)] for one in times])
+        own = state.design.projector(state.design.stacked([own]))
+        along, square = own.T @ state.design.residual, np.sum(own**2, axis=0)
+        best = int(np.argmax(along**2 / np.where(square > 0, square, np.inf)))
+        return Described.saying([times[best].text], [-along[best] / square[best]])
 
     def _hopeful(self, state: Examination, item: Ranked) -> bool:
         """True if a sentence predicts what it has not seen, by its linear step: nobody has a name for it to believe."""
@@ -491,6 +504,11 @@ def unexplained(state: Examination, patterns: tuple[tuple[str, float], ...]) -> 
         text = f"unidentified patterns: {'; '.join(f'{name} (p = {p:.1g})' for name, p in patterns)}"
     else:
         text = "something is missing, but no single pattern is significant by itself"
+    leading = [*state.significant[:1], *state.significant_sentences[:1]] if state.alarm else []
+    if leading:
+        nearest = max(leading, key=lambda item: item.log_bayes)
+        p = state.table.corrected(nearest.score)
+        text += f". {nearest.probe.name} comes nearest (p = {p:.1g}) and does not stand up to a fit"
     where = describe(state.design, state.design.residual)
     text += f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}"
     return Unexplained(state.table.p_global, text, patterns)

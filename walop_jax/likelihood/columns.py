@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.engine import PointData, best_flux, point_prediction, real_counts
 from walop_jax.likelihood.flux import Sharing, project_flux, sharing
-from walop_jax.likelihood.layout import PointReader, median_counts
+from walop_jax.likelihood.layout import PointReader, median_over_field
 from walop_jax.likelihood.likelihood import Likelihood, Vector, used_rows
 from walop_jax.likelihood.pieces import NoColumnError, Piece, Resolver
 from walop_jax.model import light, responses
@@ -233,7 +233,8 @@ class Columns:
     """
 
     def __init__(self, likelihood: Likelihood, values: Vector, *, once: bool = True) -> None:
-        self.likelihood, self.instrument = likelihood, likelihood.model.instrument(values)
+        self.likelihood, self.values = likelihood, values
+        self.instrument = likelihood.model.instrument(values)
         self.once = once
         self.plan = likelihood.plan
         self.patched = self.instrument.patched()
@@ -290,9 +291,17 @@ class Columns:
 
     @functools.cached_property
     def median(self) -> Float[np.ndarray, "e k"]:
-        """Median counts over the field, in every exposure."""
+        """Median counts over the field, in every exposure: those that the model has, or else those that it expects.
+
+        A column of the measured counts would hold their noise, and find it in the residuals.
+        """
         known = self.plan.exposures.median_counts
-        return median_counts(self.likelihood.calset) if known is None else np.asarray(known)
+        if known is not None:
+            return np.asarray(known)
+        _, residual = self.likelihood.residuals(self.values)
+        counts, weight = map(self.likelihood.points.gathered, ("counts", "weight"))
+        used = self.likelihood.used[..., None]
+        return median_over_field(np.where(used, counts - residual / np.where(used, weight, 1.0), np.nan))
 
     def of(self, changes: Sequence[Change]) -> Float[np.ndarray, "d a"]:
         """The columns of changes: rows run over points, then exposures, then cameras, used ones only."""

@@ -202,10 +202,14 @@ def median_counts(calset: CalibrationSet) -> Float[np.ndarray, "e k"]:
     for start in starts:
         block = calset.intensities.block(int(start), min(int(start) + slab, n))
         counts.append(np.where(block.used[:, :, None], block.counts, np.nan))
-    every = np.concatenate(counts)
-    seen = np.isfinite(every[..., 0]).any(axis=0)
-    median = np.zeros(every.shape[1:])
-    median[seen] = np.nanmedian(every[:, seen], axis=0)
+    return median_over_field(np.concatenate(counts))
+
+
+def median_over_field(counts: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "e k"]:
+    """Median over the field of the counts of each camera in each exposure, NaN left out; 0 where all are."""
+    seen = np.isfinite(counts[..., 0]).any(axis=0)
+    median = np.zeros(counts.shape[1:])
+    median[seen] = np.nanmedian(counts[:, seen], axis=0)
     return median
 
 

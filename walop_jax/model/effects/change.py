@@ -184,7 +184,7 @@ class Change:
             advice.append("the same exposures without that element, or with it mounted turned over")
         else:
             advice.append(
-                "the calibration plate at 0° and 45°: it turns what is ahead of it, and not what is behind"
+                "a half-wave plate for calibration at 0° and 45°: it turns what is ahead of it, not what is behind"
             )
         return "; ".join(dict.fromkeys(advice))
 
