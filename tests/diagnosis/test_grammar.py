@@ -138,7 +138,7 @@ def test_steps_part_the_exposures_evenly_and_are_dated_between():
     """Midway between exposures; of many exposures every fourth time at first, then all times of the neighbourhood."""
     few = builders.exposures(*({"mjd": 61000.0 + hour / 24.0} for hour in (0, 1, 3, 4)))
     assert candidates.starts_of_steps(few) == pytest.approx([0.5, 2.0, 3.5], abs=1e-6)
-    assert candidates.step_from(few, 2.0) == "hours 2.0 to 4.5"
+    assert candidates.between(2.0, candidates.end_of(few)) == "hours 2.0 to 4.5"
     instrument = nominal_instrument("WALOP-SOUTH")
     many = builders.exposures(
         *({"mjd": 61000.0 + hour / 24.0, "clp_angle": 3.0 * hour} for hour in range(65))
@@ -146,9 +146,16 @@ def test_steps_part_the_exposures_evenly_and_are_dated_between():
     said = [p.group[0].sentences[0] for p in candidates.sentences(instrument, many, 25)]
     steps = [text for text in said if text.startswith("axis of half1.plate * hours ")]
     assert steps == [f"axis of half1.plate * hours {hour}.5 to 64.5" for hour in range(2, 64, 4)]
-    near = candidates.later_or_earlier(Change.parsed(steps[5]), many)
-    assert [change.text for change in near] == [
-        f"axis of half1.plate * hours {hour}.5 to 64.5" for hour in range(18, 27)
-    ]
-    assert candidates.later_or_earlier(Change.parsed("axis of half1.plate * hours"), many) == []
-    assert candidates.later_or_earlier(Change.parsed("axis of half1.plate * hours 1 to 2"), many) == []
+    spells = [text for text in said if text.startswith("turn of polariser * hours ") and "64.5" not in text]
+    assert len(spells) == 14 + 12
+    assert spells[0] == "turn of polariser * hours 2.5 to 10.5"
+    assert spells[-1] == "turn of polariser * hours 46.5 to 62.5"
+
+    def near(text: str, end: int) -> list[str]:
+        return [change.factors[0] for change in candidates.retimed(Change.parsed(text), many, end)]
+
+    assert near(steps[5], 0) == [f"hours {hour}.5 to 64.5" for hour in range(18, 27)]
+    assert near(steps[5], 1) == []
+    assert near(spells[0], 1) == [f"hours 2.5 to {hour}.5" for hour in range(6, 15)]
+    assert near("axis of half1.plate * hours", 0) == []
+    assert near("axis of half1.plate * hours 1 to 2", 0) == []

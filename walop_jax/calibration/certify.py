@@ -156,5 +156,6 @@ def _protection(calibration: Calibration) -> Check:
     return Check(
         "protection",
         True,
-        f"up to {100 * np.nanmax(errors):.2g} % in q and u by what would not be found ({found})",
+        f"q or u off by {100 * np.nanmedian(errors):.2g} % (median) to {100 * np.nanmax(errors):.2g} % (worst place) "
+        f"by what would not be found ({found})",
     )

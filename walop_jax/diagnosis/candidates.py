@@ -178,6 +178,7 @@ ALONE = ("diattenuation v", "retardance v", "depolarisation")
 NIGHT = 8.0  # hours without an exposure that part two nights
 STEPS = 16  # times of a step that are looked at first
 AFTER = 0.5  # hours behind the last exposure that a step ends
+ROUNDED = 1e-4  # hours, of times that are written into a description
 HARMONICS = (1, 2)
 HARMONICS_OF_ENCODER = (1, 2, 3, 4, 5, 6)
 
@@ -243,28 +244,34 @@ def starts_of_steps(exposures: Exposures) -> Float[np.ndarray, " s"]:
     return (hours[1:] + hours[:-1]) / 2.0
 
 
-def step_from(exposures: Exposures, start: float) -> str:
-    """The factor that is 1 from a time (hours) until the last exposure."""
-    return f"hours {_hours(start)} to {_end(exposures)}"
+def between(start: float, stop: float) -> str:
+    """The factor that is 1 from one time to another (hours; to 0.4 s)."""
+    return f"hours {round(float(start), 4)} to {round(float(stop), 4)}"
 
 
-def _end(exposures: Exposures) -> str:
-    return _hours(hours_since_first(exposures).max() + AFTER)
+def end_of(exposures: Exposures) -> float:
+    """Hours at which a step ends: `AFTER` the last exposure."""
+    return float(hours_since_first(exposures).max()) + AFTER
 
 
-def _hours(time: float) -> str:
-    return str(round(float(time), 4))  # to 0.4 s
+def retimed(sentence: Sentence, exposures: Exposures, end: int) -> list[Sentence]:
+    """The same with another start (`end` 0) or stop (1), at every time as near as others that are looked at first.
 
-
-def later_or_earlier(sentence: Sentence, exposures: Exposures) -> list[Sentence]:
-    """The same step at every time between those of the steps beside it; none for what is no step."""
-    if len(sentence.factors) != 1 or not sentence.factors[0].endswith(f" to {_end(exposures)}"):
+    None for what does not start or stop between two exposures.
+    """
+    times = starts_of_steps(exposures)
+    if [factor.form for factor in sentence.grows_with] != ["hours"]:
         return []
-    starts = starts_of_steps(exposures)
-    at = int(np.argmin(np.abs(starts - float(sentence.grows_with[0].given[0]))))
-    reach = -(-len(starts) // STEPS)
-    near = starts[max(at - reach, 0) : at + reach + 1]
-    return [dataclasses.replace(sentence, factors=(step_from(exposures, start),)) for start in near]
+    given = [float(text) for text in sentence.grows_with[0].given]
+    at = int(np.argmin(np.abs(times - given[end])))
+    if abs(times[at] - given[end]) > ROUNDED:
+        return []
+    reach = -(-len(times) // STEPS)
+    spans = [
+        (time, given[1]) if end == 0 else (given[0], time)
+        for time in times[max(at - reach, 0) : at + reach + 1]
+    ]
+    return [dataclasses.replace(sentence, factors=(between(*span),)) for span in spans if span[0] < span[1]]
 
 
 # -------------------------------------------------------------------------------------------------- the grammar
@@ -322,13 +329,29 @@ class _Asked:
         if self.kelvin:
             yield "kelvin"
 
+    def _times(self) -> Float[np.ndarray, " s"]:
+        """Times that part the exposures evenly, `STEPS` or fewer; `retimed` has those between."""
+        starts = starts_of_steps(self.exposures) if self.hours else np.zeros(0)
+        return (
+            starts[np.unique(((np.arange(STEPS) + 0.5) / STEPS * len(starts)).astype(int))]
+            if len(starts)
+            else starts
+        )
+
     def steps(self) -> Iterator[str]:
-        """From a time until the end: times that part the exposures evenly (`later_or_earlier` has those between)."""
-        if not self.hours:
-            return
-        starts = starts_of_steps(self.exposures)
-        for number in np.unique((np.arange(STEPS) + 0.5) / STEPS * len(starts) // 1).astype(int):
-            yield step_from(self.exposures, starts[number])
+        """From a time until the end."""
+        yield from (between(time, end_of(self.exposures)) for time in self._times())
+
+    def spells(self) -> Iterator[str]:
+        """From a time until another, an eighth or a quarter of the exposures later."""
+        times = self._times()
+        for length in (STEPS // 8, STEPS // 4):
+            yield from (between(*span) for span in zip(times, times[length:], strict=False))
+
+    def kinds(self) -> Iterator[str]:
+        """Kinds of exposures, but the most frequent."""
+        names, counts = np.unique(self.exposures.kind, return_counts=True)
+        yield from (f"kind {name}" for name in names[np.argsort(-counts, kind="stable")][1:])
 
     def nights(self) -> Iterator[str]:
         """Every night, where there are several."""
@@ -360,8 +383,8 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
         for base in _families("of", element.name):
             for pair in asked.harmonics(element.moves, HARMONICS):
                 yield _times(base, *pair)
-        for step in asked.steps():
-            yield (Sentence("turn", "of", element.name, (step,)),)
+        for span in (*asked.steps(), *asked.spells()):
+            yield (Sentence("turn", "of", element.name, (span,)),)
     yield from _of_plates(instrument, exposures, asked)
     yield from _of_cameras(instrument, asked)
     yield from _of_field_and_band(instrument, asked)
@@ -417,8 +440,11 @@ def _of_polariser(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sente
             yield _times(base, factor)
     for pair in asked.harmonics(polariser.moves, (1,)) if asked.over_field else ():
         yield _times(_times(turn, *pair), "x", "y")  # a beam that wanders over a film that is not uniform
-    for span in (*asked.nights(), *asked.steps()):
+    for span in (*asked.nights(), *asked.steps(), *asked.spells()):
         yield _times(turn, span)
+    if asked.over_field and len(asked.exposures) <= limits.FREE_EXPOSURES:
+        for number in np.flatnonzero(asked.exposures.clp_in):
+            yield _times(turn, f"exposure {number}")
 
 
 def places(instrument: Instrument, exposures: Exposures) -> Iterator[tuple[str, str, bool]]:
@@ -540,6 +566,13 @@ def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
         if asked.over_field and len(e) <= limits.FREE_EXPOSURES:
             for number in range(len(e)):
                 yield _times(gain, f"exposure {number}")
+        for kind in asked.kinds():
+            yield _times(gain, kind)
+        if asked.over_field:
+            for factor in (*asked.slow(), *asked.kinds()):
+                yield _times(_times(gain, factor), "x", "y")
+            for factor in asked.slow():
+                yield _times(_times(gain, factor), "r2")
         light = (Sentence("light", "in", camera),)
         if asked.over_field:
             yield (Sentence("light", "in", camera, origin=OPPOSITE),)
@@ -557,3 +590,6 @@ def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
             yield _times(gain, factor)
         if asked.over_field:
             yield _times(gain, *(f"ring {n}" for n in RINGS))
+            both = tuple(Sentence("gain", "of", name) for name in arm.analyser.cameras)
+            for kind in asked.kinds():
+                yield _times(_times(both, kind), "x", "y")

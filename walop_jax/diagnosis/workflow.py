@@ -258,16 +258,16 @@ class Refit:
         return dataclasses.replace(found, item=item, linear=trial.linear)
 
     def _dated(self, state: Examination, said: Described) -> Described:
-        """A step at the time at which it explains most, by linear steps; whatever else as it is."""
-        (change, *more) = (change for change, _ in said.terms())
-        times = [] if more else candidates.later_or_earlier(change, self.calset.exposures)
-        if not times:
-            return said
-        own = columns(self.fit.likelihood, self.fit.values, [[(1.0, one)] for one in times])
-        own = state.design.projector(state.design.stacked([own]))
-        along, square = own.T @ state.design.residual, np.sum(own**2, axis=0)
-        best = int(np.argmax(along**2 / np.where(square > 0, square, np.inf)))
-        return Described.saying([times[best].text], [-along[best] / square[best]])
+        """What starts or stops in time, at the times at which it explains most by linear steps; all else as it is."""
+        ((change, amplitude), *more) = said.terms()
+        for end in (0, 1) if not more else ():
+            if times := candidates.retimed(change, self.calset.exposures, end):
+                own = columns(self.fit.likelihood, self.fit.values, [[(1.0, one)] for one in times])
+                own = state.design.projector(state.design.stacked([own]))
+                along, square = own.T @ state.design.residual, np.sum(own**2, axis=0)
+                best = int(np.argmax(along**2 / np.where(square > 0, square, np.inf)))
+                change, amplitude = times[best], -along[best] / square[best]
+        return said if more else Described.saying([change.text], [float(amplitude)])
 
     def _hopeful(self, state: Examination, item: Ranked) -> bool:
         """True if a sentence predicts what it has not seen, by its linear step: nobody has a name for it to believe."""

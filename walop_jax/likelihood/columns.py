@@ -217,6 +217,10 @@ class _Laid:
             return np.arange(len(self.likelihood.flux_known))[None]
         return np.asarray(getattr(self.likelihood.plan.exposures, name))[None]
 
+    def of_kind(self, name: str) -> Any:
+        """True in exposures of a KIND."""
+        return np.asarray(self.likelihood.plan.exposures.of_kind(name))[None]
+
     def angle(self, prefix: str) -> Any:
         """Angle of a moving element, NaN where it is out."""
         position = self.likelihood.calset.exposures.position(prefix)

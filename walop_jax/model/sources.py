@@ -55,6 +55,10 @@ class ExposureArrays(eqx.Module):
             raise NotPlannedError("median")
         return self.median_counts
 
+    def of_kind(self, name: str) -> Bool[Array, " e"]:
+        """True in exposures of a KIND."""
+        return self.kind == (self.kinds.index(name) if name in self.kinds else -1)
+
 
 class Sight(NamedTuple):
     """Target at one field point, exposure by exposure.
@@ -87,8 +91,7 @@ class Source(Component):
 
     def shines(self, sight: Sight) -> Bool[Array, " e"]:
         """The exposures that see it."""
-        e = sight.exposures
-        return e.kind == e.kinds.index(self.kind) if self.kind in e.kinds else jnp.zeros(e.kind.shape, bool)
+        return sight.exposures.of_kind(self.kind)
 
     def polarisation(self, sight: Sight) -> Float[Array, "e 2"]:
         """(q, u) in the instrument frame; unpolarised unless a source says otherwise."""

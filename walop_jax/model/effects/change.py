@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 from walop_jax.data.records import POLARISER
 from walop_jax.model.effects.factors import Factor, factor
 from walop_jax.model.instrument import Instrument, Scalar
+from walop_jax.model.parameters import unknown_name
 from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays
 
@@ -58,7 +59,8 @@ AMPLITUDES = {
 class Grows(NamedTuple):
     """Dependences that a change may have (`Factor.depends_on`), and which of angles and single exposures.
 
-    Of angles that of one element, by the prefix of its columns; None: of any, and in single exposures as well.
+    Of angles that of one element, by the prefix of its columns; None: of any, and in single exposures and those of a
+    KIND as well.
     """
 
     allowed: tuple[str, ...] = ()
@@ -156,8 +158,10 @@ class Change:
         """Raise ValueError for a factor that the kind would leave out."""
         allowed, angle = KINDS[self.kind].grows(instrument, self)
         for one in self.grows_with:
+            if one.form == "kind" and one.given[0] not in instrument.kinds:
+                raise unknown_name("KIND of exposures", one.given[0], instrument.kinds)
             known = angle is None or (one.form in ("cos", "sin") and one.given[-1] == angle)
-            single = one.form in ("cos", "sin", "exposure")
+            single = one.form in ("cos", "sin", "exposure", "kind")
             if one.depends_on not in allowed or (single and not known):
                 takes = ", ".join(allowed) or "nothing"
                 only = f"; of angles that of {angle} alone" if angle else ""
@@ -273,6 +277,10 @@ class InExposures:
     def number(self) -> Any:
         """Positions in the list."""
         return jnp.arange(self.exposures.hours.shape[0])
+
+    def of_kind(self, name: str) -> Any:
+        """True in exposures of a KIND."""
+        return self.exposures.of_kind(name)
 
     def angle(self, prefix: str) -> Any:
         """That of the polariser or of another element that moves; NaN where it is out."""

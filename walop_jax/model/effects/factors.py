@@ -5,8 +5,9 @@ its own) and what it `depends_on`: FIELD, WAVELENGTH, EXPOSURE, COUNTS, or SHAPE
 one reader of their texts.
 
 A value is asked for with something that has x, y (deg), wavelength (µm), hours since the first exposure, hour_angle
-(h), temperature (Celsius), the number of the exposure in its list, and `angle(prefix)` (rad) of the polariser or
-another moving element, NaN where that is out of the beam; all are scalars, or arrays that broadcast.
+(h), temperature (Celsius), the number of the exposure in its list, `of_kind(name)`, true for exposures of a KIND, and
+`angle(prefix)` (rad) of the polariser or another moving element, NaN where that is out of the beam; all are scalars, or
+arrays that broadcast.
 """
 
 from __future__ import annotations
@@ -91,6 +92,13 @@ def _exposure(number: str) -> Factor:
     return Factor(f"exposure {number}", EXPOSURE, words, ONCE_MORE, value, "exposure", (number,))
 
 
+def _kind(name: str) -> Factor:
+    """1 in exposures of a KIND, 0 in all others."""
+    test = "the same field points in exposures of another KIND"
+    words = f"in exposures of KIND {name}"
+    return Factor(f"kind {name}", EXPOSURE, words, test, lambda at: at.of_kind(name) * 1.0, "kind", (name,))
+
+
 def _gap(thickness: str) -> Factor:
     """Thickness (µm) of the air whose fringes a change is: 1, the fringes themselves know it."""
     words = f"of {thickness} µm of air (amplitude at a maximum)"
@@ -102,6 +110,7 @@ FORMS: Mapping[str, tuple[str, Callable[..., Factor]]] = {
     "cos N PREFIX, sin N PREFIX": (r"(cos|sin) (\d+) (\S+)", _harmonic),
     "hours A to B": (rf"hours {NUMBER} to {NUMBER}", _span),
     "exposure N": (r"exposure (\d+)", _exposure),
+    "kind KIND": (r"kind (\S+)", _kind),
     "gap N": (rf"gap (?!-){NUMBER}", _gap),
 }
 """Factors with numbers or names in them, as messages name them: how they are typed, and what makes one."""
