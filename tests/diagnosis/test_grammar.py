@@ -25,6 +25,8 @@ LISTED = (
     "turn of polariser * x; turn of polariser * y",
     "retardance q behind collimator * hours; retardance u behind collimator * hours",
     "gain of E1 * exposure 3",
+    "gain of E1 * kind moon * x; gain of E1 * kind moon * y",
+    "turn of polariser * exposure 4",
     "diattenuation radial ahead of half2.wedge",
     "gain of half1 * ring 3; gain of half1 * ring 4; gain of half1 * ring 5; "
     "gain of half1 * ring 6; gain of half1 * ring 7; gain of half1 * ring 8",
@@ -37,7 +39,7 @@ LISTED = (
     "shift of band",
 )
 QUICK = (
-    LISTED[:3] + LISTED[5:7] + LISTED[9:10]
+    LISTED[:5] + LISTED[7:9] + LISTED[11:12]
 )  # without derivatives of crystals and ghosts, which take half a minute
 HELD = 0.999  # share of the square of what an effect does that its sentences hold
 

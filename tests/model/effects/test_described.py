@@ -105,6 +105,7 @@ EVERY_NAME = {name: parameters for *_, (name, parameters) in SAME.values()}
 IN_VAIN = (
     ("axis of half1.plate", "sin 2 CHWP"),  # not an element whose angle it knows
     ("axis of chwp", "exposure 3"),
+    ("retardance q behind collimator", "kind moon"),
     ("retardance q behind collimator", "cos 2 CLP"),
     ("retardance q behind collimator", "counts"),
     ("turn of polariser", "colour"),
@@ -127,6 +128,11 @@ IN_VAIN = (
 def test_factors_that_would_be_left_out_are_refused(change, factor):
     with pytest.raises(ValueError, match=f"cannot grow with '{factor}'"):
         said(f"{change} * {factor}", values=[0.1]).patch(nominal_instrument())
+
+
+def test_a_kind_of_exposures_that_is_none_is_refused():
+    with pytest.raises(ValueError, match="no KIND of exposures 'mon'; did you mean 'moon'"):
+        said("gain of O1 * kind mon", values=[0.1]).patch(nominal_instrument())
 
 
 def in_company(case):
@@ -216,6 +222,7 @@ EVERY_CHANGE = (
     "gain of O1 * r2",
     "gain of half2 * ring 3",
     "gain of O2 * exposure 3",
+    "gain of E2 * kind moon",
     "gain of E1 * hours 1 to 3",
     "gain of E2 * counts",
     "reported gain of O1 * hours",
