@@ -258,7 +258,7 @@ class Refit:
         return dataclasses.replace(found, item=item, linear=trial.linear)
 
     def _dated(self, state: Examination, said: Described) -> Described:
-        """What starts or stops in time, at the times at which it explains most by linear steps; all else as it is."""
+        """A description that starts or stops in time, where it explains most by linear steps; any other as it is."""
         ((change, amplitude), *more) = said.terms()
         for end in (0, 1) if not more else ():
             if times := candidates.retimed(change, self.calset.exposures, end):
