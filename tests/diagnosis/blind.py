@@ -30,10 +30,11 @@ from walop_jax.diagnosis.candidates import Probe, probes
 from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.examination import Evidence, Examination, Ranked, examine
 from walop_jax.diagnosis.policy import POLICY
-from walop_jax.diagnosis.score import ScoreSpace, separations, whitening
+from walop_jax.diagnosis.score import ScoreSpace, separations
 from walop_jax.diagnosis.search import Trial, search
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
+from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Described
 from walop_jax.model.specification import effect_context

@@ -46,7 +46,7 @@ sys.path[:1] = [str(ROOT), *(str(ROOT / "tests" / p) for p in (".", "diagnosis",
 from generate import STEP  # noqa: E402
 from judge import opened  # noqa: E402
 
-from walop_jax.diagnosis.score import whitening  # noqa: E402
+from walop_jax.likelihood.inverses import whitening  # noqa: E402
 
 Answer = dict[str, Any]
 FALSE_ALARMS, SEPARATION = 0.01, 3.0

@@ -43,11 +43,12 @@ from jaxtyping import Bool, Float, Int
 from numpy.polynomial.legendre import legvander
 
 from walop_jax.data.records import POLARISER, CalibrationSet, Exposures
-from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram, whitening
+from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import states
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.flux import Sharing, project_flux
+from walop_jax.likelihood.inverses import unit_columns, whitening
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.effects.free_form import FINE, HARMONICS, SMOOTH, WIDTH
@@ -355,21 +356,18 @@ class Design:
         model is linear to better than that fraction squared.
         """
         rows = np.concatenate([keep, np.ones(len(self.residual) - self.rows, bool)])
-        j, r = self.jacobian[rows], self.residual[rows]
-        norm = np.sqrt(np.sum(self.jacobian**2, axis=0))
-        norm = np.where(norm > 0, norm, 1.0)
-        scaled = j / norm
+        unit, norm = unit_columns(self.jacobian)
+        scaled, r = unit[rows], self.residual[rows]
         return -np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(norm)), scaled.T @ r) / norm
 
-    def taken_up(self, columns: Float[np.ndarray, "_ k"]) -> Float[np.ndarray, "_ k"]:
-        """By how much the free parameters change, at first order, when the data lack the amplitudes of `columns`.
+    def taken_up(self, along: Float[np.ndarray, "q k"]) -> Float[np.ndarray, "f k"]:
+        """By how much the free parameters change, at first order, when the model lacks some amplitudes: R⁻¹ QᵀC.
 
-        A column holds the derivative of the rows with respect to an amplitude; the data have it, the model has not.
+        J = QR with Q the basis of `projector`; a column of C holds the derivative of the rows with respect to an
+        amplitude that the data have, `along` is QᵀC.
         """
-        norm = np.linalg.norm(self.jacobian, axis=0)
-        norm = np.where(norm > 0, norm, 1.0)
-        scaled = self.jacobian / norm
-        return np.linalg.pinv(scaled.T @ scaled, hermitian=True) @ (scaled.T @ columns) / norm[:, None]
+        unit, norm = unit_columns(self.jacobian)
+        return np.linalg.lstsq(self.projector.basis.T @ unit, along, rcond=None)[0] / norm[:, None]
 
     def robust_ratio(self, name: str) -> float:
         """Largest ratio of robust to stated errors among the parameters of an effect; NaN when it has none.
@@ -381,8 +379,7 @@ class Design:
         at = np.flatnonzero(self._columns_of(name))
         if not len(at):
             return float("nan")
-        norm = np.sqrt(np.sum(self.jacobian**2, axis=0))
-        scaled = self.jacobian / np.where(norm > 0, norm, 1.0)
+        scaled, _ = unit_columns(self.jacobian)
         inverse = np.linalg.pinv(scaled.T @ scaled, hermitian=True)[at]
         pull = (scaled * self.residual[:, None])[: self.rows] @ inverse.T
         by_exposure = np.zeros((self.measured.used.shape[1], len(at)))

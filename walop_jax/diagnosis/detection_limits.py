@@ -167,7 +167,8 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     raw = [
         examination.named[c.probe.name].columns[:, c.number, None] for c in (columns[i] for i in looked_at)
     ]
-    for i, taken_up in zip(looked_at, design.taken_up(design.stacked(raw)).T, strict=True):
+    along = design.products(raw, design.projector.basis).T
+    for i, taken_up in zip(looked_at, design.taken_up(along).T, strict=True):
         column = columns[i]
         own = change[..., place[column.probe.name] + column.number]
         found[i] = change_of_qu(matrix, matrix + column.detected * (own - slopes @ taken_up))
@@ -263,7 +264,8 @@ def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
     instrument, calset = result.model.instrument(result.values), result.calset
     setting, x, y = first_setting(calset, instrument), calset.points.x, calset.points.y
     matrix, slopes = matrix_slopes(instrument, setting, calset.filters, x, y)
-    taken_up = design.taken_up(np.column_stack([one.column for one in scored]))
+    columns = np.column_stack([one.column for one in scored])
+    taken_up = design.taken_up(design.projector.basis.T @ columns)
     off = slopes @ (result.model.selection() @ taken_up)
     least = noncentrality(local_p(ALARM, tried), 1, PROBABILITY)
     found = []

@@ -35,6 +35,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import linalg, special
 
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.inverses import unit_columns, whitening
 from walop_jax.likelihood.runner import cores
 
 Vector = Float[np.ndarray, " _"]
@@ -43,7 +44,6 @@ Reduction = Callable[[Vector, float], tuple[Vector, float]]
 
 ABSORBED = 1e-6  # surviving share of a column's square below which the base has swallowed it
 FAINTEST = 0.05  # standard deviations that a plausible amplitude must reach to be testable
-RANK_TOLERANCE = 1e-8
 ROOT_TOLERANCE = 1e-6  # ten times what products in single precision leave
 LEAST_REST = 0.1  # share of the degrees of freedom that must be left behind all candidates to tell the noise
 TAIL = 0.2  # share of the draws, those with the smallest p, that give the number of trials
@@ -90,8 +90,7 @@ class Projector:
     """
 
     def __init__(self, jacobian: Matrix, eliminated: int = 0) -> None:
-        norm = np.linalg.norm(jacobian, axis=0)
-        self.basis, _ = np.linalg.qr(jacobian / np.where(norm > 0, norm, 1.0))
+        self.basis, _ = np.linalg.qr(unit_columns(jacobian)[0])
         self.free = jacobian.shape[0] - jacobian.shape[1] - eliminated
 
     def __call__(self, columns: np.ndarray) -> np.ndarray:
@@ -153,15 +152,6 @@ def effective_trials(smallest: Vector) -> float:
 def noncentrality(p: float, rank: int, power: float) -> float:
     """λ for which the statistic of a candidate, χ'²_rank(λ), undercuts a local `p` with probability `power`."""
     return float(special.chndtrinc(special.chdtri(rank, p), rank, 1.0 - power))
-
-
-def whitening(gram: Matrix) -> Matrix:
-    """W with Wᵀ G W = 1 on the range of a Gram matrix G (columns of no length or no independence are left out)."""
-    norm = np.sqrt(np.clip(np.diag(gram), 0.0, None))
-    scale = np.where(norm > 0, 1.0 / np.where(norm > 0, norm, 1.0), 0.0)
-    value, vector = np.linalg.eigh(gram * np.outer(scale, scale))
-    keep = value > max(value.max(initial=0.0), 1e-300) * RANK_TOLERANCE
-    return scale[:, None] * vector[:, keep] / np.sqrt(value[keep])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -171,13 +171,8 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
             if size * float(np.linalg.norm(singles.along[:, first])) > 1.0:
                 found.append((one, size, first))
         first += len(one.candidate.widths)
-    jacobian = design.jacobian
-    length = np.linalg.norm(jacobian, axis=0)
-    length = np.where(length > 0, length, 1.0)
-    triangle = design.projector.basis.T @ (jacobian / length)
-    columns = np.array([size * singles.along[:, at] for _, size, at in found]).reshape(len(found), -1).T
-    taken = np.linalg.lstsq(triangle, columns, rcond=None)[0] / length[:, None]
-    changes = (design.fit.model.selection() @ taken).T
+    along = np.array([size * singles.along[:, at] for _, size, at in found]).reshape(len(found), -1).T
+    changes = (design.fit.model.selection() @ design.taken_up(along)).T
     order = np.argsort(-_errors_of_stars(design, changes), kind="stable")[:MOST_HIDDEN]
     kept = [found[i] for i in order]
     return Hidden(

@@ -117,17 +117,14 @@ def with_structure(
     With J = QR the parameters take up R⁻¹QᵀA of the amplitudes, so that τ² R⁻¹BBᵀR⁻ᵀ is added. `design` may be of a
     sample of so many `points`: structure then counts by their share, as noise does.
     """
-    jacobian = design.jacobian
-    length = np.linalg.norm(jacobian, axis=0)
-    length = np.where(length > 0, length, 1.0)
-    triangle = design.projector.basis.T @ (jacobian / length)
-    added, places = np.zeros((len(length), len(length))), 1
+    rows, size = design.jacobian.shape
+    added, places = np.zeros((size, size)), 1
     for component in found:
-        blocks = _blocks(design, component.grouping, np.zeros((len(jacobian), 0)))
+        blocks = _blocks(design, component.grouping, np.zeros((rows, 0)))
         if not component.grouping.structure or blocks is None:
             continue
-        places, b = len(blocks[0]), blocks[1].reshape(-1, len(triangle))
-        taken = np.linalg.lstsq(triangle, b.T, rcond=None)[0] / length[:, None]
+        places, basis = len(blocks[0]), design.projector.basis
+        taken = design.taken_up(blocks[1].reshape(-1, basis.shape[1]).T)
         added += component.size**2 * taken @ taken.T
     share = len(design.fit.calset.points) ** 2 / (places * points)
     select = result.model.selection()
@@ -249,11 +246,7 @@ def _blocks(
     place, features = grouping.place[used], grouping.features[used]
     gain = (measured.flux[..., None] * measured.model)[used] / design.fit.noise_scale
     change = gain[..., None] * features[:, None, :]
-    power = shared.summed(measured.model**2)
-    unit = np.where(measured.known[:, None], 0.0, measured.model / np.sqrt(np.where(power > 0, power, 1.0)))[
-        used
-    ]
-    along = (change * unit[..., None]).reshape(len(change), -1)
+    along = (change * measured.unit_model[..., None]).reshape(len(change), -1)
     group = None
     if shared.exposures is not None:
         of_exposure = np.asarray(shared.exposures).argmax(axis=1)

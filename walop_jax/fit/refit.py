@@ -19,11 +19,12 @@ from walop_jax.fit.minimise import Minimum
 from walop_jax.fit.model_file import base_model, render
 from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
 from walop_jax.fit.robust import robust_errors
-from walop_jax.fit.search import find_minimum, free_scales
+from walop_jax.fit.search import find_minimum
 from walop_jax.fit.verdict import NO_STRUCTURE, STATED, Doubt, Hidden, Quality, Structure, Verdict
 from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display
 from walop_jax.io.progress import Stage
+from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.likelihood import Likelihood, Posterior
 from walop_jax.likelihood.runner import Journal, Processes, Progress, Runner, fingerprint
 from walop_jax.model.specification import Model
@@ -234,15 +235,8 @@ def check_constrained(model: Model, posterior: Posterior) -> None:
 
 def covariance(model: Model, posterior: Posterior) -> Matrix:
     """Covariance of all parameters: the inverse of JᵀJ, priors included, ties expanded."""
-    # In units of what each parameter is known to by itself: its own precision costs no digits of the inverse.
-    known = np.sqrt(np.clip(np.diag(posterior.matrix), 0.0, None))
-    scale = np.where(known > 0, 1.0 / np.where(known > 0, known, 1.0), free_scales(model))
-    scaled = posterior.matrix * np.outer(scale, scale)
-    value, vector = np.linalg.eigh(scaled)
-    keep = value > value.max(initial=0.0) * 1e-15
-    inverse = (vector[:, keep] / value[keep]) @ vector[:, keep].T
-    select = model.selection() * scale
-    return select @ inverse @ select.T
+    root = model.selection() @ whitening(posterior.matrix, 1e-15)
+    return root @ root.T
 
 
 def fit(

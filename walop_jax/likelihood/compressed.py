@@ -32,6 +32,7 @@ from walop_jax.likelihood.frames import (
     information_of,
     unit_slopes_at,
 )
+from walop_jax.likelihood.inverses import whitening
 
 SINGULAR = 1e-12  # of the largest eigenvalue: directions of the parameters that the data say nothing of
 
@@ -116,9 +117,5 @@ def _with_gradient(
     changes = np.einsum("pekl,peln->pekn", matrix, slopes, optimize=True)
     lacking = -half_gradient(found) - np.einsum("pekn,pek->n", slopes, pull)
     normal = np.einsum("pekn,pekm->nm", slopes, changes, optimize=True)
-    size = np.sqrt(np.diag(normal))
-    size = np.where(size > 0, size, 1.0)
-    value, vector = np.linalg.eigh(normal / np.outer(size, size))
-    kept = value > SINGULAR * value[-1]
-    step = (vector[:, kept] / value[kept]) @ (vector[:, kept].T @ (lacking / size)) / size
-    return pull + changes @ step
+    root = whitening(normal, SINGULAR)
+    return pull + changes @ (root @ (root.T @ lacking))

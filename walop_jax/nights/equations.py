@@ -27,6 +27,7 @@ from walop_jax.fit.search import nearer
 from walop_jax.io.errors import DataError, fail
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.columns import Columns
+from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, used_rows
 from walop_jax.likelihood.runner import fingerprint
 from walop_jax.model.effects import EFFECTS, Effect
@@ -284,9 +285,7 @@ def with_candidates_of(night: Night, before: Night) -> Night:
     if not before.candidates or night.candidates or night.names != before.names[:cut]:
         return night
     known, cross, own = before.matrix[:cut, :cut], before.matrix[cut:, :cut], before.matrix[cut:, cut:]
-    size = np.sqrt(np.where(np.diag(known) > 0.0, np.diag(known), 1.0))
-    inverse = np.linalg.pinv(known / np.outer(size, size), rcond=1e-13, hermitian=True) / np.outer(size, size)
-    along = cross @ inverse
+    along = cross @ pseudo_inverse(known, 1e-13)
     beyond, pull = own - along @ cross.T, before.gradient[cut:] - along @ before.gradient[:cut]
     slope = along @ night.matrix
     return dataclasses.replace(

@@ -27,6 +27,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.flux import Sharing, project_flux, sharing
+from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
@@ -472,12 +473,6 @@ def information_of(
     """Information of a calibration on parameters by name; none on those that it has not, nor on those of `effects`."""
     both = [i for i, name in enumerate(names) if name in known.model.names and not _effect_of(name, effects)]
     there = [known.model.index(names[i]) for i in both]
-    covariance = known.covariance[np.ix_(there, there)]
-    size = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    varied = size > 0
-    scaled = covariance[np.ix_(varied, varied)] / np.outer(size[varied], size[varied])
-    inverse = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) / np.outer(size[varied], size[varied])
-    at = np.array(both)[varied]
     whole = np.zeros((len(names), len(names)))
-    whole[np.ix_(at, at)] = inverse
+    whole[np.ix_(both, both)] = pseudo_inverse(known.covariance[np.ix_(there, there)], 1e-12)
     return whole

@@ -25,6 +25,7 @@ from walop_jax.data.inspection import about_exposures
 from walop_jax.data.user_tables import InputTable
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
+from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import Effect
 from walop_jax.plans.could import Could, Place, separation
 from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
@@ -526,12 +527,7 @@ def _of(experiment: Experiment, number: int, place: Place) -> Float[np.ndarray, 
 
 def covariance(total: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r n n"]:
     """M⁻¹, scaled so that gauges drop out."""
-    found = []
-    for matrix in total:
-        size = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
-        scaled = matrix / np.outer(size, size)
-        found.append(np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) / np.outer(size, size))
-    return np.stack(found)
+    return np.stack([pseudo_inverse(matrix, 1e-13) for matrix in total])
 
 
 def criterion(experiment: Experiment, total: Float[np.ndarray, "r n n"]) -> float:

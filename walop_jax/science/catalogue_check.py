@@ -26,17 +26,18 @@ from scipy import special
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import some, with_error, with_minus_sign
+from walop_jax.likelihood.inverses import whitening
 from walop_jax.science.star_residuals import (
     ABOUT_GAINS,
     CROWDED,
     FEW,
     NO_NOISE,
+    SINGULAR,
     Scale,
     StarResiduals,
     beside_fitted,
     chance_of_scale,
     eliminated,
-    inverse_root,
     is_off,
     noise_scale,
     normal_matrix,
@@ -388,9 +389,9 @@ class CatalogueSearch:
         order = [*range(cameras), *range(self.asked, len(look.score))]
         found = np.zeros_like(look.score)
         matrix, score = eliminated(look.matrix[np.ix_(order, order)], look.score[order], cameras)
-        root = inverse_root(matrix)
+        root = whitening(matrix, SINGULAR)
         found[:cameras] = root @ (root.T @ score)
-        return found, int(np.count_nonzero(root.any(axis=0)))
+        return found, root.shape[1]
 
     def answer(self) -> CatalogueCheck:
         """All questions, then again behind what was found."""
@@ -450,7 +451,7 @@ class CatalogueSearch:
         fitted = np.array([*chosen, *range(self.asked, len(sizes))])
         for _ in range(_ROUNDS):
             matrix = look.matrix[np.ix_(fitted, fitted)]
-            root = inverse_root(matrix)
+            root = whitening(matrix, SINGULAR)
             step = root @ (root.T @ look.score[fitted])
             if step @ matrix @ step < _SETTLED**2:
                 break

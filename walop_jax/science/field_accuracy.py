@@ -24,6 +24,7 @@ from walop_jax.calibration.matrix import (
 )
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import rounded, two_digits
+from walop_jax.likelihood.inverses import whitening
 from walop_jax.science.star_errors import GOAL
 
 SIZE = 21  # points along each axis of the map
@@ -172,12 +173,8 @@ def _limited_by(
     for part in dict.fromkeys(parts.tolist()):
         group = np.flatnonzero((parts == part) & (np.diag(covariance) > 0))
         if group.size:
-            sigma = np.sqrt(np.diag(covariance)[group])
-            inverse = np.linalg.pinv(
-                covariance[np.ix_(group, group)] / np.outer(sigma, sigma), hermitian=True
-            )
-            one = seen[..., group] / sigma
-            gone = np.mean(np.einsum("pnj,jk,pnk->pn", one, inverse, one, optimize=True), axis=1)
+            root = whitening(covariance[np.ix_(group, group)], 1e-15)
+            gone = np.mean(np.sum((seen[..., group] @ root) ** 2, axis=-1), axis=1)
             shares[part] = float(np.nanmedian(gone / total))
     most = max(shares, key=lambda part: shares[part], default="")
     if not most:

@@ -29,6 +29,7 @@ from scipy import special
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.field_table import through_series
 from walop_jax.likelihood.flux import Sharing, project_flux
+from walop_jax.likelihood.inverses import whitening
 
 TRIMMED = 1e-3
 CROWDED = 1.5
@@ -40,6 +41,8 @@ FEW = 4
 """Stars, or degrees of freedom: of fewer a single star may be the scale."""
 ABOUT_GAINS = 2
 """Rounds in which the scale of stars is found about the gains that fit them best, and these with that scale."""
+SINGULAR = 1e-10
+"""Share of the largest eigenvalue below which stars say nothing of a direction of what is fitted to them."""
 Matrix = Float[np.ndarray, "c c"]
 
 
@@ -211,16 +214,9 @@ def eliminated(
     """Q and g of the first `kept` columns with all others fitted (these have their priors in Q and g)."""
     if kept == len(matrix):
         return matrix, score
-    root = inverse_root(matrix[kept:, kept:])
+    root = whitening(matrix[kept:, kept:], SINGULAR)
     cross = matrix[:kept, kept:] @ root
     return matrix[:kept, :kept] - cross @ cross.T, score[:kept] - cross @ (root.T @ score[kept:])
-
-
-def inverse_root(matrix: Matrix) -> Matrix:
-    """R with R Rᵀ the inverse of a symmetric matrix; directions in which it is singular are left out."""
-    scale = np.sqrt(np.clip(np.diag(matrix), 1e-300, None))
-    weight, vector = np.linalg.eigh(matrix / np.outer(scale, scale))
-    return vector / scale[:, None] * np.where(weight > 1e-10 * weight[-1], weight, np.inf) ** -0.5
 
 
 # -------------------------------------------------------------------------------------------- noise, robustly

@@ -32,6 +32,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.catalogue import Catalogue
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.inverses import whitening
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.science.apply import residuals_of
@@ -40,11 +41,11 @@ from walop_jax.science.star_residuals import (
     ABOUT_GAINS,
     CROWDED,
     FEW,
+    SINGULAR,
     Scale,
     StarResiduals,
     beside_fitted,
     eliminated,
-    inverse_root,
     is_off,
     noise_scale,
     of_few,
@@ -227,9 +228,9 @@ class Watching:
         blocks, slopes = self._by_group(*self.scan(residual, weight, share))
         gain, fitted = np.zeros((groups, cameras)), np.zeros(groups)
         for g in range(groups):
-            root = inverse_root(blocks[g, :cameras, g, :cameras])
+            root = whitening(blocks[g, :cameras, g, :cameras], SINGULAR)
             gain[g] = root @ (root.T @ slopes[g, :cameras])
-            fitted[g] = np.count_nonzero(np.abs(root).max(axis=0))
+            fitted[g] = root.shape[1]
         left = self.stars.behind(residual, lambda part, rows: part.model * gain[self.group[rows]])
         return left, fitted
 

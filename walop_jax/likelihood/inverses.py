@@ -1,0 +1,39 @@
+"""Linear algebra of quantities whose units differ by orders of magnitude: in units of what each row or column holds.
+
+What is taken for rounding, and left out, then depends on no unit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+Matrix = Float[np.ndarray, "_ _"]
+
+RANK_TOLERANCE = 1e-8
+
+
+def whitening(matrix: Matrix, least: float = RANK_TOLERANCE) -> Matrix:
+    """W with Wᵀ G W = 1 on the range of a symmetric matrix G, so that W Wᵀ is its inverse there.
+
+    With a diagonal of ones, directions of which the matrix has less than the share `least` of its largest eigenvalue
+    are left out, and rows of zeros with them.
+    """
+    norm = np.sqrt(np.clip(np.diag(matrix), 0.0, None))
+    scale = np.where(norm > 0, 1.0 / np.where(norm > 0, norm, 1.0), 0.0)
+    value, vector = np.linalg.eigh(matrix * np.outer(scale, scale))
+    keep = value > max(value.max(initial=0.0), 1e-300) * least
+    return scale[:, None] * vector[:, keep] / np.sqrt(value[keep])
+
+
+def pseudo_inverse(matrix: Matrix, least: float) -> Matrix:
+    """The inverse of a symmetric matrix on what `whitening` keeps of it, zero elsewhere."""
+    root = whitening(matrix, least)
+    return root @ root.T
+
+
+def unit_columns(matrix: Matrix) -> tuple[Matrix, Float[np.ndarray, " _"]]:
+    """The columns of a matrix at unit length, and their lengths; of a column of zeros the length is 1."""
+    length = np.linalg.norm(matrix, axis=0)
+    length = np.where(length > 0, length, 1.0)
+    return matrix / length, length
