@@ -46,8 +46,8 @@ from walop_jax.data.schema import Column, Place, column_names, read_table, table
 from walop_jax.data.write import filter_columns, grid_cards, set_table_hdu, sign_and_write, table_hdu
 from walop_jax.fit.verdict import STATED, Hidden, Structure, Verdict
 from walop_jax.io.atomic import atomic_path
-from walop_jax.io.errors import DataError, errors_naming, fail
-from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
+from walop_jax.io.errors import errors_naming, fail
+from walop_jax.io.fits_reading import OpenFile, open_fits
 from walop_jax.io.text import in_ascii
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.parameters import NAME, Parameter
@@ -256,13 +256,8 @@ def read_calibration(
     format, or changed since it was written, and if the model cannot be rebuilt.
     """
     path = product_path(run)
-    with open_fits(path) as opened:
-        try:
-            found = _Reader(opened).calibration(tuple(catalogue))
-        except DataError:
-            raise
-        except UNREADABLE as error:
-            raise fail(f"cannot be read: {one_line(error)}", file=path, advice=_AGAIN) from error
+    with open_fits(path, _AGAIN) as opened:
+        found = _Reader(opened).calibration(tuple(catalogue))
     with errors_naming(path):
         return found.rebuilt() if rebuild else found
 

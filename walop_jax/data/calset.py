@@ -40,8 +40,8 @@ from walop_jax.data.settings import builtin_filter
 from walop_jax.data.table_intensities import TableIntensities, mask_repeats, table_intensities, usable
 from walop_jax.data.write import EXTENSION, filter_columns, read_compression, remark, set_tables
 from walop_jax.instruments.description import described, shipped
-from walop_jax.io.errors import DataError, fail, nearest
-from walop_jax.io.fits_reading import UNREADABLE, OpenFile, one_line, open_fits
+from walop_jax.io.errors import fail, nearest
+from walop_jax.io.fits_reading import OpenFile, open_fits
 
 _IMAGE = re.compile(r"[NE](0|[1-9][0-9]{0,2})")  # of one camera: counts or errors
 _NO_SETS = (".csv", ".ecsv", ".txt", ".dat", ".vot", ".xml", ".json", ".toml", ".nc", ".npz", ".h5")
@@ -80,15 +80,8 @@ def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
     if path.suffix.lower() in _NO_SETS:
         advice = "a calibration set is a FITS file (walop-jax docs files); walop_jax.from_arrays makes one of arrays"
         raise fail("is not a calibration set", file=path, advice=advice)
-    with open_fits(path) as opened:
-        try:
-            found = _from_hdus(opened, (*KINDS, *kinds))
-        except DataError:
-            raise
-        except UNREADABLE as error:
-            raise fail(
-                f"cannot be read: {one_line(error)}", file=path, advice="write the file again"
-            ) from error
+    with open_fits(path, "write the file again") as opened:
+        found = _from_hdus(opened, (*KINDS, *kinds))
     return dataclasses.replace(found, inputs=(InputFile(path, opened.sha256),))
 
 

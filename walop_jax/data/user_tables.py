@@ -67,7 +67,7 @@ def read_input_table(path: str | os.PathLike[str]) -> InputTable:
                 table = Table.read(path, format=kind)
     except DataError:
         raise
-    except (*UNREADABLE, UnicodeError) as error:
+    except UNREADABLE as error:
         what = f"cannot be read as a table: {one_line(error)}"
         raise fail(what, file=path, advice="write it again") from error
     if len(table) == 0:

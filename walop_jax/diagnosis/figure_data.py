@@ -31,8 +31,8 @@ from walop_jax.data.schema import Column, Place, read_table
 from walop_jax.data.write import sign_and_write, table_hdu
 from walop_jax.diagnosis.findings import HARMONICS, Cube, Diagnosis
 from walop_jax.io.atomic import atomic_path
-from walop_jax.io.errors import DataError, fail
-from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
+from walop_jax.io.errors import fail
+from walop_jax.io.fits_reading import open_fits
 from walop_jax.io.text import in_ascii
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import FreeForm
@@ -201,24 +201,18 @@ def read_figure_data(path: str | os.PathLike[str]) -> DiagnosisFigureData:
 
     Raises `DataError`, with advice, for a file that is damaged, of another kind or from a newer version.
     """
-    with open_fits(path) as opened:
+    again = "run walop-jax diagnose again"
+    with open_fits(path, again) as opened:
         version = opened.hdus[0].header.get("DIAGVERS")
         if version != DIAGVERS:
             found = "is missing" if version is None else f"is {version}, this program reads {DIAGVERS}"
-            raise fail(found, file=path, column="DIAGVERS", advice="run walop-jax diagnose again")
+            raise fail(found, file=path, column="DIAGVERS", advice=again)
         units = {hdu.name.strip().upper(): hdu for hdu in opened.hdus[1:]}
-        try:
-            tables: dict[str, dict[str, Any]] = {}
-            for name, columns in _TABLES.items():
-                rules = {key: rule for key, (rule, _) in columns.items()}
-                tables[name] = read_table(units[name], rules, Place(path, name))[0]
-            return _figure_data(tables)
-        except DataError:
-            raise
-        except UNREADABLE as error:
-            raise fail(
-                f"cannot be read: {one_line(error)}", file=path, advice="run walop-jax diagnose again"
-            ) from error
+        tables: dict[str, dict[str, Any]] = {}
+        for name, columns in _TABLES.items():
+            rules = {key: rule for key, (rule, _) in columns.items()}
+            tables[name] = read_table(units[name], rules, Place(path, name))[0]
+        return _figure_data(tables)
 
 
 def _figure_data(tables: Mapping[str, Mapping[str, Any]]) -> DiagnosisFigureData:

@@ -64,11 +64,12 @@ class OpenFile:
 
 
 @contextlib.contextmanager
-def open_fits(path: str | os.PathLike[str]) -> Iterator[OpenFile]:
+def open_fits(path: str | os.PathLike[str], advice: str | None = None) -> Iterator[OpenFile]:
     """Open a FITS file (plain, or compressed with gzip) after checking that it is whole.
 
     A file without checksums is remarked on: damage to it cannot be noticed. Raises `DataError` as `check_input` and
-    `check_structure` do, and if a checksum that the file carries does not agree with its bytes.
+    `check_structure` do, and if a checksum that the file carries does not agree with its bytes; with `advice`, for
+    what astropy cannot read while the block uses it.
     """
     path = check_input(path)
     with contextlib.ExitStack() as stack:
@@ -99,7 +100,12 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[OpenFile]:
         remarks = tuple(f"{path}: {one_line(entry.message)}" for entry in caught)
         # A file packed with gzip carries a CRC-32 of all its bytes.
         unprotected = [] if compressed else _unprotected(path, units)
-        yield OpenFile(path, sha256, units, compressed, (*remarks, *unprotected))
+        try:
+            yield OpenFile(path, sha256, units, compressed, (*remarks, *unprotected))
+        except UNREADABLE as error:
+            if advice is None or isinstance(error, DataError):
+                raise
+            raise fail(f"cannot be read: {one_line(error)}", file=path, advice=advice) from error
 
 
 def primary_keywords(path: str | os.PathLike[str]) -> tuple[str, ...]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from astropy.io import fits
@@ -21,8 +20,8 @@ from astropy.io import fits
 from walop_jax.data.schema import Column, Place, read_table
 from walop_jax.data.write import sign_and_write, table_hdu
 from walop_jax.io.atomic import atomic_path
-from walop_jax.io.errors import DataError, fail
-from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
+from walop_jax.io.errors import fail
+from walop_jax.io.fits_reading import OpenFile, open_fits
 from walop_jax.io.text import in_ascii
 from walop_jax.model.parameters import Parameter
 from walop_jax.nights.equations import Night
@@ -50,6 +49,22 @@ _NIGHTS = {
 }
 
 
+_PLAIN = {
+    "NIGHT": ("number", int),
+    "MJD_BEG": ("begin", float),
+    "MJD_END": ("end", float),
+    "MJD": ("mjd", float),
+    "SOURCE": ("source", str),
+    "SHA256": ("sha256", str),
+    "NDATA": ("n_data", int),
+    "DOF": ("dof", int),
+    "CHI2": ("chi2", float),
+    "REFERENCE": ("reference", np.asarray),
+    "GRADIENT": ("gradient", np.asarray),
+}
+"""Columns of NIGHTS that hold a field of `Night` as it is, and the field's kind."""
+
+
 def write_nights(path: str | os.PathLike[str], nights: Sequence[Night], *, overwrite: bool = False) -> None:
     """Write nights of the same parameters to a file, which appears whole or not at all.
 
@@ -70,24 +85,16 @@ def write_nights(path: str | os.PathLike[str], nights: Sequence[Night], *, overw
         "SCALE": np.array([p.scale for p in first.parameters]),
         "CANDIDATE": np.arange(n) >= n - first.candidates,
     }
-    rows: dict[str, Any] = {
-        name: np.array([getattr(night, of) for night in nights])
-        for name, of in (
-            ("NIGHT", "number"), ("MJD_BEG", "begin"), ("MJD_END", "end"), ("MJD", "mjd"), ("NDATA", "n_data"),
-            ("DOF", "dof"), ("CHI2", "chi2"), ("REFERENCE", "reference"), ("GRADIENT", "gradient"),
-        )
-    }  # fmt: skip
-    rows |= {
-        "FILTERS": _texts(" ".join(night.filters) for night in nights),
-        "SOURCE": _texts(night.source for night in nights),
-        "SHA256": _texts(night.sha256 for night in nights),
-        "MATRIX": np.stack([night.matrix[lower] for night in nights]),
+    rows = {
+        name: (_texts if kind is str else np.array)([getattr(night, field) for night in nights])
+        for name, (field, kind) in _PLAIN.items()
     }
+    rows["FILTERS"] = _texts(" ".join(night.filters) for night in nights)
+    rows["MATRIX"] = np.stack([night.matrix[lower] for night in nights])
     primary = fits.PrimaryHDU()
-    cards = {"NIGHTVER": NIGHTVER, "INSTRUME": first.instrument, "CREATOR": "walop-jax"}
-    for name, value in cards.items():
-        primary.header[name] = value
-    primary.header["MODEL"] = (first.model, "")
+    primary.header.update(
+        NIGHTVER=NIGHTVER, INSTRUME=first.instrument, CREATOR="walop-jax", MODEL=first.model
+    )
     hdus = [
         primary,
         table_hdu("PARAMETERS", parameters, path, _PARAMETERS),
@@ -103,16 +110,11 @@ def _texts(values: Iterable[str]) -> np.ndarray:
 
 def read_nights(path: str | os.PathLike[str]) -> list[Night]:
     """The nights of a file. Raises `DataError`, with advice, for one that is damaged, of another kind, or newer."""
-    with open_fits(path) as opened:
-        try:
-            return _nights(opened)
-        except DataError:
-            raise
-        except UNREADABLE as error:
-            raise fail(f"cannot be read: {one_line(error)}", file=path, advice=_AGAIN) from error
+    with open_fits(path, _AGAIN) as opened:
+        return _nights(opened)
 
 
-def _nights(opened: Any) -> list[Night]:
+def _nights(opened: OpenFile) -> list[Night]:
     path, header = opened.path, opened.hdus[0].header
     version = header.get("NIGHTVER")
     if not isinstance(version, int) or isinstance(version, bool):
@@ -158,21 +160,11 @@ def _nights(opened: Any) -> list[Night]:
             Night(
                 instrument=str(header.get("INSTRUME", "")),
                 model=str(header.get("MODEL", "")),
-                number=int(rows["NIGHT"][k]),
-                begin=float(rows["MJD_BEG"][k]),
-                end=float(rows["MJD_END"][k]),
-                mjd=float(rows["MJD"][k]),
                 filters=tuple(str(rows["FILTERS"][k]).split()),
-                source=str(rows["SOURCE"][k]),
-                sha256=str(rows["SHA256"][k]),
-                n_data=int(rows["NDATA"][k]),
-                dof=int(rows["DOF"][k]),
-                chi2=float(rows["CHI2"][k]),
                 parameters=parameters,
                 candidates=int(table["CANDIDATE"].sum()),
-                reference=rows["REFERENCE"][k],
-                gradient=rows["GRADIENT"][k],
                 matrix=matrix,
+                **{field: kind(rows[name][k]) for name, (field, kind) in _PLAIN.items()},
             )
         )
     return found
