@@ -14,7 +14,8 @@ Limit       no structure smaller than the smooth model's: δ scatters about 0 wi
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +39,20 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 
 
+def _changes(
+    vectors: Float[Any, "n k 4"], stokes: Float[Any, "n 4"], unit: Float[Any, "n k"], pairs: Sequence[Any]
+) -> Float[Any, "n d k"]:
+    """Counts that a change of each quantity of the map adds for light of unit flux, in numpy or inside a program."""
+    xp = jnp if isinstance(unit, jax.Array) else np
+    first, second = np.array(pairs).T
+    # One row of signs for each arm: first camera minus second.
+    signs = np.eye(unit.shape[1])[first] - np.eye(unit.shape[1])[second]
+    total = vectors[:, first, 0] + vectors[:, second, 0]
+    elements = 0.5 * xp.einsum("na,ns,ak->nask", total, stokes[:, :3], signs)
+    later = unit[:, None] * np.abs(signs[1:])
+    return xp.concatenate([elements.reshape(len(unit), -1, unit.shape[1]), later], axis=1)
+
+
 def _point_sums(
     instrument: Instrument,
     plan: Plan,
@@ -49,15 +64,8 @@ def _point_sums(
     unit = engine.point_prediction(instrument, plan, point, nodes)
     vectors = engine.vectors_at(instrument, plan, point, nodes)[point.band]
     stokes = light.stokes(instrument, point.sight(plan))
-    stokes = stokes[:, :3]
-    # One row of signs for each arm: first camera minus second.
-    pairs = np.array(instrument.cameras.pairs)
-    signs = np.eye(unit.shape[-1])[pairs[:, 0]] - np.eye(unit.shape[-1])[pairs[:, 1]]
-    total = vectors[:, pairs[:, 0], 0] + vectors[:, pairs[:, 1], 0]
-    elements = 0.5 * jnp.einsum("ea,es,ak->eask", total, stokes, signs).reshape(len(unit), -1, unit.shape[-1])
-    later = unit[:, None] * np.abs(signs[1:])
     weight = point.weight * chosen[:, None]
-    change = jnp.concatenate([elements, later], axis=1) * (flux * weight)[:, None]
+    change = _changes(vectors, stokes, unit, instrument.cameras.pairs) * (flux * weight)[:, None]
     known = plan.exposures.flux_known
     change = jnp.moveaxis(change, 1, 0)  # exposures next to cameras
     change = jnp.moveaxis(project_flux(change, unit * weight, known, sharing(instrument, plan)), 0, 1)
@@ -166,19 +174,15 @@ def residual_map_of_pixels(found: FrameSums) -> ResidualMap:
     together = int(np.ceil(max(1.0, *blocks)))
     s, t = np.meshgrid(*cells.middles())
     smooth = found.smooth(s.ravel(), t.ravel())
-    pairs = np.array(found.instrument.cameras.pairs)
-    signs = np.eye(likelihood.cameras)[pairs[:, 0]] - np.eye(likelihood.cameras)[pairs[:, 1]]
+    pairs = found.instrument.cameras.pairs
     n = len(residual_names(len(pairs)))
     right, left = np.zeros((n, s.size)), np.zeros((n, n, s.size))
     matrices = information(found).reshape(likelihood.cameras, likelihood.cameras, len(chosen), -1)
     pull = found.sums.pull.reshape(likelihood.cameras, len(chosen), -1)
     for exposure in np.flatnonzero(chosen):
-        vectors = np.asarray(smooth.vectors)[:, likelihood.plan.band_of[exposure, 0]]
-        total = vectors[:, pairs[:, 0], 0] + vectors[:, pairs[:, 1], 0]
-        stokes = np.asarray(smooth.stokes)[:, exposure, :3]
-        elements = 0.5 * np.einsum("ca,cs,ak->cask", total, stokes, signs)
-        later = np.asarray(smooth.unit)[:, None, :, exposure] * np.abs(signs[1:])
-        change = np.concatenate([elements.reshape(s.size, -1, likelihood.cameras), later], axis=1)
+        band = likelihood.plan.band_of[exposure, 0]
+        vectors, stokes = np.asarray(smooth.vectors)[:, band], np.asarray(smooth.stokes)[:, exposure]
+        change = _changes(vectors, stokes, np.asarray(smooth.unit)[..., exposure], pairs)
         right += np.einsum("cdk,kc->dc", change, pull[:, exposure])
         left += np.einsum("cdk,klc,cfl->dfc", change, matrices[:, :, exposure], change, optimize=True)
     each = likelihood.cameras - np.where(likelihood.flux_known, 0.0, found.instrument.cameras.fluxes)

@@ -47,7 +47,7 @@ from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTab
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import states
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.flux import Sharing, project_flux
+from walop_jax.likelihood.flux import project_flux, sharing
 from walop_jax.likelihood.inverses import unit_columns, whitening
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
@@ -59,12 +59,6 @@ SINGLE_EXPOSURES = "single exposures"
 STATES = "states"
 
 Cube = Float[np.ndarray, "p e k"]
-
-
-def numpy_sharing(likelihood: Likelihood) -> Sharing:
-    """Common fluxes, in arrays of numpy."""
-    groups = likelihood.plan.exposures.shared
-    return Sharing(likelihood.model.template.cameras.together, None if groups is None else np.asarray(groups))
 
 
 class Measured:
@@ -79,7 +73,8 @@ class Measured:
         # Weighted model at unit flux, from data = flux · model + residual.
         flux = np.where(self.flux == 0, 1.0, self.flux)[..., None]
         self.model: Cube = (self.counts * self.weight - self.residual) / flux
-        self.known, self.shared = likelihood.flux_known, numpy_sharing(likelihood)
+        self.known = likelihood.flux_known
+        self.shared = sharing(likelihood.model.template, likelihood.plan)
         self.cameras = likelihood.cameras
         # Of the model, not of the counts: patterns that know the noise would find it in the residuals.
         unit = self.model / np.where(self.weight > 0, self.weight, 1.0)

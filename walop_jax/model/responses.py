@@ -308,21 +308,16 @@ def _varied(element: Element, own: dict[str, Scalar]) -> Element:
     if not isinstance(element, WavePlate) or not element.layers:
         return element
 
-    def added(value: Scalar | None, name: str) -> Scalar:
-        return own[name] if value is None else value + own[name]
+    def added(part: Any, prefix: str, *names: str) -> Any:
+        changes = {name: _sum(getattr(part, name), own[prefix + name]) for name in names}
+        return dataclasses.replace(part, **changes)
 
-    layers = tuple(
-        dataclasses.replace(
-            layer, **{name: added(getattr(layer, name), f"{i}.{name}") for name in LAYER_NUMBERS}
-        )
-        for i, layer in enumerate(element.layers)
-    )
-    return dataclasses.replace(
-        element,
-        axis=added(element.axis, "axis"),
-        thermal=added(element.thermal, "thermal"),
-        layers=layers,
-    )
+    layers = tuple(added(layer, f"{i}.", *LAYER_NUMBERS) for i, layer in enumerate(element.layers))
+    return dataclasses.replace(added(element, "", "axis", "thermal"), layers=layers)
+
+
+def _sum(value: Scalar | None, change: Scalar) -> Scalar:
+    return change if value is None else value + change
 
 
 def _stacked(
@@ -527,11 +522,10 @@ def light_responses(instrument: Instrument, sight: Sight) -> LightResponses:
 
 def _lit(instrument: Instrument, own: dict[str, Scalar], count: int) -> Instrument:
     def added(name: str) -> Callable[[Scalar | None], Scalar]:
-        return lambda value: own[name] if value is None else value + own[name]
+        return lambda value: _sum(value, own[name])
 
     if instrument.polariser is not None:
-        names = ("zero", "extinction", "ellipticity")
-        changes = {name: added(name) for name in names}
+        changes = {name: added(name) for name in ("zero", "extinction", "ellipticity")}
         instrument = instrument.changed(instrument.polariser.name, **changes)
     instrument = instrument.changed("", rotator_zero=added("rotator"))
     for source in instrument.sources:
@@ -541,7 +535,7 @@ def _lit(instrument: Instrument, own: dict[str, Scalar], count: int) -> Instrume
             )
             instrument = instrument.changed(
                 source.name,
-                missing=lambda p: -own["sky"] if p is None else p - own["sky"],
+                missing=lambda p: _sum(p, -own["sky"]),
                 patches=lambda there, every=every: every if there is None else there.joined(every),
             )
     if instrument.standard.names:
