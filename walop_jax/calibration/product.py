@@ -1,26 +1,8 @@
-"""The file of a calibration, `calibration.fits`: what a fit has learnt, complete in one file.
+"""The file of a calibration, `calibration.fits`: what a fit has learnt, complete in one file (docs: files).
 
-    PRIMARY      instrument, verdict of the fit, validity (dates, temperatures, filters), versions of the software,
-                 hash of the content
-    PARAMETERS   NAME, VALUE, SIGMA, UNIT, PRIOR_MEAN, PRIOR_WIDTH, FREE
-    COVARIANCE   image, in the order of PARAMETERS; tied and frozen parameters included
-    M21 … M33    images of the instrument matrix over the field (filter of MAPFILT, flat photon spectrum,
-                 calibration plate out), M21_ERR … M33_ERR their standard errors; linear WCS in degrees; three for
-                 each arm of the instrument, further moving elements at ANGLE1, … of the elements ELEM1, …
-    RESIDUAL     (7, ny, nx), of a large set, in cells of the field: dm21 … dm33 to be added to the instrument matrix,
-                 and the relative change of the throughput of the second arm (cameras N2, N3); NaN where a cell has too
-                 few data. Of an instrument with A arms 4 A − 1 planes, PLANE1, … name them. RESIDUAL_ERR are their
-                 standard errors, RESIDUAL_CHI2 (ny, nx) is χ² per degree of freedom before that correction
-    FILTERS      the filter curves that were used          } as in a calibration set
-    EXPOSURES    the exposures that went in                }
-    MODEL        LINE: the model file of the fit, line by line
-    INSTRUMENT   LINE: the description file of an instrument that does not come with the package
-    SOURCES      the standards, if there were any, as in a calibration set
-    INPUTS       PATH, SHA256 of the calibration sets
-    WARNINGS     TEXT: what does not hold
-
-PRODVERS is 2 for an instrument that is none of the first three or has not two arms, for further moving elements and
-for lamps, otherwise 1. FITS headers and tables hold ASCII only: Greek letters and signs are spelt out.
+Of an instrument with A arms RESIDUAL has 4 A − 1 planes. Moving elements ELEM1, … of a map stand at ANGLE1, … PRODVERS
+is 2 for an instrument that is none of the first three or has not two arms, for further moving elements and for lamps,
+otherwise 1. FITS headers and tables hold ASCII only: Greek letters and signs are spelt out.
 """
 
 from __future__ import annotations

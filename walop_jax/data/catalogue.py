@@ -1,18 +1,6 @@
 """Tables that an instrument is asked about: field points, and catalogues of stars (docs: files).
 
-Catalogues have one row per star and exposure, an intensity of every camera:
-
-| column | unit | meaning |
-| --- | --- | --- |
-| X, Y | deg | field position in the instrument frame |
-| N, N_ERR | electron | the cameras, in the order of the instrument, and their errors (or N0, N1, …, N0_ERR, …) |
-| ID | | rows of one ID (and one FILTER) are one star; without it every row is one |
-| TEFF | K | colour temperature of the star; NaN: flat photon spectrum |
-| `<P>_IN`, `<P>_ANGLE` | deg | moving elements behind the polariser, such as CHWP_IN, CHWP_ANGLE |
-| ROTATOR | deg | position angle of +X; where it is given the results are on the sky |
-| N_FLAG | | bits of the cameras as FLAG of a calibration set, one number or one per camera; any bit: not used |
-| FILTER, TEMP, HA | Celsius, h | as for field points |
-| MJD | d | mid-exposure: what changes with time is looked for |
+Catalogues have one row per star and exposure, an intensity of every camera.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """Writing calibration sets as tables.
 
-The extension COMPRESSION says of a calibration set that stands for the pixels of whole frames, what they were.
-
-A table NAME, VALUE of the model's parameters at which the pixels were summed; in its header NPIXELS, CHI2 and DOF of
-the pixels there, and the frames, FILE1, SHA1, …; STRUCTG and STRUCTR, by how much single pixels differ (docs: files).
+The extension COMPRESSION says of a calibration set that stands for the pixels of whole frames, what they were
+(docs: files).
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
 """Data of the figures of a diagnosis, `diagnosis.fits` (DIAGVERS = 1): small arrays, no data set.
 
-Its tables are those of `_TABLES`: the models one after the other, the shares of the data in χ², and comparisons, of the
-starting with the final model (row 0) and of a model without and with one effect, over the field and the exposures.
-EXPLAINED is what the effect makes once all other parameters have followed. Columns of FIELD and CURVES without a unit
-are (data - model) in standard deviations of one intensity as N_ERR gives them, one value for each camera, in the order
-of SHARES; NaN where there are no data. Values of FIELD in a combination, BEFORE and AFTER, have standard deviation 1
-(where the flux is free √(1 − 1/K) with K cameras, 0.87 of four) if there is noise alone.
+Its tables are those of `_TABLES` (docs: files). Columns of FIELD and CURVES without a unit are (data - model) in
+standard deviations of one intensity as N_ERR gives them. Values of FIELD in a combination, BEFORE and AFTER, have
+standard deviation 1 (where the flux is free √(1 − 1/K) with K cameras, 0.87 of four) if there is noise alone.
 
 _Combination  r_pk = Σ_e w_e r_pek / (Σ_e w_e² over the used ones)^½ keeps unit noise. The weights w are those of what
              can be said in words (a harmonic of the polariser angle at its best phase, the mean of a kind of

@@ -1,27 +1,4 @@
-"""Models from data, from a model file, or from neither; the file is a TOML text, of any part of this:
-
-    [model]
-    instrument = "WALOP-SOUTH"
-    plates = "waves"            # or "fixed_axis", the paper's approximation
-    throughput_degree = 4
-    effects = ["clp_wobble"]    # effects beyond the base model, by name
-
-    [effects.blemish]           # discrete choices of an effect that has some
-    camera = 2
-
-    [catalogue.stressed_window] # entries of effects of one's own: docs adding-an-effect
-    about = "…"
-
-    [parameters."half2.plate.mgf2"]
-    start = 1930.0
-    prior = [1930.0, 1.0]       # mean and standard deviation, or "none"
-    free = true
-    tie = "half1.plate.mgf2"    # optional: takes the value of another parameter
-
-    [law."half2.wedge"]    # how it may change from night to night (docs nights); kept for walop-jax stack
-    per = "night"
-
-What it does not mention stays as in the base model. Names that do not exist are errors that list the nearest ones.
+"""Models from data, from a model file (TOML, docs: files), or from neither.
 
 The scale of the throughput is a gauge unless a flux is known: the constant of camera N0 is held then. Of two cameras,
 and where every arm has a flux of its own, the whole series of the first one is: only ratios can be known.
@@ -49,7 +26,7 @@ from walop_jax.model.effects import EFFECTS, Context, Effect, effect_by_name
 from walop_jax.model.effects.catalogue import entries, is_own
 from walop_jax.model.instrument import Instrument, adapted, as_designed, nominal_instrument
 from walop_jax.model.laws import laws_of
-from walop_jax.model.parameters import Parameter, unknown_name
+from walop_jax.model.parameters import Parameter, check_names, unknown_name
 from walop_jax.model.sources import MoonSky, Standards
 from walop_jax.model.specification import THROUGHPUT, Model, effect_context, make_model, with_effects
 
@@ -133,9 +110,8 @@ def parse(text: str, build: Callable[[ModelTable], Model]) -> Model:
         content = parse_toml(text)
     except ValueError as error:
         raise ValueError(f"the model file is {error}") from None
+    check_names("table", content, TABLES)
     for key in content:
-        if key not in TABLES:
-            raise unknown_name("table", key, TABLES)
         if not isinstance(content[key], Mapping):
             raise ValueError(f"{key} = {content[key]!r} must be a table, [{key}]")
     header = _header(*(content.get(table, {}) for table in TABLES[:3]))
@@ -158,18 +134,15 @@ def parse(text: str, build: Callable[[ModelTable], Model]) -> Model:
 
 
 def _header(table: Mapping[str, Any], choices: Mapping[str, Any], entries: Mapping[str, Any]) -> ModelTable:
-    for key in table:
-        if key not in MODEL_KEYS:
-            raise unknown_name("key of [model]", key, MODEL_KEYS)
+    check_names("key of [model]", table, MODEL_KEYS)
     effects = table.get("effects", [])
     if not (isinstance(effects, list) and all(isinstance(name, str) for name in effects)):
         raise ValueError('[model] effects must be a list of names, e.g. effects = ["clp_wobble"]')
     degree = table.get("throughput_degree")
     if degree is not None and not (isinstance(degree, int) and 0 <= degree <= 12):
         raise ValueError(f"[model] throughput_degree = {degree!r} must be a whole number from 0 to 12")
+    check_names("effect (it has choices but is not in the list of [model])", choices, effects)
     for name, values in choices.items():
-        if name not in effects:
-            raise unknown_name("effect (it has choices but is not in the list of [model])", name, effects)
         if not isinstance(values, Mapping):
             raise ValueError(f"[effects] {name} = {values!r} must be a table, [effects.{name}]")
     return ModelTable(table.get("instrument"), table.get("plates"), degree, tuple(effects), choices, entries)
@@ -183,9 +156,8 @@ def _number(name: str, key: str, value: Any) -> float:
 
 def _changes(parameter: Parameter, entry: Mapping[str, Any]) -> dict[str, Any]:
     name, changes = parameter.name, {}
+    check_names(f'key of [parameters."{name}"]', entry, PARAMETER_KEYS)
     for key, value in entry.items():
-        if key not in PARAMETER_KEYS:
-            raise unknown_name(f'key of [parameters."{name}"]', key, PARAMETER_KEYS)
         if key == "unit":
             if value != parameter.unit:
                 raise ValueError(

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from walop_jax.model import materials
 from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate, Wedge
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import unknown_name
+from walop_jax.model.parameters import check_names
 
 Rearrangement = Callable[[Instrument], Instrument]
 Named = tuple[str, Rearrangement]
@@ -53,8 +53,7 @@ def changed(instrument: Instrument, sentence: str) -> Instrument:
     """
     for part in sentence.split(JOINED) if sentence else ():
         known = alternatives(instrument)
-        if part not in known:
-            raise unknown_name(f"change of {instrument.name}", part, known)
+        check_names(f"change of {instrument.name}", [part], known)
         instrument = known[part](instrument)
     return instrument
 

@@ -35,7 +35,7 @@ from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.compiled import array
 from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate
 from walop_jax.model.elements.wave_plate import MODELS
-from walop_jax.model.parameters import Component, leaves, number, unknown_name
+from walop_jax.model.parameters import Component, check_names, leaves, number, unknown_name
 from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import SOURCES, Source, Standards
 
@@ -269,9 +269,7 @@ def _name(member: Any) -> str:
 def _changed(part: AnyPart, rest: list[str], fields: dict[str, Any], place: str) -> AnyPart:
     if not rest:
         known = [field.name for field in dataclasses.fields(part)]
-        for name in fields:
-            if name not in known:
-                raise unknown_name(f"field of {place or 'the instrument'}", name, known)
+        check_names(f"field of {place or 'the instrument'}", fields, known)
         new = {
             name: value(getattr(part, name)) if callable(value) else value for name, value in fields.items()
         }

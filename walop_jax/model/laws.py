@@ -10,15 +10,7 @@
     linear      a drift, per year of 365.25 days
     annual      a cosine and a sine with that period
 
-In a model file, for a parameter or, with * and ?, for a group of them:
-
-    [law."half2.wedge"]
-    per = "night"
-
-    [law."throughput.n?.p00"]
-    per = ["walk", "step"]
-    rate = 2e-5
-    at = [61250.0]
+In a model file a table [law.NAME] holds that of a parameter or, with * and ?, of a group of them (docs: nights).
 
 Dates are MJD (UTC); an interval holds its first moment and not its last. Steps, bad nights, drifts and annual terms are
 added to what holds otherwise. A candidate (an amplitude beyond the model) is absent unless it has a law; one with steps

@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -132,6 +132,13 @@ def _array(value: Any) -> Any:
 def unknown_name(what: str, name: str, known: Iterable[str]) -> ValueError:
     """The error for a name that does not exist, with the nearest ones that do."""
     return ValueError(f"there is no {what} {name!r}; {nearest(name, known)}")
+
+
+def check_names(what: str, names: Iterable[str], known: Collection[str]) -> None:
+    """Raise ValueError, with the nearest names, for the first of some that does not exist."""
+    for name in names:
+        if name not in known:
+            raise unknown_name(what, name, known)
 
 
 class Component(eqx.Module):

@@ -19,7 +19,7 @@ from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects import EFFECTS, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import Parameter, leaves, unknown_name, values_of, with_values
+from walop_jax.model.parameters import Parameter, check_names, leaves, unknown_name, values_of, with_values
 
 Vector = Float[np.ndarray, " n"]
 THROUGHPUT = "throughput"
@@ -92,9 +92,7 @@ class Model:
     def change(self, name: str, **changes: Any) -> Model:
         """The model with fields of one parameter replaced. Raises ValueError for values that mean nothing."""
         i = self.index(name)
-        for field in changes:
-            if field not in Parameter.__dataclass_fields__:
-                raise unknown_name("field of a parameter", field, Parameter.__dataclass_fields__)
+        check_names("field of a parameter", changes, Parameter.__dataclass_fields__)
         changed = dataclasses.replace(self.parameters[i], **changes).checked()
         return dataclasses.replace(
             self, parameters=(*self.parameters[:i], changed, *self.parameters[i + 1 :])

@@ -1,9 +1,4 @@
-"""The file of nights (FITS): normal equations that are kept.
-
-    PRIMARY      NIGHTVER, INSTRUME, MODEL (hash of what the model holds fixed), CREATOR, SOFT1, … versions
-    PARAMETERS   NAME, UNIT, START, PRIOR_MEAN, PRIOR_WIDTH, LOOSE, SCALE (NaN: none), CANDIDATE
-    NIGHTS       a row for each file and night: NIGHT, MJD_BEG, MJD_END, MJD, FILTERS, SOURCE, SHA256, NDATA, DOF, CHI2,
-                 and, in the order of PARAMETERS, REFERENCE, GRADIENT and MATRIX: its lower triangle, row by row
+"""The file of nights, `nights.fits`: normal equations that are kept (docs: files).
 
 A row of 127 parameters takes 67 kB. All extensions carry checksums; the file appears whole or not at all.
 """

@@ -1,13 +1,6 @@
 """From what users have to a survey: nights are made of fits, runs and sets, stacked, and kept in a folder.
 
-The folder of a survey:
-
-    nights.fits        the normal equations of all nights (`night_file`)
-    reference.fits     the calibration about which they are linearised; its model file holds the laws
-    calibration.fits   the calibration of the last exposure
-    tracks.fits        every parameter in every night
-    survey.json        what was found
-    partial            nights that are made, until all are
+The files of a survey: docs, files. Nights that are made lie in its folder `partial` until all are.
 """
 
 from __future__ import annotations

@@ -1,17 +1,7 @@
 """Possible observations and their costs: filters, plates, exposure times, what is up, the time beside exposing.
 
-    plate = ["out", "any"]  # through the polariser the calibration plate may stand at any angle; or a list (deg)
-    altitude = 20           # of the lowest pointing (deg)
-    places = true           # standards at single places of their raster
-    [seconds]               # exposure times to choose from, by kind
-    clp = [10, 30, 120]
-    [costs]                 # s beside exposing: read-out, turning or pointing, settling
-    clp = 20                # an exposure through the polariser, and likewise lamp, moon, standard
-    filter = 60             # a change of the filter
-    position = 30           # a moving element put in, taken out or turned
-    slew = 1                # for each degree between pointings
-
-Everything else in the file is an observing plan (`simulation.plan_file`), of which the polariser angles are ignored.
+Their file (docs: files) is that of an observing plan, of which the polariser angles are ignored, with a few entries
+more.
 """
 
 from __future__ import annotations
@@ -29,7 +19,7 @@ from jaxtyping import Float
 from walop_jax.data.records import CALIBRATION_PLATE
 from walop_jax.io.errors import errors_naming
 from walop_jax.io.text import parse_toml, read_text
-from walop_jax.model.parameters import unknown_name
+from walop_jax.model.parameters import check_names
 from walop_jax.simulation.observing_plan import EXPOSED, OUT, ObservingPlan, Stop, is_plan, plan_of
 from walop_jax.sky.moon import altitude, body_direction
 
@@ -147,9 +137,8 @@ class Could:
     any_plate: bool = False
 
     def __post_init__(self) -> None:
+        check_names("kind of exposure", self.seconds, EXPOSED)
         for kind, times in self.seconds.items():
-            if kind not in EXPOSED:
-                raise unknown_name("kind of exposure", kind, tuple(EXPOSED))
             if not times or min(times) <= 0:
                 raise ValueError(f"seconds: {kind} = {list(times)}; give exposure times above 0")
         if not -90.0 <= self.altitude < 90.0:
@@ -182,16 +171,12 @@ class Could:
             if name in content:
                 own[name] = content.pop(name)
         costs = dict(content.pop("costs", {}))
-        for name in costs:
-            if name not in Costs.__dataclass_fields__:
-                raise unknown_name("cost", name, tuple(Costs.__dataclass_fields__))
+        check_names("cost", costs, Costs.__dataclass_fields__)
         plate = content.get("plate", ())
         if own.setdefault("any_plate", ANY in plate if isinstance(plate, list) else plate == ANY):
             listed = [angle for angle in plate if angle != ANY] if isinstance(plate, list) else []
             content["plate"] = plate = listed or [OUT]
-        for angle in plate:
-            if isinstance(angle, str) and angle != OUT:
-                raise unknown_name("angle of the plate", angle, (OUT, ANY))
+        check_names("angle of the plate", (a for a in plate if isinstance(a, str) and a != OUT), (OUT, ANY))
         seconds = {kind: tuple(np.atleast_1d(v).tolist()) for kind, v in content.pop("seconds", {}).items()}
         return cls(plan_of(content, folder), Costs(**costs), seconds, **own)
 

@@ -27,7 +27,7 @@ from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import InputTable, numeric_column
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.model.effects import effect_by_name
-from walop_jax.model.parameters import unknown_name
+from walop_jax.model.parameters import check_names
 from walop_jax.plans.exposures import Candidates
 from walop_jax.plans.optimal import root_of
 
@@ -165,8 +165,7 @@ def wanted(found: Candidates, field: FieldErrors | None, criterion: str | InputT
         return Wanted(MEAN, "error of p, rms over the field", "%", root_of(whole)[:, None])
     if criterion == APART:
         return _apart(found)
-    if criterion not in found.names:
-        raise unknown_name("criterion or parameter", criterion, (WORST, MEAN, APART, *found.names))
+    check_names("criterion or parameter", [criterion], (WORST, MEAN, APART, *found.names))
     unit = found.model.parameters[found.model.index(criterion)].unit
     one = np.zeros((len(found.values), 1, len(found.names), 1))
     one[:, 0, found.names.index(criterion)] = 1.0

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import unknown_name, with_values
+from walop_jax.model.parameters import check_names, with_values
 from walop_jax.posterior.samplers import Density
 
 Vector = Float[np.ndarray, " f"]
@@ -238,9 +238,7 @@ def choose_sampled(
     Where there are more, the straightest are marginalised with the rest. Raises ValueError for unknown names.
     """
     if names is not None:
-        for name in names:
-            if name not in target.names:
-                raise unknown_name("free parameter", name, target.names)
+        check_names("free parameter", names, target.names)
         chosen = np.array([target.names.index(name) for name in names], int)
     else:
         chosen = np.setdiff1d(np.arange(len(target.free)), near_linear(target))

@@ -1,24 +1,6 @@
 """The plan of a calibration run: points, exposures, standards and filters, without any light yet.
 
-As a TOML file: what `ObservingPlan` has, by the same names, and nothing else.
-
-    instrument = "WALOP-SOUTH"        # or a description file, beside the plan
-    grid = 12
-    polariser_angles = 15             # so many over half a turn; or a list of angles (deg)
-    full_turn = true                  # those over a full one
-    plate = ["out", 0, 45]
-    filters = ["SDSS-r", "NB-660"]
-    electrons = 5e5
-
-    [[stops]]                         # each exposure through the polariser, in place of all combinations
-    polariser_angle = 33.75
-    plate = "out"
-    times = 4
-    seconds = 20                      # exposure time; electrons are those of the usual one
-
-    [[stops]]
-    kind = "moon"                     # or "standard", with place = 12 for one place of its raster; "lamp"
-    number = 3
+Its TOML file (docs: files) has what `ObservingPlan` has, by the same names, and nothing else.
 """
 
 from __future__ import annotations
@@ -44,7 +26,7 @@ from walop_jax.io.errors import errors_naming, nearest
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.effects.base import Context
 from walop_jax.model.instrument import Instrument, as_designed, nominal_instrument
-from walop_jax.model.parameters import unknown_name
+from walop_jax.model.parameters import check_names, unknown_name
 from walop_jax.sky.moon import body_direction, local_sidereal_time, offset_direction
 
 NAN = float("nan")
@@ -84,8 +66,7 @@ class Stop:
     seconds: float | None = None
 
     def __post_init__(self) -> None:
-        if self.kind not in EXPOSED:
-            raise unknown_name("kind of a stop", self.kind, tuple(EXPOSED))
+        check_names("kind of a stop", [self.kind], EXPOSED)
         if (self.polariser_angle is None) == (self.kind == "clp"):
             raise ValueError(
                 f"a stop of kind {self.kind} {'needs' if self.kind == 'clp' else 'has no'} polariser_angle"
@@ -164,9 +145,9 @@ class ObservingPlan:
             described(self.instrument)  # an unknown name is an error here
         if np.isnan(self.field):
             object.__setattr__(self, "field", self._raster[1])
+        moving = self.design.moving()
+        check_names("moving element", self.moving, moving)
         for prefix in self.moving:
-            if prefix not in self.design.moving():
-                raise unknown_name("moving element", prefix, self.design.moving())
             if not self.moving[prefix]:
                 raise ValueError(f"moving: {prefix} has no positions; list its angles (deg), or leave it out")
         for name in ("grid", "standard_grid"):
@@ -195,11 +176,9 @@ class ObservingPlan:
         if len(self.curves()) < len(self.filters):
             raise ValueError("filters: one is there twice; give each a name of its own")
         for stop in self.stops:
-            if stop.filter not in self.filter_names:
-                raise unknown_name("filter of a stop", stop.filter, self.filter_names)
+            check_names("filter of a stop", [stop.filter], self.filter_names)
+            check_names("moving element of a stop", stop.moving, moving)
             for prefix in stop.moving:
-                if prefix not in self.design.moving():
-                    raise unknown_name("moving element of a stop", prefix, self.design.moving())
                 if prefix not in self.moving:
                     raise ValueError(
                         f"a stop has a position of {prefix}: list all of them in the plan as well, "
@@ -493,9 +472,7 @@ def plan_of(
 ) -> ObservingPlan:
     """The plan of the entries of a file in `folder`; the rest as `read_plan`."""
     content = dict(content)
-    for name in content:
-        if name not in _KNOWN:
-            raise unknown_name("entry of a plan", name, _KNOWN)
+    check_names("entry of a plan", content, _KNOWN)
     own = instrument_named(content, folder)
     content.pop("instrument", None)
     instrument = own if instrument is None else instrument
