@@ -141,14 +141,15 @@ class ResidualMap:
 STARS, LARGEST_P = 100, 0.05
 
 
-def _point_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
+def point_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
+    """Analysis vectors (band, camera, Stokes) at a field point for light behind the telescope, as a computation."""
     rows = light.band_rows(instrument, plan, x, y)
     return light.camera_vectors(instrument, rows, instrument.throughput.at(x, y), x, y)
 
 
 def point_sky_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
     """Analysis vectors (band, camera, Stokes) at a field point for light from the sky, inside a computation."""
-    return _point_vectors(instrument, plan, x, y) @ light.telescope(instrument, x, y)
+    return point_vectors(instrument, plan, x, y) @ light.telescope(instrument, x, y)
 
 
 def point_matrix(
@@ -183,7 +184,7 @@ def _slopes_at(
 
 
 _slopes = compiled(_slopes_at, kept_as="slopes")
-_vectors = compiled(jax.vmap(_point_vectors, in_axes=(None, None, 0, 0)), kept_as="vectors")
+_vectors = compiled(jax.vmap(point_vectors, in_axes=(None, None, 0, 0)), kept_as="vectors")
 _sky_vectors = compiled(jax.vmap(point_sky_vectors, in_axes=(None, None, 0, 0)), kept_as="sky_vectors")
 
 

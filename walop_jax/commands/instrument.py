@@ -126,21 +126,17 @@ def checked(source: PathLike) -> CheckedInstrument:
     import numpy as np
 
     from walop_jax import DataError, Instrument
+    from walop_jax.calibration.matrix import point_vectors
     from walop_jax.fit.model_file import model_without_data
-    from walop_jax.model import light
     from walop_jax.model.dependence import needs, optical_indices
     from walop_jax.model.plan import blank_plan
-
-    def camera_vectors(design: Instrument, plan: Any, x: Any, y: Any) -> Any:
-        rows = light.band_rows(design, plan, x, y)
-        return light.camera_vectors(design, rows, design.throughput.at(x, y), x, y)
 
     design = Instrument.read(source)
     asked = needs(design)
     plan = blank_plan(design, asked.conditions, asked.median)
     edge = OFF_AXIS * min(design.field_limit, LARGEST_FIELD)
     for x, y in ((0.0, 0.0), (edge, -edge)):
-        vectors = np.asarray(jax.jit(camera_vectors)(design, plan, jnp.asarray(x), jnp.asarray(y)))
+        vectors = np.asarray(jax.jit(point_vectors)(design, plan, jnp.asarray(x), jnp.asarray(y)))
         if not np.isfinite(vectors).all():
             raise DataError(f"{design.name}: the optics are not finite at ({x:g}, {y:g}) deg")
         # A camera gives no less than nothing for any light, if its vector is longer in I than in (Q, U, V).

@@ -45,7 +45,7 @@ from numpy.polynomial.legendre import legvander
 from walop_jax.data.records import POLARISER, CalibrationSet, Exposures
 from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram
 from walop_jax.fit.refit import FitResult
-from walop_jax.fit.robust import states
+from walop_jax.fit.robust import cut, states
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.flux import project_flux, sharing
 from walop_jax.likelihood.inverses import unit_columns, whitening
@@ -400,12 +400,7 @@ def exposure_folds(design: Design) -> Int[np.ndarray, " d"]:
 def field_folds(design: Design) -> Int[np.ndarray, " d"]:
     """Fold of every data row: the field cut into 5 × 5 blocks, dealt out so that neighbours differ."""
     points = design.fit.calset.points
-
-    def cell(v: np.ndarray) -> np.ndarray:
-        span = np.ptp(v) or 1.0
-        return np.minimum((5 * (v - v.min()) / span).astype(int), 4)
-
-    return ((cell(points.x) + 2 * cell(points.y)) % HOLDOUT_FOLDS)[design.point]
+    return ((cut(points.x, 5) + 2 * cut(points.y, 5)) % HOLDOUT_FOLDS)[design.point]
 
 
 def held_out(design: Design, scheme: str) -> float:

@@ -124,11 +124,12 @@ def states(calset: CalibrationSet) -> Int[np.ndarray, " e"]:
 
 def field_cells(calset: CalibrationSet) -> Int[np.ndarray, " p"]:
     """Number of the cell of every field point: the field cut into `CELLS` × `CELLS`."""
+    return _labels(cut(calset.points.x, CELLS) * CELLS + cut(calset.points.y, CELLS))
 
-    def cut(v: Float[np.ndarray, " p"]) -> Int[np.ndarray, " p"]:
-        return np.minimum((CELLS * (v - v.min()) / (np.ptp(v) or 1.0)).astype(int), CELLS - 1)
 
-    return _labels(cut(calset.points.x) * CELLS + cut(calset.points.y))
+def cut(values: Float[np.ndarray, " p"], count: int) -> Int[np.ndarray, " p"]:
+    """The part, of so many of equal width from the smallest value to the largest, in which each value lies."""
+    return np.minimum((count * (values - values.min()) / (np.ptp(values) or 1.0)).astype(int), count - 1)
 
 
 def _labels(values: np.ndarray) -> Int[np.ndarray, " n"]:

@@ -17,6 +17,7 @@ Exposures      are not compressed beforehand, although light is linear in them: 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -245,13 +246,16 @@ def _normal_equations(
     points, block = data.x.shape[0], limits.JACOBIAN_BLOCK
     if points <= block or points % block:
         return function(data)
-    parts = jax.tree.map(lambda v: v.reshape(-1, block, *v.shape[1:]), data)
-    blank = jax.tree.map(
-        lambda v: jnp.zeros(v.shape), jax.eval_shape(function, jax.tree.map(lambda v: v[0], parts))
-    )
-    return jax.lax.scan(lambda sum_, part: (jax.tree.map(jnp.add, sum_, function(part)), None), blank, parts)[
-        0
-    ]
+    return summed(function, jax.tree.map(lambda v: v.reshape(-1, block, *v.shape[1:]), data))
+
+
+def summed(function: Callable[[Any], Any], parts: Any) -> Any:
+    """Sums of what a function gives for each of the parts along the first axis, one part after the other."""
+    first = jax.eval_shape(function, jax.tree.map(lambda v: v[0], parts))
+    nothing = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), first)
+    return jax.lax.scan(
+        lambda total, part: (jax.tree.map(jnp.add, total, function(part)), None), nothing, parts
+    )[0]
 
 
 def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None) -> Normal:

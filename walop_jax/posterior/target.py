@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -145,17 +145,10 @@ def exact_density(target: Target, inflate: bool = False) -> Density:
         ln_f = w[-1] * target.ln_f_unit
         return -0.5 * (chi2 * jnp.exp(-2.0 * ln_f) + total + (ln_f / LN_F_WIDTH) ** 2) - measured * ln_f
 
-    def over_chunks(function: Callable[[engine.PointData], Any], chunks: engine.PointData) -> Any:
-        blank = jax.eval_shape(function, jax.tree.map(lambda v: v[0], chunks))
-        zero = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), blank)
-        return jax.lax.scan(
-            lambda total, chunk: (jax.tree.map(jnp.add, total, function(chunk)), None), zero, chunks
-        )[0]
-
     def value(w: Array, template: Instrument, plan: Any, chunks: engine.PointData, *linear: Array) -> Array:
         first, along, offset, slope = linear
         values = first + along @ w[:free]
-        chi2 = over_chunks(lambda chunk: chi2_of(values, template, plan, chunk), chunks)
+        chi2 = engine.summed(lambda chunk: chi2_of(values, template, plan, chunk), chunks)
         return log_density(w, chi2, offset, slope)
 
     def with_gradient(
@@ -163,7 +156,7 @@ def exact_density(target: Target, inflate: bool = False) -> Density:
     ) -> tuple[Array, Array]:
         first, along, offset, slope = linear
         values = first + along @ w[:free]
-        here = over_chunks(lambda chunk: jax.value_and_grad(chi2_of)(values, template, plan, chunk), chunks)
+        here = engine.summed(lambda chunk: jax.value_and_grad(chi2_of)(values, template, plan, chunk), chunks)
         chi2, by_values = here
         # χ² enters as the line that has its value and slope at w.
         return jax.value_and_grad(
