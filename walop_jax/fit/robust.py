@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.fit.search import free_scales
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.compressed import compressed
 from walop_jax.likelihood.frames import PixelPosterior, Vector
@@ -47,7 +48,7 @@ def robust_errors(likelihood: Likelihood, values: Vector, posterior: Posterior) 
     """
     rows = likelihood.priors
     model, scale = likelihood.model, posterior.noise_scale
-    unit = np.array([model.parameters[i].scale for i in model.free])
+    unit = free_scales(model)
     prior = np.zeros((len(values), len(values)))
     prior[rows.index, rows.index] = rows.width**-2
     prior = model.selection().T @ prior @ model.selection()

@@ -36,6 +36,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.model import fold, light
 from walop_jax.model.compiled import array
+from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument, Scalar
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
@@ -44,7 +45,6 @@ from walop_jax.model.plan import Plan
 from walop_jax.model.ray import CONDITIONS, Conditions, Ray
 from walop_jax.model.sources import MoonPatches, MoonSky, Sight
 
-REFERENCE_WAVELENGTH = 0.62  # µm
 LAYER_NUMBERS = ("thickness", "axis", "cut")
 
 
