@@ -9,10 +9,14 @@ import handmade_run
 import numpy as np
 import pytest
 from html_page import Page
+from matplotlib.figure import Figure
 
 from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import astropy_table, write_table
 from walop_jax.io.text import probability, value_and_error, with_error
+from walop_jax.model.effects import EFFECTS
+from walop_jax.posterior import Run
+from walop_jax.reports import page as page_module
 from walop_jax.reports.page import render
 from walop_jax.reports.run import read_run
 from walop_jax.reports.wording import effect_in_words, verdict_of_diagnosis
@@ -351,3 +355,17 @@ def test_the_data_are_told_of(tmp_path):
     assert "Exposures2 (2 through the polariser)" in text
     assert "Polariser angles2 modulo 180°, widest gap 135°" in text
     assert "Standardsnone" in text
+
+
+def test_figures_are_drawn_from_the_run_that_was_given(tmp_path, monkeypatch):
+    """With its effects and with its data, wherever they are: without these they could not be drawn."""
+    drawn = []
+
+    def draw(name, source):
+        drawn.append((name, source.catalogue, source.data))
+        return Figure()
+
+    monkeypatch.setattr(page_module, "draw", draw)
+    folder = handmade_run.make_refit(tmp_path / "run")
+    render(read_run(Run(folder, EFFECTS[:2], ("elsewhere.fits",))))
+    assert drawn == [("residuals", EFFECTS[:2], ("elsewhere.fits",))]
