@@ -175,6 +175,12 @@ class Allocation:
         """Proven relative distance of the criterion from that of the best plan."""
         return self.value / self.bound - 1.0
 
+    @property
+    def weights(self) -> dict[tuple[int, tuple[float, ...]], float]:
+        """The weights by family and place."""
+        keys = ((int(f), tuple(p.tolist())) for f, p in zip(self.family, self.place, strict=True))
+        return dict(zip(keys, self.weight.tolist(), strict=True))
+
 
 class _Some:
     """The problem for a few candidates: their matrices laid out, and the barrier method on them."""

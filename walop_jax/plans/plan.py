@@ -304,11 +304,11 @@ def plan_from(
         tell("how long the goal takes")
         try:
             cheapest, least = least_budget(whole, want.variance(goal), gap=gap)
-            needed = (_cost(whole, cheapest) / 60.0, least / 60.0)
+            needed = (_cost(whole, cheapest.weights) / 60.0, least / 60.0)
         except NotEstimableError:
             said = f"no time reaches {digits(goal, '.3g')} {want.unit}"
             endless = (f"{want.what}: {said}; add other settings to what could be observed",)
-    total = _total(experiment, best)
+    total = experiment.known + information_of_weights(experiment, best.weights)[0]
     plan = dataclasses.replace(
         some.could.plan,
         stops=tuple(some.choices[line.choice].stop(line.place, line.times) for line in lines),
@@ -338,6 +338,10 @@ def plan_from(
     )
 
 
+Weights = Mapping[tuple[int, tuple[float, ...]], float]
+"""How often exposures are taken, by choice and place."""
+
+
 def experiment_of(
     found: Candidates, minutes: float, want: Wanted, known: Float[np.ndarray, "f f"] | None = None
 ) -> Experiment:
@@ -361,10 +365,9 @@ def _errors(
     return np.zeros((len(found.values), 0)) if field is None else field.error(covariances)
 
 
-def _cost(experiment: Experiment, plan: Allocation) -> float:
+def _cost(experiment: Experiment, weights: Weights) -> float:
     return sum(
-        w * float(experiment.families[f].cost_at(np.atleast_2d(p))[0])
-        for f, p, w in zip(plan.family, plan.place, plan.weight, strict=True)
+        w * float(experiment.families[f].cost_at(np.atleast_2d(p))[0]) for (f, p), w in weights.items()
     )
 
 
@@ -450,7 +453,7 @@ def _within(
         whole = dataclasses.replace(whole, family=np.array([kept[i] for i in whole.family]))
         lines = _ordered(found, whole)
         between = sum(_changes(found, lines))
-        if _cost(experiment, whole) + between <= budget * (1 + 1e-9):
+        if _cost(experiment, whole.weights) + between <= budget * (1 + 1e-9):
             return whole, lines
         changes = max(between, changes + 1.0)
     raise ValueError(f"{budget / 60:g} minutes do not pay for the changes between exposures; give more time")
@@ -458,10 +461,7 @@ def _within(
 
 def _ordered(found: Candidates, plan: Allocation) -> list[Line]:
     """Indoors setting by setting, the polariser turning one way; then the sky, last setting first, the nearest next."""
-    lines = [
-        Line(int(f), tuple(p.tolist()), int(w))
-        for f, p, w in zip(plan.family, plan.place, plan.weight, strict=True)
-    ]
+    lines = [Line(*at, int(times)) for at, times in plan.weights.items()]
     settings = list(dict.fromkeys(found.choices[i].setting for i in sorted({line.choice for line in lines})))
 
     def key(line: Line) -> tuple[int, int, float]:
@@ -512,19 +512,6 @@ def _changes(found: Candidates, lines: list[Line]) -> Iterator[float]:
 # -------------------------------------------------------------------------------------------------- what it is worth
 
 
-def _total(experiment: Experiment, plan: Allocation) -> Float[np.ndarray, "r n n"]:
-    """M of a plan in every draw."""
-    total = experiment.known.copy()
-    for number, place, weight in zip(plan.family, plan.place, plan.weight, strict=True):
-        total += weight * _of(experiment, int(number), place)
-    return total
-
-
-def _of(experiment: Experiment, number: int, place: Place) -> Float[np.ndarray, "r n n"]:
-    """M of one exposure."""
-    return experiment.families[number].information(np.atleast_2d(place))[:, 0]
-
-
 def covariance(total: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r n n"]:
     """M⁻¹, scaled so that gauges drop out."""
     return np.stack([pseudo_inverse(matrix, 1e-13) for matrix in total])
@@ -540,7 +527,7 @@ def criterion(experiment: Experiment, total: Float[np.ndarray, "r n n"]) -> floa
 def _described(
     found: Candidates, experiment: Experiment, lines: list[Line], best: Allocation
 ) -> Iterator[PlannedExposure]:
-    keys = [(int(f), tuple(p.tolist())) for f, p in zip(best.family, best.place, strict=True)]
+    keys = list(best.weights)
     without, more = worth(experiment, best)
     for line, change in zip(lines, _changes(found, lines), strict=True):
         choice, i = found.choices[line.choice], keys.index((line.choice, line.place))
@@ -580,14 +567,12 @@ def usual_plans(found: Candidates) -> Iterator[tuple[str, dict[tuple[int, tuple[
 
 
 def information_of_weights(
-    experiment: Experiment, weights: Mapping[tuple[int, tuple[float, ...]], float]
+    experiment: Experiment, weights: Weights
 ) -> tuple[Float[np.ndarray, "r n n"], float]:
     """M of weights of (choice, place) without what is known, and their cost."""
-    whole = sum(w * _of(experiment, *key) for key, w in weights.items())
-    cost = sum(
-        w * float(experiment.families[i].cost_at(np.atleast_2d(p))[0]) for (i, p), w in weights.items()
-    )
-    return np.asarray(whole), cost
+    families = experiment.families
+    whole = sum(w * families[f].information(np.atleast_2d(p))[:, 0] for (f, p), w in weights.items())
+    return np.asarray(whole), _cost(experiment, weights)
 
 
 def _beside(found: Candidates, experiment: Experiment, want: Wanted) -> Iterator[tuple[str, float]]:
