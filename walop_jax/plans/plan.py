@@ -27,7 +27,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import Effect
-from walop_jax.plans.could import Could, Place, separation
+from walop_jax.plans.could import Could, separation
 from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
 from walop_jax.plans.optimal import (
     GAP,
