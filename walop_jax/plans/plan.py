@@ -339,7 +339,7 @@ def plan_from(
 
 
 Weights = Mapping[tuple[int, tuple[float, ...]], float]
-"""How often exposures are taken, by choice and place."""
+"""Numbers of exposures, by choice and place."""
 
 
 def experiment_of(
