@@ -106,12 +106,14 @@ class _Single(NamedTuple):
     """One number, or a few of one thing, that may be otherwise: its columns, and its size in words.
 
     `plausible` is the largest mistake to reckon with where the data would not show it; 0 where errors hold it already.
+    `stated` is the number of the set that it is, if it is one.
     """
 
     candidate: Candidate
     said: Callable[[Score], str]
     plausible: float = 0.0
     unit: str = ""
+    stated: _Stated | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -149,8 +151,11 @@ def scored(design: Design, rivals: tuple[_Single, ...]) -> Singles:
     along = design.projector.basis.T @ columns
     if not rivals:
         return Singles((), ScoreTable((), 1.0, 1.0, 1.0), along, np.zeros(0))
-    table, left = _table(design, names, widths, columns)
-    return Singles(rivals, table, along, left)
+    each = [one.candidate.columns for one in rivals]
+    space = ScoreSpace.projected(design.projector, names, widths, each)
+    residual = design.projector(design.residual)
+    table = space.table(columns.T @ residual, float(residual @ residual))
+    return Singles(rivals, table, along, np.diag(space.gram))
 
 
 def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
@@ -250,12 +255,16 @@ def _holds(one: Score, other: Score) -> bool:
 
 
 def _conditions(design: Design) -> Iterator[_Single]:
-    asked, columns = _asked(design)
-    for one, column in zip(asked, columns.T, strict=True):
-        candidate = Candidate(one.what, column[:, None], np.array([one.width]))
+    """The numbers that the set states and that are used."""
+    asked = list(_stated(design.fit.calset))
+    columns = [design.stacked([column[:, None]]) for column in _columns(design, asked)]
+    for one, column in zip(asked, columns, strict=True):
+        if not column.any():  # a number may be stated and not used
+            continue
+        candidate = Candidate(one.what, column, np.array([one.width]))
         # What stars see as well is no mistake of the matrix alone.
         plausible = 0.0 if one.seen_by_stars else one.width
-        yield _Single(candidate, lambda score, one=one: _in_words(one, score), plausible, one.unit)
+        yield _Single(candidate, lambda score, one=one: _in_words(one, score), plausible, one.unit, one)
 
 
 def _priors(design: Design) -> Iterator[_Single]:
@@ -363,37 +372,12 @@ def _in_words(stated: _Stated, score: Score) -> str:
 
 def condition_scores(design: Design) -> list[_Scored]:
     """The numbers that a set states, each with the score of changing it."""
-    asked, columns = _asked(design)
-    if not asked:
-        return []
-    names = [str(number) for number in range(len(asked))]
-    widths = [np.array([one.width]) for one in asked]
-    table, square = _table(design, names, widths, columns)
+    found = scored(design, tuple(_conditions(design)))
     return [
-        _Scored(one, table[name], column, float(length))
-        for one, name, column, length in zip(asked, names, columns.T, square, strict=True)
+        _Scored(one.stated, found.table[one.candidate.name], one.candidate.columns[:, 0], float(left))
+        for one, left in zip(found.rivals, found.left, strict=True)
+        if one.stated is not None
     ]
-
-
-def _asked(design: Design) -> tuple[list[_Stated], Float[np.ndarray, "d c"]]:
-    """The numbers that a set states and that are used, and the derivatives of the rows."""
-    asked = list(_stated(design.fit.calset))
-    if not asked:
-        return [], np.zeros((len(design.residual), 0))
-    columns = design.stacked([column[:, None] for column in _columns(design, asked)])
-    there = np.flatnonzero(np.any(columns != 0.0, axis=0))  # a number may be stated and not used
-    return [asked[i] for i in there], columns[:, there]
-
-
-def _table(
-    design: Design, names: Sequence[str], widths: Sequence[np.ndarray], columns: Float[np.ndarray, "d c"]
-) -> tuple[ScoreTable, Float[np.ndarray, " c"]]:
-    """Scores of columns, and what the parameters leave of their squares."""
-    each = np.split(columns, np.cumsum([len(own) for own in widths])[:-1], axis=1)
-    space = ScoreSpace.projected(design.projector, names, widths, each)
-    residual = design.projector(design.residual)
-    table = space.table(columns.T @ residual, float(residual @ residual))
-    return table, np.diag(space.gram)
 
 
 def _columns(design: Design, asked: Sequence[_Stated]) -> Iterator[Float[np.ndarray, " _"]]:
