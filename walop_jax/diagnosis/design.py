@@ -177,12 +177,13 @@ def number_of_columns(calset: CalibrationSet, instrument: Instrument) -> int:
     of_camera += 6 * len(HARMONICS) * turning + 3  # time, temperature, flux
     of_camera += 5 * (len(np.unique(e.kind)) - 1) + 3 * (len(np.unique(e.filter)) - 1)
     for prefix in instrument.patched().moving():
-        of_camera += 3 * (len(np.unique(_positions(e, prefix))) - 1)
+        of_camera += 3 * (len(np.unique(positions_of(e, prefix))) - 1)
     gains = (len(e) + int(states(calset).max()) + 1) * (cameras - instrument.cameras.fluxes)
     return cameras * of_camera + gains
 
 
-def _positions(e: Exposures, prefix: str) -> np.ndarray:
+def positions_of(e: Exposures, prefix: str) -> np.ndarray:
+    """Angle (deg) of a moving element in every exposure, or "out", as texts."""
     position = e.position(prefix)
     return np.array([f"{a:g}" if i else "out" for i, a in zip(position.inside, position.angle, strict=True)])
 
@@ -230,7 +231,7 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
         spread = np.nanstd(quantity)
         if np.isfinite(spread) and spread > 1e-9 * max(1.0, float(np.nanmax(np.abs(quantity)))):
             yield _Stratum.of_all(every, name, [np.nan_to_num(quantity / spread)], block)
-    positions = [(prefix.lower(), _positions(e, prefix)) for prefix in measured.likelihood.plan.moving]
+    positions = [(prefix.lower(), positions_of(e, prefix)) for prefix in measured.likelihood.plan.moving]
     for name, label, block in (
         ("kind", e.kind, "exposures"),
         ("filter", e.filter, None),

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.design import Design, positions_of
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.display import Display, Drawn
@@ -90,6 +90,7 @@ def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
     def grouped(labels: np.ndarray) -> dict[str, float]:
         return {str(label): float(by_exposure[labels == label].sum()) for label in np.unique(labels)}
 
+    stood = {prefix: positions_of(e, prefix) for prefix in design.measured.likelihood.plan.moving}
     harmonics, field = _harmonics(design, cube)
     hours = (e.mjd - e.mjd.min()) * 24.0
     order = np.argsort(hours)
@@ -102,7 +103,7 @@ def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
         "wavelength": _named(grouped(e.filter)),
         "kind": _named(grouped(e.kind)),
         "time": "grows with time" if trend > 0.7 else "shrinks with time" if trend < -0.7 else "no trend",
-    }
+    } | {prefix: _named(grouped(at)) for prefix, at in stood.items() if len(np.unique(at)) > 1}
 
 
 # -------------------------------------------------------------------------------------------------------- what is found

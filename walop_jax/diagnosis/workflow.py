@@ -510,7 +510,8 @@ def unexplained(state: Examination, patterns: tuple[tuple[str, float], ...]) -> 
         p = state.table.corrected(nearest.score)
         text += f". {nearest.probe.name} comes nearest (p = {p:.1g}) and does not stand up to a fit"
     where = describe(state.design, state.design.residual)
-    text += f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}"
+    moving = "".join(f"; {p} {where[p]}" for p in state.design.measured.likelihood.plan.moving if p in where)
+    text += f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}{moving}"
     return Unexplained(state.table.p_global, text, patterns)
 
 
