@@ -98,7 +98,10 @@ OUTSIDE: dict[str, tuple[str, ...]] = {
     "quadratic non-linearity": ("gain of O2 * counts", "nonlinearity"),
     "one camera in two exposures": ("gain of E1 * exposure 4", "gain of E1 * exposure 9"),
     "background that varies": (),
-    "image shift by the polariser": (),
+    "image shift by the polariser": tuple(
+        f"gain of {camera} * cos 1 CLP * {along}"
+        for camera, along in (("O1", "x"), ("O2", "x"), ("E1", "y"), ("E2", "y"))
+    ),
     "ring": (),
     "step": (),
     "six times the angle": ("gain of O1 * cos 6 CLP",),

@@ -561,6 +561,8 @@ def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
         for prefix in prefixes:
             for pair in asked.harmonics(prefix, HARMONICS_OF_ENCODER):
                 yield _times(gain, *pair)
+            for pair in asked.harmonics(prefix, (1,)) if asked.over_field else ():
+                yield _times(_times(gain, *pair), "x", "y")  # an image that goes in a circle
         for factor in (*asked.slow(), *asked.nights(), *asked.steps()):
             yield _times(gain, factor)
         if asked.over_field and len(e) <= limits.FREE_EXPOSURES:
