@@ -176,7 +176,7 @@ def _fringes(change: Change) -> Iterator[Sentence]:
 LINEAR = ("diattenuation", "retardance")
 ALONE = ("diattenuation v", "retardance v", "depolarisation")
 NIGHT = 8.0  # hours without an exposure that part two nights
-STEPS = 16  # times of a step that are looked at first
+STEPS, FEW = 16, 18  # times of a step that are looked at first; times of which all spells are
 AFTER = 0.5  # hours behind the last exposure that a step ends
 ROUNDED = 1e-4  # hours, of times that are written into a description
 HARMONICS = (1, 2)
@@ -242,6 +242,13 @@ def starts_of_steps(exposures: Exposures) -> Float[np.ndarray, " s"]:
     """Hours at which something may have changed: midway between exposures."""
     hours = np.unique(hours_since_first(exposures))
     return (hours[1:] + hours[:-1]) / 2.0
+
+
+def evenly(times: Float[np.ndarray, " s"]) -> Float[np.ndarray, " t"]:
+    """`STEPS` or fewer of them that part the others evenly; `retimed` has those between."""
+    return (
+        times[np.unique(((np.arange(STEPS) + 0.5) / STEPS * len(times)).astype(int))] if len(times) else times
+    )
 
 
 def between(start: float, stop: float) -> str:
@@ -329,24 +336,25 @@ class _Asked:
         if self.kelvin:
             yield "kelvin"
 
-    def _times(self) -> Float[np.ndarray, " s"]:
-        """Times that part the exposures evenly, `STEPS` or fewer; `retimed` has those between."""
-        starts = starts_of_steps(self.exposures) if self.hours else np.zeros(0)
-        return (
-            starts[np.unique(((np.arange(STEPS) + 0.5) / STEPS * len(starts)).astype(int))]
-            if len(starts)
-            else starts
-        )
+    def _times(self, inside: Bool[np.ndarray, " e"] | None) -> Float[np.ndarray, " s"]:
+        """Times at which something may have changed, of an element that it may have while it was `inside` the beam."""
+        if not self.hours:
+            return np.zeros(0)
+        starts, hours = starts_of_steps(self.exposures), np.unique(hours_since_first(self.exposures)[inside])
+        return starts[np.unique(np.searchsorted(starts, hours[1:]) - 1)]  # ahead of each but the first
 
-    def steps(self) -> Iterator[str]:
-        """From a time until the end."""
-        yield from (between(time, end_of(self.exposures)) for time in self._times())
+    def steps(self, inside: Bool[np.ndarray, " e"] | None = None) -> Iterator[str]:
+        """From a time until the end; not so near to an end that all but one or two exposures are alike."""
+        yield from (between(time, end_of(self.exposures)) for time in evenly(self._times(inside)[1:-1]))
 
-    def spells(self) -> Iterator[str]:
-        """From a time until another, an eighth or a quarter of the exposures later."""
-        times = self._times()
-        for length in (STEPS // 8, STEPS // 4):
-            yield from (between(*span) for span in zip(times, times[length:], strict=False))
+    def spells(self, inside: Bool[np.ndarray, " e"]) -> Iterator[str]:
+        """From a time until another: all of them, or of many exposures an eighth, a quarter or half of them."""
+        times = self._times(inside)
+        if len(times) <= FEW:
+            yield from (between(*span) for span in itertools.combinations(times, 2))
+            return
+        for length in (STEPS // 8, STEPS // 4, STEPS // 2):
+            yield from (between(*s) for s in zip(evenly(times), evenly(times)[length:], strict=False))
 
     def kinds(self) -> Iterator[str]:
         """Kinds of exposures, but the most frequent."""
@@ -378,12 +386,13 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
             for factor in asked.slow():
                 yield _times(base, factor)
     for element in _turning(instrument, exposures):
-        if element is instrument.polariser:
+        if element is instrument.polariser or not element.moves:
             continue
         for base in _families("of", element.name):
             for pair in asked.harmonics(element.moves, HARMONICS):
                 yield _times(base, *pair)
-        for span in (*asked.steps(), *asked.spells()):
+        inside = exposures.position(element.moves).inside
+        for span in (*asked.steps(inside), *asked.spells(inside)):
             yield (Sentence("turn", "of", element.name, (span,)),)
     yield from _of_plates(instrument, exposures, asked)
     yield from _of_cameras(instrument, asked)
@@ -440,7 +449,8 @@ def _of_polariser(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sente
             yield _times(base, factor)
     for pair in asked.harmonics(polariser.moves, (1,)) if asked.over_field else ():
         yield _times(_times(turn, *pair), "x", "y")  # a beam that wanders over a film that is not uniform
-    for span in (*asked.nights(), *asked.steps(), *asked.spells()):
+    inside = asked.exposures.clp_in
+    for span in (*asked.nights(), *asked.steps(inside), *asked.spells(inside)):
         yield _times(turn, span)
     if asked.over_field and len(asked.exposures) <= limits.FREE_EXPOSURES:
         for number in np.flatnonzero(asked.exposures.clp_in):
@@ -544,6 +554,10 @@ def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence,
     yield tuple(Sentence("gain", "of", name, ("counts",)) for name in names)
     if asked.over_field:
         yield tuple(Sentence("light", "in", name) for name in names)
+        every = tuple(Sentence("gain", "of", name) for name in names)
+        for element in _turning(instrument, asked.exposures):
+            for pair in asked.harmonics(element.moves or "", (1,)):
+                yield _times(_times(every, *pair), "x", "y")
     if asked.hours:
         yield tuple(Sentence("afterglow", "in", name) for name in names)
     if asked.over_field:
@@ -574,7 +588,7 @@ def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
             for factor in (*asked.slow(), *asked.kinds()):
                 yield _times(_times(gain, factor), "x", "y")
             for factor in asked.slow():
-                yield _times(_times(gain, factor), "r2")
+                yield (*_times(gain, factor), *_times(_times(gain, factor), "r2"))  # a focus that drifts
         light = (Sentence("light", "in", camera),)
         if asked.over_field:
             yield (Sentence("light", "in", camera, origin=OPPOSITE),)
