@@ -336,7 +336,7 @@ class _Asked:
         if self.kelvin:
             yield "kelvin"
 
-    def _times(self, inside: Bool[np.ndarray, " e"] | None) -> Float[np.ndarray, " s"]:
+    def moments(self, inside: Bool[np.ndarray, " e"] | None) -> Float[np.ndarray, " s"]:
         """Times at which something may have changed, of an element that it may have while it was `inside` the beam."""
         if not self.hours:
             return np.zeros(0)
@@ -345,11 +345,11 @@ class _Asked:
 
     def steps(self, inside: Bool[np.ndarray, " e"] | None = None) -> Iterator[str]:
         """From a time until the end; not so near to an end that all but one or two exposures are alike."""
-        yield from (between(time, end_of(self.exposures)) for time in evenly(self._times(inside)[1:-1]))
+        yield from (between(time, end_of(self.exposures)) for time in evenly(self.moments(inside)[1:-1]))
 
     def spells(self, inside: Bool[np.ndarray, " e"]) -> Iterator[str]:
         """From a time until another: all of them, or of many exposures an eighth, a quarter or half of them."""
-        times = self._times(inside)
+        times = self.moments(inside)
         if len(times) <= FEW:
             yield from (between(*span) for span in itertools.combinations(times, 2))
             return
