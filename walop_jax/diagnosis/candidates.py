@@ -18,8 +18,7 @@ sine, a gradient two directions. Groups are short: at most two things are free b
     dependence    none; gradient, r², radial, diagonal, astigmatic over the field; wavelength; time, temperature, hour
                   angle; harmonics of the angles; one night; one exposure; the counts; the exposure before
 
-Each sentence carries a look-elsewhere penalty, the logarithm of their number; longer ones are penalised by their
-evidence. `beside_names` tells which groups an effect of the catalogue already is, or holds.
+Each sentence pays the logarithm of their number; longer ones pay by their evidence. `beside_names` tells which groups an effect of the catalogue already is, or holds.
 """
 
 from __future__ import annotations
@@ -230,9 +229,6 @@ def beside_names(
     return alone, parts
 
 
-# ------------------------------------------------------------------------------------------- steps within a night
-
-
 def hours_since_first(exposures: Exposures) -> Float[np.ndarray, " e"]:
     """Hours since the first exposure."""
     return (exposures.mjd - exposures.mjd.min()) * 24.0
@@ -246,9 +242,8 @@ def starts_of_steps(exposures: Exposures) -> Float[np.ndarray, " s"]:
 
 def evenly(times: Float[np.ndarray, " s"]) -> Float[np.ndarray, " t"]:
     """`STEPS` or fewer of them that part the others evenly; `retimed` has those between."""
-    return (
-        times[np.unique(((np.arange(STEPS) + 0.5) / STEPS * len(times)).astype(int))] if len(times) else times
-    )
+    at = np.unique(((np.arange(STEPS) + 0.5) / STEPS * len(times)).astype(int))
+    return times[at[: len(times)]]
 
 
 def between(start: float, stop: float) -> str:
@@ -274,10 +269,8 @@ def retimed(sentence: Sentence, exposures: Exposures, end: int) -> list[Sentence
     if abs(times[at] - given[end]) > ROUNDED:
         return []
     reach = -(-len(times) // STEPS)
-    spans = [
-        (time, given[1]) if end == 0 else (given[0], time)
-        for time in times[max(at - reach, 0) : at + reach + 1]
-    ]
+    near = times[max(at - reach, 0) : at + reach + 1]
+    spans = [(time, given[1]) if end == 0 else (given[0], time) for time in near]
     return [dataclasses.replace(sentence, factors=(between(*span),)) for span in spans if span[0] < span[1]]
 
 
@@ -350,11 +343,9 @@ class _Asked:
     def spells(self, inside: Bool[np.ndarray, " e"]) -> Iterator[str]:
         """From a time until another: all of them, or of many exposures an eighth, a quarter or half of them."""
         times = self.moments(inside)
-        if len(times) <= FEW:
-            yield from (between(*span) for span in itertools.combinations(times, 2))
-            return
-        for length in (STEPS // 8, STEPS // 4, STEPS // 2):
-            yield from (between(*s) for s in zip(evenly(times), evenly(times)[length:], strict=False))
+        some, lengths = evenly(times), (STEPS // 8, STEPS // 4, STEPS // 2)
+        each = itertools.chain(*(zip(some, some[length:], strict=False) for length in lengths))
+        yield from (between(*s) for s in (itertools.combinations(times, 2) if len(times) <= FEW else each))
 
     def kinds(self) -> Iterator[str]:
         """Kinds of exposures, but the most frequent."""
@@ -403,11 +394,7 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
 
 def _turning(instrument: Instrument, exposures: Exposures) -> list[Element]:
     """Elements of the common train that move, the polariser first, and are in the beam in some exposure."""
-    return [
-        element
-        for element in instrument.train()
-        if element.moves and exposures.position(element.moves).inside.any()
-    ]
+    return [e for e in instrument.train() if e.moves and exposures.position(e.moves).inside.any()]
 
 
 def _times(base: tuple[Sentence, ...], *factors: str) -> tuple[Sentence, ...]:
