@@ -18,7 +18,8 @@ sine, a gradient two directions. Groups are short: at most two things are free b
     dependence    none; gradient, r², radial, diagonal, astigmatic over the field; wavelength; time, temperature, hour
                   angle; harmonics of the angles; one night; one exposure; the counts; the exposure before
 
-Each sentence pays the logarithm of their number; longer ones pay by their evidence. `beside_names` tells which groups an effect of the catalogue already is, or holds.
+Each sentence pays the logarithm of their number; longer ones pay by their evidence.
+`beside_names` tells which groups an effect of the catalogue already is, or holds.
 """
 
 from __future__ import annotations
