@@ -14,6 +14,8 @@ from walop_jax.data import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.diagnosis.trust import examined
+from walop_jax.fit.refit import FitResult
 
 REPOSITORY = "https://github.com/HeisenbergK/NewWALOPCalibrate2Dens"
 ELEMENTS = ("m22", "m23", "m32", "m33")
@@ -106,6 +108,11 @@ def measured_matrix(calset: CalibrationSet) -> tuple[np.ndarray, np.ndarray]:
         found.append(np.concatenate(arms, axis=-1))
         fourth.append(five[..., 3:] / five[..., :1])
     return np.stack(found, axis=1), np.stack(fourth, axis=1)
+
+
+def calibration_of(result: FitResult) -> walop.Calibration:
+    """The calibration of a fit, whatever it leaves: that is what the notebook is about."""
+    return walop.Calibration.from_fit(examined(result, as_written=True))
 
 
 def predicted_matrix(calibration, x, y, wavelengths):
