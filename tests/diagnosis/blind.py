@@ -18,7 +18,7 @@ import functools
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +124,12 @@ OUTSIDE: dict[str, tuple[str, ...]] = {
 }
 
 
+def truth_of(name: str, sentences: Iterable[str]) -> set[str]:
+    """The sentences that a shape outside the catalogue is, of all that there are."""
+    begun = tuple(text for text in OUTSIDE[name] if text.endswith(" "))
+    return {*OUTSIDE[name]} - {*begun} | {text for text in sentences if text.startswith(begun)}
+
+
 def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
     """Shapes that are in no catalogue, with their columns; `said` are those of single sentences."""
     e, points = measured.likelihood.calset.exposures, measured.likelihood.calset.points
@@ -187,6 +193,8 @@ class Blind:
         self.sentences = examination.sentences
         self.probes = list(examination.probes)
         self.in_sentences = {p.name: set(p.group[0].in_sentences(model.template)) for p in self.probes}
+        texts = [text for probe in self.sentences for text in candidates.said_by(probe)]
+        self.in_sentences |= {name: truth_of(name, texts) for name in OUTSIDE}
         self.effect_of = {p.name: p.effect.name for p in self.probes}
         self.space = examination.bare
         self.places = self.space.places()
@@ -401,19 +409,14 @@ def _seal(scenes: Sequence[Scene]) -> bytes:
 OUTCOMES = ("right", "in its class", "wrong name", "wrong sentence", "unexplained", "not detected")
 
 
-def _holds(said: set[str], truth: set[str]) -> bool:
-    """True if one of the sentences is said; of one that ends with a blank any text that begins so."""
-    return any(text == one or (one.endswith(" ") and text.startswith(one)) for one in truth for text in said)
-
-
 def _outcome(verdict: Verdict, truth: set[str]) -> str:
     """What is said of something that the catalogue does not hold; `truth` are the sentences that it is."""
     if verdict.kind == "consistent":
         return "not detected"
     told = {*verdict.named, *(text for group in verdict.said for text in group.split("; "))}
-    if _holds(told, truth):
+    if told & truth:
         return "right"
-    if _holds({text for one in verdict.classes for group in one for text in group.split("; ")}, truth):
+    if truth & {text for one in verdict.classes for group in one for text in group.split("; ")}:
         return "in its class"
     if any(name != "described" for name in verdict.named):
         return "wrong name"
@@ -422,7 +425,7 @@ def _outcome(verdict: Verdict, truth: set[str]) -> str:
 
 
 def summarise(judged: Sequence[tuple[Scene, Verdict]], known: dict[str, set[str]]) -> dict[str, object]:
-    """Rates over judged scenes, and the confusion of names; `known` are the sentences of the effects, by probe."""
+    """Rates over judged scenes, and the confusion of names; `known` are the sentences of probes and of shapes."""
     rates: dict[str, list[bool]] = collections.defaultdict(list)
     pulls: list[float] = []
     mistakes: list[str] = []
@@ -437,7 +440,7 @@ def summarise(judged: Sequence[tuple[Scene, Verdict]], known: dict[str, set[str]
         if scene.kind == "null":
             rates["false alarm"].append(verdict.kind != "consistent")
         elif scene.kind == "outside":
-            outcome = _outcome(verdict, set(OUTSIDE[scene.truth[0]]))
+            outcome = _outcome(verdict, known[scene.truth[0]])
             for one in OUTCOMES:
                 rates[f"outside: {one}, SNR {ratio}"].append(outcome == one)
             rates[f"outside: {outcome}, SNR {ratio}, {scene.truth[0]}"].append(True)

@@ -16,10 +16,11 @@ sine, a gradient two directions. Groups are short: at most two things are free b
     places        ahead of and behind every element that acts on polarisation, in the common train and in the arms; of
                   the polariser; of a moving element; of a source
     dependence    none; gradient, r², radial, diagonal, astigmatic over the field; wavelength; time, temperature, hour
-                  angle; harmonics of the angles; one night; one exposure; the counts; the exposure before
+                  angle; harmonics of the angles; one night; from a time on; a spell; one exposure; a kind of
+                  exposures; the counts; the exposure before
 
-Each sentence pays the logarithm of their number; longer ones pay by their evidence.
-`beside_names` tells which groups an effect of the catalogue already is, or holds.
+Each sentence pays the logarithm of their number; longer ones pay by their evidence. `beside_names` tells which
+groups an effect of the catalogue already is, or holds.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from walop_jax.model.effects.optics import DISPLACEMENTS
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
+from walop_jax.model.plan import hours_of
 from walop_jax.model.ray import CONDITIONS
 from walop_jax.model.responses import acts
 
@@ -230,14 +232,9 @@ def beside_names(
     return alone, parts
 
 
-def hours_since_first(exposures: Exposures) -> Float[np.ndarray, " e"]:
-    """Hours since the first exposure."""
-    return (exposures.mjd - exposures.mjd.min()) * 24.0
-
-
 def starts_of_steps(exposures: Exposures) -> Float[np.ndarray, " s"]:
     """Hours at which something may have changed: midway between exposures."""
-    hours = np.unique(hours_since_first(exposures))
+    hours = np.unique(hours_of(exposures))
     return (hours[1:] + hours[:-1]) / 2.0
 
 
@@ -254,7 +251,7 @@ def between(start: float, stop: float) -> str:
 
 def end_of(exposures: Exposures) -> float:
     """Hours at which a step ends: `AFTER` the last exposure."""
-    return float(hours_since_first(exposures).max()) + AFTER
+    return float(hours_of(exposures).max()) + AFTER
 
 
 def retimed(sentence: Sentence, exposures: Exposures, end: int) -> list[Sentence]:
@@ -334,7 +331,7 @@ class _Asked:
         """Times at which something may have changed, of an element that it may have while it was `inside` the beam."""
         if not self.hours:
             return np.zeros(0)
-        starts, hours = starts_of_steps(self.exposures), np.unique(hours_since_first(self.exposures)[inside])
+        starts, hours = starts_of_steps(self.exposures), np.unique(hours_of(self.exposures)[inside])
         return starts[np.unique(np.searchsorted(starts, hours[1:]) - 1)]  # ahead of each but the first
 
     def steps(self, inside: Bool[np.ndarray, " e"] | None = None) -> Iterator[str]:
@@ -357,7 +354,7 @@ class _Asked:
         """Every night, where there are several."""
         if not self.hours:
             return
-        hours = np.sort(hours_since_first(self.exposures))
+        hours = np.sort(hours_of(self.exposures))
         first = np.flatnonzero(np.diff(hours, prepend=-np.inf) > NIGHT)
         if len(first) < 2:
             return
@@ -377,13 +374,13 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
                 yield _times(base, "colour")
             for factor in asked.slow():
                 yield _times(base, factor)
-    for element in _turning(instrument, exposures):
-        if element is instrument.polariser or not element.moves:
+    for prefix, element in _turning(instrument, exposures).items():
+        if element is instrument.polariser:
             continue
         for base in _families("of", element.name):
-            for pair in asked.harmonics(element.moves, HARMONICS):
+            for pair in asked.harmonics(prefix, HARMONICS):
                 yield _times(base, *pair)
-        inside = exposures.position(element.moves).inside
+        inside = exposures.position(prefix).inside
         for span in (*asked.steps(inside), *asked.spells(inside)):
             yield (Sentence("turn", "of", element.name, (span,)),)
     yield from _of_plates(instrument, exposures, asked)
@@ -393,9 +390,10 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
     yield from _together(instrument, asked)
 
 
-def _turning(instrument: Instrument, exposures: Exposures) -> list[Element]:
-    """Elements of the common train that move, the polariser first, and are in the beam in some exposure."""
-    return [e for e in instrument.train() if e.moves and exposures.position(e.moves).inside.any()]
+def _turning(instrument: Instrument, exposures: Exposures) -> dict[str, Element]:
+    """Elements of the common train that move and are in the beam in some exposure, by the prefix of their columns."""
+    moving = {element.moves: element for element in instrument.train() if element.moves}
+    return {prefix: element for prefix, element in moving.items() if exposures.position(prefix).inside.any()}
 
 
 def _times(base: tuple[Sentence, ...], *factors: str) -> tuple[Sentence, ...]:
@@ -543,8 +541,8 @@ def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence,
     if asked.over_field:
         yield tuple(Sentence("light", "in", name) for name in names)
         every = tuple(Sentence("gain", "of", name) for name in names)
-        for element in _turning(instrument, asked.exposures):
-            for pair in asked.harmonics(element.moves or "", (1,)):
+        for prefix in _turning(instrument, asked.exposures):
+            for pair in asked.harmonics(prefix, (1,)):
                 yield _times(_times(every, *pair), "x", "y")
     if asked.hours:
         yield tuple(Sentence("afterglow", "in", name) for name in names)
@@ -556,11 +554,10 @@ def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence,
 
 def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
     cameras, e = instrument.cameras.names, asked.exposures
-    prefixes = list(dict.fromkeys(one.moves for one in _turning(instrument, e) if one.moves))
     for camera in cameras:
         gain = (Sentence("gain", "of", camera),)
         yield _times(gain, "counts")
-        for prefix in prefixes:
+        for prefix in _turning(instrument, e):
             for pair in asked.harmonics(prefix, HARMONICS_OF_ENCODER):
                 yield _times(gain, *pair)
             for pair in asked.harmonics(prefix, (1,)) if asked.over_field else ():

@@ -92,8 +92,7 @@ def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
 
     stood = {prefix: positions_of(e, prefix) for prefix in design.measured.likelihood.plan.moving}
     harmonics, field = _harmonics(design, cube)
-    hours = (e.mjd - e.mjd.min()) * 24.0
-    order = np.argsort(hours)
+    order = np.argsort(e.mjd)
     rms = np.sqrt(by_exposure / np.maximum(len(names) * design.measured.used.sum(axis=0), 1))
     trend = float(np.corrcoef(np.arange(len(e)), rms[order])[0, 1]) if len(e) > 2 and rms.std() > 0 else 0.0
     return {

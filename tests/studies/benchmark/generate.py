@@ -28,7 +28,7 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "diagnosis")]
 
-from blind import OUTSIDE, Blind, outside  # noqa: E402
+from blind import Blind, outside  # noqa: E402
 
 from walop_jax.data.records import Block, CalibrationSet, Points  # noqa: E402
 from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
@@ -158,11 +158,12 @@ def hidden(layout: Layout, seed: int, draws: int, nulls: int, ratios: Sequence[f
         yield Hidden("null", "", 0.0, (), str(rng.choice(blind.visible)), *nothing)
     for name, column in outside(layout.whole, single):
         rows, beyond = (part[:, 0] for part in layout.projected(column[:, None]))
+        said = tuple(sorted(blind.in_sentences[name]))
         for ratio in ratios:
             for _ in range(draws):
                 size = rng.choice([-1.0, 1.0]) * ratio / np.linalg.norm(rows)
                 without = str(rng.choice(blind.visible))
-                yield Hidden("outside", name, ratio, OUTSIDE[name], without, size * rows, size * beyond)
+                yield Hidden("outside", name, ratio, said, without, size * rows, size * beyond)
     for name in blind.visible:
         for ratio in ratios:
             drawn = blind.hidden(name, ratio, (name,), "removed")

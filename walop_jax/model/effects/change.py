@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 from walop_jax.data.records import POLARISER
 from walop_jax.model.effects.factors import Factor, factor
 from walop_jax.model.instrument import Instrument, Scalar
-from walop_jax.model.parameters import unknown_name
+from walop_jax.model.parameters import check_names
 from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays
 
@@ -158,8 +158,8 @@ class Change:
         """Raise ValueError for a factor that the kind would leave out."""
         allowed, angle = KINDS[self.kind].grows(instrument, self)
         for one in self.grows_with:
-            if one.form == "kind" and one.given[0] not in instrument.kinds:
-                raise unknown_name("KIND of exposures", one.given[0], instrument.kinds)
+            if one.form == "kind":
+                check_names("KIND of exposures", one.given, instrument.kinds)
             known = angle is None or (one.form in ("cos", "sin") and one.given[-1] == angle)
             single = one.form in ("cos", "sin", "exposure", "kind")
             if one.depends_on not in allowed or (single and not known):
