@@ -508,7 +508,7 @@ def unexplained(state: Examination, patterns: tuple[tuple[str, float], ...]) -> 
     if leading:
         nearest = max(leading, key=lambda item: item.log_bayes)
         p = state.table.corrected(nearest.score)
-        text += f". {nearest.probe.name} comes nearest (p = {p:.1g}) and does not stand up to a fit"
+        text += f". Nearest comes '{nearest.probe.name}' (p = {p:.1g}), which was not confirmed"
     where = describe(state.design, state.design.residual)
     moving = "".join(f"; {p} {where[p]}" for p in state.design.measured.likelihood.plan.moving if p in where)
     text += f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}{moving}"
