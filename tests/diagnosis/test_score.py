@@ -72,12 +72,17 @@ def test_evidence_is_the_ratio_of_gaussian_integrals(design):
     base, columns, scorer = design
     r = np.random.default_rng(3).standard_normal(ROWS)
     table = scorer(r)
-    # Marginal likelihood with amplitudes N(0, 1) and flat base: compare densities of the projected data.
+    # Marginal likelihood with amplitudes N(0, t²), t one of four where there are several, and flat base: compare
+    # densities of the projected data.
     q = np.linalg.svd(base, full_matrices=True)[0][:, FREE:]
     y = q.T @ r / table.noise_scale
     for name, c in columns.items():
         slope = q.T @ c / table.noise_scale
-        with_effect = stats.multivariate_normal(np.zeros(len(y)), np.eye(len(y)) + slope @ slope.T).logpdf(y)
+        with_scale = [
+            stats.multivariate_normal(np.zeros(len(y)), np.eye(len(y)) + t**2 * slope @ slope.T).logpdf(y)
+            for t in ((1.0, 0.3, 0.1, 0.03) if c.shape[1] > 1 else (1.0,))
+        ]
+        with_effect = np.logaddexp.reduce(with_scale) - np.log(len(with_scale))
         without = stats.norm.logpdf(y).sum()
         assert table[name].log_bayes == pytest.approx(with_effect - without, abs=1e-6)
 

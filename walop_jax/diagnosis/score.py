@@ -46,6 +46,7 @@ ABSORBED = 1e-6  # surviving share of a column's square below which the base has
 FAINTEST = 0.05  # standard deviations that a plausible amplitude must reach to be testable
 ROOT_TOLERANCE = 1e-6  # ten times what products in single precision leave
 LEAST_REST = 0.1  # share of the degrees of freedom that must be left behind all candidates to tell the noise
+SCALES = np.array([1.0, 0.3, 0.1, 0.03])  # of the numbers of one effect, in widths of their priors
 TAIL = 0.2  # share of the draws, those with the smallest p, that give the number of trials
 
 
@@ -358,13 +359,22 @@ class _Root:
         return float(part @ part)
 
 
-def log_bayes(gram: Matrix, scores: Vector, widths: Vector) -> float:
-    """ln B = ½ sᵀ (G + Λ⁻¹)⁻¹ s − ½ ln det(1 + Λ^½ G Λ^½): evidence against the base, exact for a linear effect."""
+def log_bayes(
+    gram: Matrix, scores: Vector, widths: Vector, scales: Float[np.ndarray, " t"] = SCALES
+) -> float:
+    """ln B of a linear effect against the base: exact, that of several numbers averaged over scales t of their widths.
+
+        B = ⟨exp(½ sᵀ (G + Λ⁻¹/t²)⁻¹ s) / det(1 + t² Λ^½ G Λ^½)^½⟩ over t, Λ^½ the prior widths
+
+    A width says how large one number may be. Of many independent ones it would say as well how large they are together,
+    which nobody knows: all scales are as probable beforehand (mixtures of priors: Liang et al. 2008, JASA 103, 410).
+    """
     value, vector = np.linalg.eigh(gram * np.outer(widths, widths))
-    # None is below 1: rounding of columns that are nearly alike must not make it so.
-    information = 1.0 + np.clip(value, 0.0, None)
-    s = vector.T @ (scores * widths)
-    return float(0.5 * np.sum(s**2 / information) - 0.5 * np.sum(np.log(information)))
+    t = (scales if len(widths) > 1 else np.ones(1))[:, None] ** 2
+    # None is below 0: rounding of columns that are nearly alike must not make it so.
+    value, s = t * np.clip(value, 0.0, None), vector.T @ (scores * widths)
+    each = 0.5 * np.sum(t * s**2 / (1.0 + value) - np.log1p(value), axis=1)
+    return float(np.logaddexp.reduce(each) - np.log(len(each)))
 
 
 def _log_of_chi2(statistic: Any, rank: int) -> Any:

@@ -1,7 +1,8 @@
 """Exact fits of what a diagnosis tries, adds and drops, and the search for what is missing.
 
 Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det H_base) − Σ ln w, with O the objective (χ² of
-               data and priors), H half its Hessian and w the prior widths of the added parameters.
+               data and priors), H half its Hessian and w the prior widths of the added parameters; those of amplitudes
+               are averaged over their scale (`score.log_bayes`).
 
 Names are added by evidence, one after the other, by the same rules for every judge. A *judge* says what an addition is
 worth. That of the blind study (`tests/diagnosis/blind.py`) takes its linear step (a Schur complement of the score
@@ -31,7 +32,7 @@ from walop_jax.diagnosis.design import Design, held_out
 from walop_jax.diagnosis.examination import Evidence, Ranked, explains, leaders
 from walop_jax.diagnosis.findings import Step
 from walop_jax.diagnosis.policy import Policy
-from walop_jax.diagnosis.score import Candidate
+from walop_jax.diagnosis.score import SCALES, Candidate, log_bayes
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
 from walop_jax.fit.robust import field_cells, states
 from walop_jax.likelihood.likelihood import Likelihood
@@ -81,16 +82,34 @@ def _log_determinant(result: FitResult) -> float:
 
 
 def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
-    """Laplace evidence of an extended fit against the base (parameters without a prior carry no Occam factor)."""
-    known = set(base.model.names)
-    widths = [
-        p.prior[1] if p.prior is not None else (p.loose or p.scale)
-        for p in extended.model.parameters
-        if p.name not in known and p.free and p.tie is None
-    ]
+    """Laplace evidence of an extended fit against the base (parameters without a prior carry no Occam factor).
+
+    Priors of amplitudes are those of the fit at all `SCALES`.
+    """
+    known, at = set(base.model.names), []
+    widths = []
+    for i, p in enumerate(extended.model.parameters):
+        if p.name not in known and p.free and p.tie is None:
+            widths.append(p.prior[1] if p.prior is not None else (p.loose or p.scale))
+            at += [i] if p.prior is not None else []
     gain = 0.5 * (base.posterior.objective - extended.posterior.objective)
     occam = 0.5 * (_log_determinant(extended) - _log_determinant(base))
-    return gain - occam - float(np.sum(np.log(widths)))
+    at_all_scales = _of_amplitudes(extended, at) - _of_amplitudes(extended, at, np.ones(1))
+    return gain - occam - float(np.sum(np.log(widths))) + at_all_scales
+
+
+def _of_amplitudes(result: FitResult, at: Sequence[int], scales: Float[np.ndarray, " t"] = SCALES) -> float:
+    """ln B of some parameters against their prior means: density of posterior and prior there, both Gaussian.
+
+    The Savage–Dickey ratio of nested models (Dickey 1971, Ann. Math. Stat. 42, 204), with the prior at all `scales`: what
+    the data alone say is the information of the posterior without that of the prior.
+    """
+    if not at:
+        return 0.0
+    mean, width = np.transpose([result.model.parameters[i].prior for i in at])  # type: ignore[arg-type]
+    information = np.linalg.inv(result.covariance[np.ix_(at, at)])
+    scores = information @ (result.values[at] - mean)
+    return log_bayes(information - np.diag(width**-2.0), scores, width, scales)
 
 
 def try_effect(base: FitResult, instance: Effect, context: Context, prior_shapes: int = 1) -> Trial:
@@ -201,28 +220,13 @@ def beyond_prior(result: FitResult, name: str) -> dict[str, float]:
     return found
 
 
-def evidence_of_presence(result: FitResult, name: str, context: Context) -> float:
+def evidence_of_presence(result: FitResult, name: str) -> float:
     """ln B of a fitted model against the one without an effect: the density that prior and posterior have at neutral.
 
-    The Savage–Dickey ratio of nested models, Gaussian (Dickey 1971, Ann. Math. Stat. 42, 204). Infinite for an
-    effect without parameters.
+    Infinite for an effect without parameters.
     """
-    effect = result.model.template.effect(name)
     at = amplitude_positions(result.model, name)
-    if not at:
-        return float("inf")
-    neutral = dict(
-        zip(
-            (f"{name}.{leaf.name}" for leaf in leaves(effect)),
-            np.asarray(values_of(effect.at_neutral(context))),
-            strict=True,
-        )
-    )
-    away = result.values[at] - np.array([neutral[result.model.parameters[i].name] for i in at])
-    width = np.array([result.model.parameters[i].prior[1] for i in at])  # type: ignore[index]
-    covariance = result.covariance[np.ix_(at, at)] / np.outer(width, width)
-    away = away / width
-    return float(0.5 * away @ np.linalg.solve(covariance, away) + 0.5 * np.linalg.slogdet(covariance)[1])
+    return _of_amplitudes(result, at) if at else float("inf")
 
 
 def model_without(model: Model, name: str) -> Model:

@@ -399,7 +399,7 @@ class Refit:
         """Take out, one by one, names that the final model does not need; whether there were any."""
         dropped = False
         while self.steps and len(self.fit.model.template.effects) > 1:
-            worth = {s.effect: evidence_of_presence(self.fit, s.effect, self.context) for s in self.steps}
+            worth = {s.effect: evidence_of_presence(self.fit, s.effect) for s in self.steps}
             least = min(worth, key=lambda name: worth[name])
             if worth[least] >= self.policy.least_evidence:
                 break
