@@ -45,6 +45,31 @@ def test_density_at_neutral_is_the_evidence_of_two_fits(leaking):
     assert search.evidence_of_presence(extended, "camera_leakage") == pytest.approx(by_fits, abs=0.5)
 
 
+def test_evidence_of_many_numbers_is_the_mean_over_fits_with_priors_of_four_widths(leaking):
+    """Moon patches of which each is small beside its prior: fits at every width, their Laplace evidence by hand."""
+    context, rng = leaking[1], np.random.default_rng(1)
+    neutral = effect_by_name("moon_patch").neutral(context)
+    q, u = 5e-4 * rng.standard_normal((2, len(neutral.q)))
+    calset, _ = simulate(PLAN, seed=8, effects=[dataclasses.replace(neutral, q=q, u=u)])
+    model = base_model(calset)
+    base = fit(Likelihood.of(calset, model))
+    with_patches, evidence = with_effects(model, ["moon_patch"], context), []
+    added = [name for name in with_patches.names if name.startswith("moon_patch.")]
+    for scale in (1.0, 0.3, 0.1, 0.03):
+        narrower = with_patches
+        for name in added:
+            narrower = narrower.change(name, prior=(0.0, scale * 0.005))
+        found = fit(Likelihood.of(calset, narrower))
+        curvature = [np.linalg.slogdet(one.posterior.matrix)[1] for one in (base, found)]
+        gain = base.posterior.objective - found.posterior.objective - (curvature[1] - curvature[0])
+        evidence.append(0.5 * gain - len(added) * np.log(scale * 0.005))
+    extended = fit(Likelihood.of(calset, with_patches))
+    mean = np.logaddexp.reduce(evidence) - np.log(4.0)
+    assert search.log_evidence_ratio(base, extended) == pytest.approx(mean, abs=0.05)
+    assert search.evidence_of_presence(extended, "moon_patch") == pytest.approx(mean, abs=0.05)
+    assert mean > evidence[0] + 5.0
+
+
 def test_signature_is_what_taking_the_effect_away_does(leaking):
     """To first order, the effect's column times its amplitude."""
     calset, context, base, extended = leaking

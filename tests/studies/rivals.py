@@ -40,8 +40,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-# In the place of this folder: its `coverage.py` has the name of a package that numba looks for.
-sys.path[:1] = [str(ROOT), *(str(ROOT / "tests" / p) for p in (".", "diagnosis", "studies/benchmark"))]
+sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / p) for p in (".", "diagnosis", "studies/benchmark"))]
 
 from generate import STEP  # noqa: E402
 from judge import opened  # noqa: E402

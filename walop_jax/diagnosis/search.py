@@ -101,8 +101,8 @@ def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
 def _of_amplitudes(result: FitResult, at: Sequence[int], scales: Float[np.ndarray, " t"] = SCALES) -> float:
     """ln B of some parameters against their prior means: density of posterior and prior there, both Gaussian.
 
-    The Savage–Dickey ratio of nested models (Dickey 1971, Ann. Math. Stat. 42, 204), with the prior at all `scales`: what
-    the data alone say is the information of the posterior without that of the prior.
+    The Savage–Dickey ratio of nested models (Dickey 1971, Ann. Math. Stat. 42, 204), with the prior at all `scales`:
+    what the data alone say is the information of the posterior without that of the prior.
     """
     if not at:
         return 0.0

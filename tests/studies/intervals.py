@@ -1,6 +1,6 @@
 """Do the intervals of stars hold the truth where the calibration has structure, a mistake, or a detector's coefficient?
 
-    python tests/studies/coverage.py [--runs 60] [--frames 12]                                         (an hour)
+    python tests/studies/intervals.py [--runs 60] [--frames 12]                                         (an hour)
 
 Runs are simulated, calibrated and examined; `apply` then works on 200 stars of each, of 4·10⁶ electrons. Printed is how
 often q and u lie within 1 and 1.96 stated errors of the truth, with the scatter between runs, and how often they do
