@@ -200,8 +200,8 @@ def analysis_vectors(
 
     For light behind the telescope, or `from_sky`, which passes the telescope first.
     """
-    program = _sky_vectors if from_sky else _vectors
-    return in_chunks(lambda a, b: (program(instrument, plan, a, b),), x, y)[0]
+    program, once = _sky_vectors if from_sky else _vectors, len(x) <= limits.MATRICES_ONCE
+    return in_chunks(lambda a, b: (program(instrument, plan, a, b, once=once),), x, y)[0]
 
 
 sky_vectors = functools.partial(analysis_vectors, from_sky=True)
@@ -228,11 +228,12 @@ def matrices(
     """
     size = 3 * len(instrument.cameras.pairs)
     values, errors = np.empty((len(x), size)), np.empty((len(x), size, size))
+    once = len(x) <= limits.MATRICES_ONCE
     for layout, rows in settings.layouts():
         plan = plan_for_settings(instrument, layout, filters)
 
         def part(*columns: Array, plan: Plan = plan) -> tuple[np.ndarray, np.ndarray]:
-            found, slopes = map(np.asarray, _slopes(instrument, plan, *columns))
+            found, slopes = map(np.asarray, _slopes(instrument, plan, *columns, once=once))
             return found, slopes @ covariance @ np.swapaxes(slopes, 1, 2)
 
         values[rows], errors[rows] = in_chunks(part, x[rows], y[rows], *_numbers(settings[rows]))
@@ -296,7 +297,8 @@ def matrix_slopes(
         return np.zeros((len(x), 0, 3)), np.zeros((len(x), 0, 3, values_of(instrument).size))
     plan = plan_for_settings(instrument, setting, filters)
     numbers = (np.broadcast_to(number, len(x)) for number in _numbers(setting))
-    values, slopes = in_chunks(lambda *columns: _slopes(instrument, plan, *columns), x, y, *numbers)
+    once = len(x) <= limits.MATRICES_ONCE
+    values, slopes = in_chunks(lambda *at: _slopes(instrument, plan, *at, once=once), x, y, *numbers)
     arms = (len(x), values.shape[1] // 3, 3)
     return values.reshape(arms), slopes.reshape(*arms, slopes.shape[-1])
 

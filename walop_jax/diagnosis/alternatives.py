@@ -373,7 +373,7 @@ def _screened(
         changed, left = Likelihood.of(calset, model), []
         for design in places:
             rows = design.residual.copy()
-            residual = changed.residuals(design.fit.values, once=True)[1][design.measured.used].reshape(-1)
+            residual = changed.residuals(design.fit.values)[1][design.measured.used].reshape(-1)
             rows[: design.rows] = residual / design.fit.noise_scale
             if np.abs(rows - design.residual).max() < NO_DIFFERENCE:
                 break

@@ -98,7 +98,7 @@ def _gradients(likelihood: Likelihood, values: Vector) -> Iterator[tuple[str, Fl
     by_exposure = np.zeros((len(calset.exposures), select.shape[1]))
     by_cell, first = np.zeros((int(cell.max(initial=0)) + 1, select.shape[1])), 0
     for chunk in likelihood.points:
-        found = engine.linearised_residuals(instrument, likelihood.plan, chunk)
+        found = engine.linearised_residuals(instrument, likelihood.plan, chunk, once=likelihood.once)
         residual, slope = (np.asarray(part) for part in found)
         residual = residual.reshape(chunk.counts.shape)
         rows = slope.reshape(*residual.shape, -1)

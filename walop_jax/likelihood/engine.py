@@ -307,12 +307,12 @@ def _linearised_residuals(
     return residual, slope
 
 
-def dense_equations(instrument: Instrument, plan: Plan, data: PointData) -> Normal:
+def dense_equations(instrument: Instrument, plan: Plan, data: PointData, *, once: bool = False) -> Normal:
     """As `normal_equations`, from all rows: of small sets, for which one program is then enough.
 
     Compiling the optics with their derivatives takes longer than the fit of a table does.
     """
-    residual, slope = (np.asarray(part) for part in linearised_residuals(instrument, plan, data))
+    residual, slope = map(np.asarray, linearised_residuals(instrument, plan, data, once=once))
     r, jacobian = residual.reshape(-1), slope.reshape(-1, slope.shape[-1])
     return Normal(r @ r, jacobian.T @ r, jacobian.T @ jacobian)
 

@@ -165,6 +165,7 @@ class Likelihood:
     points: MeasuredPoints
     runner: Runner
     model: Model
+    once: bool = False
 
     @classmethod
     def of(
@@ -177,13 +178,14 @@ class Likelihood:
         runner: Runner | None = None,
         points_per_chunk: int | None = None,
         interpolate: bool | None = None,
+        once: bool | None = None,
     ) -> Likelihood:
         """Bring a set and a model together; `probes` are effects beyond the model whose columns will be asked for.
 
         `memory` (bytes) is what the data of the points may take, None for the usual 2 GB. A large set is shared with
         the processes of `runner`, and finished slabs are kept in its journal; smaller ones are not worth it.
-        `points_per_chunk` and `interpolate` are decided by the size of the set where they are None. Raises
-        RuntimeError when float64 is switched off.
+        `points_per_chunk`, `interpolate` and whether derivatives are compiled `once`, without optimisation, are decided
+        by the size of the set where they are None. Raises RuntimeError when float64 is switched off.
         """
         require_double_precision()
         runner = runner or Runner()
@@ -197,7 +199,11 @@ class Likelihood:
             interpolate=interpolate,
         )
         reader = PointReader(calset, layout.plan, layout.mirrored, model.template.cameras.floor)
-        return cls(layout, MeasuredPoints(reader, layout), runner if layout.large else runner.alone(), model)
+        if once is None:
+            once = layout.points * len(calset.exposures) <= limits.DERIVATIVES_ONCE
+        return cls(
+            layout, MeasuredPoints(reader, layout), runner if layout.large else runner.alone(), model, once
+        )
 
     @property
     def calset(self) -> CalibrationSet:
@@ -266,7 +272,7 @@ class Likelihood:
             "χ², gradient and matrix",
             f"matrix {values.tobytes().hex()}",
             lambda chunk: (
-                engine.dense_equations(instrument, self.plan, chunk)
+                engine.dense_equations(instrument, self.plan, chunk, once=self.once)
                 if nodes is None and self.pairs <= limits.FITTED_FROM_ROWS
                 else engine.normal_equations(instrument, self.plan, chunk, nodes)
             ),
@@ -348,17 +354,16 @@ class Likelihood:
 
     # ----------------------------------------------------------------------------------------- row by row
 
-    def residuals(
-        self, values: Vector, *, once: bool = False
-    ) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e k"]]:
+    def residuals(self, values: Vector) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e k"]]:
         """Best flux and normalised residuals (data − model)/σ of every (point, exposure); 0 where unused.
 
-        The flux is the mean over the arms where each has its own. `once`: see `compiled`.
+        The flux is the mean over the arms where each has its own.
 
         All of them at once: for whole frames take a sample (`thinning.thinned`).
         """
         instrument = self.model.instrument(values)
         nodes, _ = self.nodes(instrument)
+        once = self.pairs <= limits.COMPILED_ONCE
         parts = [engine.residuals(instrument, self.plan, chunk, nodes, once=once) for chunk in self.points]
         flux, residual = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
         return flux[: self.layout.points].mean(axis=-1), residual[: self.layout.points]
@@ -370,7 +375,7 @@ class Likelihood:
         """
         instrument, select = self.model.instrument(values), self.model.selection()
         parts = [
-            used_rows(engine.linearised_residuals(instrument, self.plan, c)[1], c) @ select
+            used_rows(engine.linearised_residuals(instrument, self.plan, c, once=self.once)[1], c) @ select
             for c in self.points
         ]
         return np.concatenate(parts)

@@ -88,6 +88,8 @@ MOST_CELLS = 128
 
 MATRIX_POINTS = 32
 """Field points whose matrices or analysis vectors are computed together, for one star as for a map: one program."""
+MATRICES_ONCE = 256
+"""Field points up to which programs of matrices and their derivatives are compiled without optimisation."""
 
 # ------------------------------------------------------------------------------------------------- diagnosis
 
@@ -98,7 +100,9 @@ TRUST_ROWS = 20_000
 DIAGNOSED_NUMBERS = 120_000_000
 """Numbers that the columns of a diagnosis may hold: 1 GB, of which there are four copies at most."""
 COMPILED_ONCE = 6000
-"""(Exposure, point) pairs of a set up to which columns of effects are compiled without optimisation."""
+"""(Exposure, point) pairs up to which columns of effects, counts and residuals are compiled without optimisation."""
+DERIVATIVES_ONCE = 1500
+"""The same for derivatives of residuals, which a fit asks for some ten times: they run three times as long then."""
 FITTED_FROM_ROWS = 20_000
 """(Exposure, point) pairs of a set up to which the matrix of a fit is made from its rows, by a program that errors and
 trust need anyway: to compile or to load another one takes longer. The rows take 100 MB at most."""

@@ -185,7 +185,9 @@ def with_candidates(
     instrument, select = likelihood.model.instrument(values), likelihood.model.selection()
     residuals, slopes = [], []
     for chunk in likelihood.points:
-        residual, slope = engine.linearised_residuals(instrument, likelihood.plan, chunk)
+        residual, slope = engine.linearised_residuals(
+            instrument, likelihood.plan, chunk, once=likelihood.once
+        )
         residuals.append(used_rows(residual[..., None], chunk)[:, 0])
         slopes.append(used_rows(slope, chunk) @ select)
     r, jacobian = np.concatenate(residuals), np.concatenate(slopes)
@@ -237,7 +239,7 @@ def night_equations(
     for evening, some in split(calset):
         if number not in (None, evening):
             continue
-        likelihood, there = Likelihood.of(some, model), values
+        likelihood, there = Likelihood.of(some, model, once=None if once else False), values
         if own:
             there = nearer(likelihood, values, np.sqrt(OWN * len(model.free)))
         if likelihood.layout.large:
