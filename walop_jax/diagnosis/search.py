@@ -86,12 +86,14 @@ def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
 
     Priors of amplitudes are those of the fit at all `SCALES`.
     """
-    known, at = set(base.model.names), []
-    widths = []
-    for i, p in enumerate(extended.model.parameters):
-        if p.name not in known and p.free and p.tie is None:
-            widths.append(p.prior[1] if p.prior is not None else (p.loose or p.scale))
-            at += [i] if p.prior is not None else []
+    known, model = set(base.model.names), extended.model
+    widths = [
+        p.prior[1] if p.prior is not None else (p.loose or p.scale)
+        for p in model.parameters
+        if p.name not in known and p.free and p.tie is None
+    ]
+    amplitudes = [i for effect in model.effect_names for i in amplitude_positions(model, effect)]
+    at = [i for i in amplitudes if model.names[i] not in known]
     gain = 0.5 * (base.posterior.objective - extended.posterior.objective)
     occam = 0.5 * (_log_determinant(extended) - _log_determinant(base))
     at_all_scales = _of_amplitudes(extended, at) - _of_amplitudes(extended, at, np.ones(1))
