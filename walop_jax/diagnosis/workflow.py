@@ -68,8 +68,6 @@ from walop_jax.model.effects import Context, Described, Effect, FreeForm, OtherD
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model, effect_context
 
-_SMALL = 200  # field points up to which programs of earlier models may stay: half a gigabyte
-
 
 def diagnose(
     calset: CalibrationSet,
@@ -113,10 +111,8 @@ def diagnose(
         policy = dataclasses.replace(policy, minutes=min(policy.minutes, policy.minutes_far_off))
         judge = dataclasses.replace(judge, policy=policy, until=began + 60.0 * policy.minutes)
     tell(Stage("scoring every effect and pattern", "scoring"))
-    last = first = judge.examined()
-    for _, _, left in search(first, judge, policy):
-        last = left
-    last, nameless = judge.conclusion(first, last)
+    first = judge.examined()
+    last, nameless = judge.conclusion(first, _left(first, judge, policy))
     # Another reading that comes near competes with names and with other descriptions of the instrument.
     if nameless and readings and readings[0].explained * judge.fit.dof < judge.fit.chi2:
         raise refusal(before, readings)
@@ -143,11 +139,22 @@ def diagnose(
         policy=policy,
         ended=judge.ended,
     )
+    del first, last  # the columns of all candidates, gigabytes of a large set
     return _examined(found)
+
+
+def _left(first: Examination, judge: Refit, policy: Policy) -> Examination:
+    """What the search leaves."""
+    last = first
+    for _, _, left in search(first, judge, policy):
+        last = left
+    return last
 
 
 def _examined(found: Diagnosis) -> Diagnosis:
     """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked."""
+    if found.after.likelihood.pairs > limits.FORGOTTEN_ABOVE:
+        forget_programs()
     after = examined(with_honest_errors(found.after), as_written=True)
     if found.before is found.after:
         return dataclasses.replace(found, before=after, after=after)
@@ -223,7 +230,7 @@ class Refit:
 
     def examined(self, earlier: Examination | None = None) -> Examination:
         """The current fit, scored."""
-        forgetting = earlier is not None and len(self.calset.points) > _SMALL
+        forgetting = earlier is not None and self.fit.likelihood.pairs > limits.FORGOTTEN_ABOVE
         if forgetting:
             forget_programs()  # of models with fewer effects: they are not asked for again
         found = examine(self.fit, self.wanted, self.rng, earlier, self.sentences, self.parts, self.policy)
