@@ -144,7 +144,7 @@ def diagnose(
 
 
 def _left(first: Examination, judge: Refit, policy: Policy) -> Examination:
-    """What the search leaves."""
+    """The evidence that the search leaves."""
     last = first
     for _, _, left in search(first, judge, policy):
         last = left
