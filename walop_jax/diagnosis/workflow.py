@@ -151,10 +151,15 @@ def _left(first: Examination, judge: Refit, policy: Policy) -> Examination:
     return last
 
 
+def _forget(result: FitResult) -> None:
+    """Give back the memory of programs, where they are of so many pairs that they take gigabytes together."""
+    if result.likelihood.pairs > limits.FORGOTTEN_ABOVE:
+        forget_programs()
+
+
 def _examined(found: Diagnosis) -> Diagnosis:
     """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked."""
-    if found.after.likelihood.pairs > limits.FORGOTTEN_ABOVE:
-        forget_programs()
+    _forget(found.after)
     after = examined(with_honest_errors(found.after), as_written=True)
     if found.before is found.after:
         return dataclasses.replace(found, before=after, after=after)
@@ -230,12 +235,11 @@ class Refit:
 
     def examined(self, earlier: Examination | None = None) -> Examination:
         """The current fit, scored."""
-        forgetting = earlier is not None and self.fit.likelihood.pairs > limits.FORGOTTEN_ABOVE
-        if forgetting:
-            forget_programs()  # of models with fewer effects: they are not asked for again
+        if earlier is not None:
+            _forget(self.fit)  # models with fewer effects: they are not asked for again
         found = examine(self.fit, self.wanted, self.rng, earlier, self.sentences, self.parts, self.policy)
-        if forgetting:
-            forget_programs()  # of columns
+        if earlier is not None:
+            _forget(self.fit)  # columns
         if found.alarm:
             self.tell(Stage(f"p = {found.table.p_global:.2g}: something is missing", "naming"))
         return found

@@ -74,9 +74,10 @@ def own_columns(
         if structure not in plans:
             plans[structure] = Likelihood.of(likelihood.calset, likelihood.model, (effect,))
         own = plans[structure]
-        instrument, once = own.model.instrument(values), own.pairs <= limits.COMPILED_ONCE
+        instrument = own.model.instrument(values)
         parts = [
-            used_rows(_own(instrument, own.plan, (effect,), chunk, once=once), chunk) for chunk in own.points
+            used_rows(_own(instrument, own.plan, (effect,), chunk, once=own.few), chunk)
+            for chunk in own.points
         ]
         found.append(np.concatenate(parts))
     return np.concatenate(found, axis=1)

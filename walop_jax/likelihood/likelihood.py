@@ -178,14 +178,15 @@ class Likelihood:
         runner: Runner | None = None,
         points_per_chunk: int | None = None,
         interpolate: bool | None = None,
-        once: bool | None = None,
+        once: bool = True,
     ) -> Likelihood:
         """Bring a set and a model together; `probes` are effects beyond the model whose columns will be asked for.
 
         `memory` (bytes) is what the data of the points may take, None for the usual 2 GB. A large set is shared with
         the processes of `runner`, and finished slabs are kept in its journal; smaller ones are not worth it.
-        `points_per_chunk`, `interpolate` and whether derivatives are compiled `once`, without optimisation, are decided
-        by the size of the set where they are None. Raises RuntimeError when float64 is switched off.
+        `points_per_chunk` and `interpolate` are decided by the size of the set where they are None. Derivatives of a
+        small set are compiled without optimisation, unless many such sets come (`once` False). Raises RuntimeError
+        when float64 is switched off.
         """
         require_double_precision()
         runner = runner or Runner()
@@ -199,8 +200,7 @@ class Likelihood:
             interpolate=interpolate,
         )
         reader = PointReader(calset, layout.plan, layout.mirrored, model.template.cameras.floor)
-        if once is None:
-            once = layout.points * len(calset.exposures) <= limits.DERIVATIVES_ONCE
+        once &= layout.points * len(calset.exposures) <= limits.DERIVATIVES_ONCE
         return cls(
             layout, MeasuredPoints(reader, layout), runner if layout.large else runner.alone(), model, once
         )
@@ -363,8 +363,9 @@ class Likelihood:
         """
         instrument = self.model.instrument(values)
         nodes, _ = self.nodes(instrument)
-        once = self.pairs <= limits.COMPILED_ONCE
-        parts = [engine.residuals(instrument, self.plan, chunk, nodes, once=once) for chunk in self.points]
+        parts = [
+            engine.residuals(instrument, self.plan, chunk, nodes, once=self.few) for chunk in self.points
+        ]
         flux, residual = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
         return flux[: self.layout.points].mean(axis=-1), residual[: self.layout.points]
 
@@ -384,6 +385,11 @@ class Likelihood:
     def pairs(self) -> int:
         """Number of (exposure, point) pairs, used or not."""
         return self.layout.points * len(self.flux_known)
+
+    @property
+    def few(self) -> bool:
+        """True if there are so few pairs that programs of counts and columns are not worth optimising (`compiled`)."""
+        return self.pairs <= limits.COMPILED_ONCE
 
     def stokes(self, values: Vector) -> Float[np.ndarray, "p e 4"]:
         """Stokes vectors that enter the instrument, per unit flux."""

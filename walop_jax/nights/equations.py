@@ -239,7 +239,7 @@ def night_equations(
     for evening, some in split(calset):
         if number not in (None, evening):
             continue
-        likelihood, there = Likelihood.of(some, model, once=None if once else False), values
+        likelihood, there = Likelihood.of(some, model, once=once), values
         if own:
             there = nearer(likelihood, values, np.sqrt(OWN * len(model.free)))
         if likelihood.layout.large:

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from walop_jax.data.records import Block, CalibrationSet, Sources
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.likelihood import engine, limits
+from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre, light
 from walop_jax.model.dependence import needs
@@ -240,9 +240,11 @@ def fluxes(plan: ObservingPlan, rng: np.random.Generator | None) -> Float[np.nda
 def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, "p e"]) -> Cube:
     """Expected counts (electron) of every (point, exposure), what the detectors do to them included."""
     likelihood = Likelihood.of(blank, make_model(blank.instrument, truth))
-    once = likelihood.pairs <= limits.COMPILED_ONCE
     unit = np.concatenate(
-        [np.asarray(engine.prediction(truth, likelihood.plan, c, once=once)) for c in likelihood.points]
+        [
+            np.asarray(engine.prediction(truth, likelihood.plan, c, once=likelihood.few))
+            for c in likelihood.points
+        ]
     )
     light_counts = flux[:, :, None] * unit[: len(flux)]
     if light.is_linear(truth):
