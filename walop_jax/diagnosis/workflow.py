@@ -159,7 +159,8 @@ def _forget(result: FitResult) -> None:
 
 def _examined(found: Diagnosis) -> Diagnosis:
     """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked."""
-    _forget(found.after)
+    if found.before is not found.after:
+        _forget(found.after)
     after = examined(with_honest_errors(found.after), as_written=True)
     if found.before is found.after:
         return dataclasses.replace(found, before=after, after=after)
