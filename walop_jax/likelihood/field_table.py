@@ -68,11 +68,11 @@ def rows_and_slopes(
     values, to_instrument = values_of(instrument), with_values(instrument)
     optical = optical_indices(instrument)
 
-    def optics(optical_values: Float[Array, " o"]) -> Float[Array, "b r 4"]:
-        return light.band_rows(to_instrument(values.at[optical].set(optical_values)), plan, x, y)
+    def optics(values: Float[Array, " n"]) -> Float[Array, "b r 4"]:
+        return light.band_rows(to_instrument(values), plan, x, y)
 
-    rows, push = jax.linearize(optics, values[optical])
-    return rows, jax.vmap(push)(jnp.eye(optical.size))
+    rows, push = jax.linearize(optics, values)
+    return rows, jax.vmap(push)(jnp.eye(values.size)[optical])
 
 
 def linearised(
@@ -92,7 +92,9 @@ def linearised(
     value, push = jax.linearize(quantity, rows, values, local)
     no_rows, no_values, no_local = jnp.zeros_like(rows), jnp.zeros_like(values), jnp.zeros_like(local)
     # Optical parameters carry their rows; those that act at other places as well do so at once.
-    rows_of = jnp.zeros((values.size, *rows.shape)).at[optical].set(slopes)[plain]
+    places = np.full(values.size, optical.size)
+    places[optical] = np.arange(optical.size)
+    rows_of = jnp.concatenate([slopes, jnp.zeros((1, *rows.shape))])[places[plain]]
     each = jnp.eye(values.size)[plain]
     each_local = jnp.eye(local.size).reshape(-1, *local.shape)
     return LocalDerivatives(

@@ -39,5 +39,7 @@ def basis(
     x: Float[Any, ...], y: Float[Any, ...], degree: int, scale: float = FIELD_SCALE
 ) -> Float[Any, "... t"]:
     """Values of all terms at field positions in degrees; arrays of numpy stay so."""
-    px, py = _one_dimension(x / scale, degree), _one_dimension(y / scale, degree)
-    return (jnp if isinstance(x, jax.Array) else np).stack([px[i] * py[j] for i, j in terms(degree)], axis=-1)
+    xp = jnp if isinstance(x, jax.Array) else np
+    px, py = (xp.stack(_one_dimension(t / scale, degree)[: degree + 1], axis=-1) for t in (x, y))
+    i, j = np.array(terms(degree)).T
+    return px[..., i] * py[..., j]

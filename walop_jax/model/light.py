@@ -218,23 +218,21 @@ def behind_throughput(
 
 def _beams(instrument: Instrument) -> tuple[Int[np.ndarray, "k j"], Float[Array, "k j"]]:
     """For each camera the rows that its beam is made of, and what it takes of each."""
-    count = max(arm.analyser.rows for arm in instrument.arms)
-    index = np.zeros((len(instrument.cameras), count), int)
-    shares = jnp.zeros((len(instrument.cameras), count))
-    first = 0
-    for arm in instrument.arms:
-        analyser = arm.analyser
-        cameras = np.array([instrument.cameras.names.index(name) for name in analyser.cameras])
-        index[cameras, : analyser.rows] = first + np.arange(analyser.rows)
-        shares = shares.at[cameras, : analyser.rows].set(analyser.shares())
-        first += analyser.rows
+    analysers = [arm.analyser for arm in instrument.arms]
+    names = [name for analyser in analysers for name in analyser.cameras]
+    order = np.array([names.index(name) for name in instrument.cameras.names])
+    first = np.cumsum([0, *(analyser.rows for analyser in analysers)])
+    index = np.concatenate(
+        [
+            np.tile(start + np.arange(a.rows), (len(a.cameras), 1))
+            for start, a in zip(first, analysers, strict=False)
+        ]
+    )
+    shares = jnp.concatenate([analyser.shares() for analyser in analysers])
     if is_dispersed(instrument):
-        slopes = jnp.zeros_like(shares)
-        for arm in instrument.arms:
-            cameras = np.array([instrument.cameras.names.index(name) for name in arm.analyser.cameras])
-            slopes = slopes.at[cameras].set(arm.analyser.shares_of_slopes())
-        index, shares = np.concatenate([index, first + index], 1), jnp.concatenate([shares, slopes], 1)
-    return index, shares
+        slopes = jnp.concatenate([analyser.shares_of_slopes() for analyser in analysers])
+        index, shares = np.concatenate([index, first[-1] + index], 1), jnp.concatenate([shares, slopes], 1)
+    return index[order], shares if (order == np.arange(len(order))).all() else shares[order]
 
 
 # ----------------------------------------------------------------------------------------- light and counts

@@ -38,10 +38,9 @@ class Matrix2(NamedTuple):
 
     def inverse(self) -> Matrix2:
         """Inverse matrix."""
-        determinant = self.a * self.d - self.b * self.c
-        return Matrix2(
-            self.d / determinant, -self.b / determinant, -self.c / determinant, self.a / determinant
-        )
+        # One division, and none as long as the derivatives: each of these would be compiled alone.
+        k = 1.0 / (self.a * self.d - self.b * self.c)
+        return Matrix2(k * self.d, -k * self.b, -k * self.c, k * self.a)
 
     def times(self, factor: Inexact[Array, ...] | float) -> Matrix2:
         """Every element times a scalar."""

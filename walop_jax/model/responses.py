@@ -242,11 +242,8 @@ def _banded(
         return list(solved.values())
 
     nothing, still = jnp.zeros(len(names)), jnp.zeros_like(wavelength)
-    base = matrices(nothing, wavelength)
-    every = jnp.eye(len(names) + 1)
-    slopes = jax.vmap(lambda one: jax.jvp(matrices, (nothing, wavelength), (one[:-1], one[-1] + still))[1])(
-        every
-    )
+    base, push = jax.linearize(matrices, nothing, wavelength)
+    slopes = jax.vmap(lambda one: push(one[:-1], one[-1] + still))(jnp.eye(len(names) + 1))
     stack = functools.partial(_stacked, plan=plan, keys=keys, nodes=len(wavelength))
     segments = _segments(instrument, functools.partial(stack, base, jnp.eye(4)), plan, len(wavelength))
     width = segments[0].folded[0].shape[2]

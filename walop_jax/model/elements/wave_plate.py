@@ -175,7 +175,11 @@ def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Floa
     nodes = jnp.shape(cases[0][1].wavelength)
 
     def together(*values: Real) -> Float[Array, "c n"]:
-        return jnp.stack([jnp.broadcast_to(value, nodes) for value in values])
+        """Rows case by case; one row of what is the same in all, one column of single numbers."""
+        if all(value is values[0] for value in values):
+            return jnp.atleast_1d(values[0])[None]
+        shape = nodes if any(jnp.ndim(value) for value in values) else (1,)
+        return jnp.stack([jnp.broadcast_to(value, shape) for value in values])
 
     known: Known = {}
     stacks = [plate.crystals(ray, known) for plate, ray in cases]
@@ -184,10 +188,10 @@ def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Floa
             tuple(c if c.cut is not None else c._replace(cut=jnp.zeros(())) for c in stack)
             for stack in stacks
         ]
-    kx, ky = together(*(ray.kx for _, ray in cases)), together(*(ray.ky for _, ray in cases))
-    return MODELS[model](
-        kx, ky, jax.tree.map(together, *stacks), together(*(ray.wavelength for _, ray in cases))
+    kx, ky, wavelength = (
+        together(*(getattr(ray, name) for _, ray in cases)) for name in ("kx", "ky", "wavelength")
     )
+    return MODELS[model](kx, ky, jax.tree.map(together, *stacks), wavelength)
 
 
 def _behind_gap(plate: WavePlate, ray: Ray, matrix: Mueller) -> Mueller:
