@@ -202,8 +202,7 @@ def fixed_axis_mueller(
     total = jnp.zeros_like(sx)
     last = plates[-1].axis
     for plate in plates:
-        kz_o = jnp.sqrt(plate.ordinary**2 - sx**2 - sy**2)
-        kz_e, _ = _extraordinary_kz(sx, sy, plate)
+        crystal = _crystal(sx, sy, plate) if plate.cut is None else _crystal_both_ways(sx, sy, plate).forward
         sign = jnp.cos(2.0 * (plate.axis - last))
-        total = total + sign * 2.0 * jnp.pi * plate.thickness * (kz_e - kz_o) / wavelength
+        total = total + sign * 2.0 * jnp.pi * plate.thickness * crystal.phase / wavelength
     return retarder(total, last + 0.5 * jnp.pi)
