@@ -34,6 +34,7 @@ from walop_jax.diagnosis.score import ScoreSpace, separations
 from walop_jax.diagnosis.search import Trial, search
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
+from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Described
@@ -134,7 +135,6 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
     """Shapes that are in no catalogue, with their columns; `said` are those of single sentences."""
     e, points = measured.likelihood.calset.exposures, measured.likelihood.calset.points
     point, exposure = (np.repeat(at, measured.cameras) for at in np.nonzero(measured.used))
-    shape = (len(points), len(e), measured.cameras)
     x, y = points.x / 0.3, points.y / 0.3
     r, camera = np.hypot(points.x, points.y), np.eye(measured.cameras)[:, None, None]
     through = e.clp_in
@@ -142,10 +142,8 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
     sky = (e.kind == "moon") & ~through
     narrow = np.where(e.filter == e.filter[0], 0.3, 1.0)
     drawn = np.random.default_rng(5).standard_normal(len(e))
-    patterns = {
+    gains = {
         "vignetting of half1": np.maximum(r - 0.22, 0.0)[:, None, None] * (camera[0] + camera[1]),
-        "quadratic non-linearity": (measured.flux / measured.flux.mean())[..., None] ** 2 * camera[2],
-        "background that varies": drawn[None, :, None] * np.ones(shape),
         "image shift by the polariser": (
             x[:, None, None] * (camera[0] - camera[2]) + y[:, None, None] * (camera[1] + 0.5 * camera[3])
         )
@@ -159,12 +157,22 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
         "focus that drifts": (r**2 / 0.09 - 0.5)[:, None, None]
         * (e.mjd - e.mjd.mean())[None, :, None]
         * camera[0],
-        "field point on a polarised star": (np.arange(len(points)) == len(points) // 3)[:, None, None]
+    }
+    counts = measured.flux[..., None] * measured.model  # in standard errors
+    level = measured.level[:, None] * measured.flux[..., None] * measured.weight
+    electrons = np.divide(counts, measured.weight, out=np.zeros_like(counts), where=measured.weight > 0)
+    alone = np.arange(len(points)) == len(points) // 3
+    changes = {name: gain * counts for name, gain in gains.items()} | {
+        "quadratic non-linearity": counts * electrons * camera[2],
+        "background that varies": level * drawn[None, :, None],
+        "field point on a polarised star": level
+        * alone[:, None, None]
         * sky[None, :, None]
         * (camera[0] - camera[1]),
     }
-    for name, pattern in patterns.items():
-        yield name, measured.column(np.broadcast_to(pattern, shape))
+    for name, change in changes.items():
+        projected = project_flux(change, measured.model, measured.known, measured.shared)
+        yield name, -projected[measured.used].reshape(-1)
     turn, narrowed = said["turn of polariser"], said["depolarisation of polariser"] * narrow[exposure]
     polish = (x**3 - 1.5 * x * y + 0.7 * y**2)[point]
     made = {
@@ -175,7 +183,7 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
     }
     yield from made.items()
     for name, texts in OUTSIDE.items():
-        if texts and name not in patterns and name not in made and set(texts) <= set(said):
+        if texts and name not in changes and name not in made and set(texts) <= set(said):
             yield name, np.sum([said[text] for text in texts], axis=0)
 
 
