@@ -294,7 +294,7 @@ class Blind:
         z, rest = self.noise()
         beyond = beyond * (ratio / length) ** 2
         rest += beyond + 2 * np.sqrt(beyond) * self.rng.standard_normal()
-        return Scene("outside", (name,), ratio, z + sign * along * ratio / length, max(rest, 0.0))
+        return Scene("outside", (name,), ratio, z + sign * along * ratio / length, float(max(rest, 0.0)))
 
     # --------------------------------------------------------------------------------------------------- judging
 
