@@ -50,6 +50,7 @@ from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import JOINED, alternatives, other_curves
 from walop_jax.model.effects import Context, OtherDescription
+from walop_jax.model.instrument import NoSuchPlaceError
 from walop_jax.model.specification import Model, with_effects
 
 _POINTS, _FEW = 16, 64  # field points that are looked at; sets of so few are looked at whole
@@ -369,7 +370,10 @@ def _screened(
     ]
     given = float(np.sum(places[0].projector(places[0].residual) ** 2))
     for sentence in sentences:
-        model = described_otherwise(result.model, sentence, context)
+        try:
+            model = described_otherwise(result.model, sentence, context)
+        except NoSuchPlaceError:  # it leaves out what an effect of the model acts on
+            continue
         changed, left = Likelihood.of(calset, model), []
         for design in places:
             rows = design.residual.copy()
