@@ -164,9 +164,7 @@ CASES = {
     "apply": Case(lambda g: (g.run, g.stars), lambda g, **k: walop.apply(g.run, g.stars, **k), "s.ecsv"),
     "certify": Case(lambda g: (g.run,), lambda g, **k: walop.certify(g.run, **k)),
     "epoch": Case(lambda g: (g.run, g.calset), lambda g, **k: walop.epoch(g.run, g.calset, **k), "RUN", True),
-    "watch": Case(
-        lambda g: (g.run, g.catalogue), lambda g, **k: walop.watch(g.run, g.stars, **k), "RUN", True
-    ),
+    "watch": Case(lambda g: (g.run, g.stars), lambda g, **k: walop.watch(g.run, g.stars, **k), "RUN", True),
     "model": Case(
         lambda g: (g.calset, "--effect", "clp_zero"),
         lambda g, **k: walop.model(g.calset, effect=["clp_zero"], **k),
@@ -233,7 +231,7 @@ def test_files_and_document_are_those_of_the_program(name: str, call, given: Giv
     caller.mkdir()
     words = ("-o", command / case.output) if case.output else ()
     done = call(name, *case.words(given), *words, "--json")
-    assert done.exit_code == 0, done.output
+    assert done.exit_code == (3 if name == "watch" else 0), done.output  # two stars, one camera too bright
     document = json.loads(done.stdout)
     output = {"output": caller / case.output} if case.output else {}
     again = {"overwrite": True} if name == "conformance" else {}
