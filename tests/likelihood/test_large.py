@@ -118,7 +118,8 @@ def test_optimistix_on_residuals_in_memory_finds_the_same(made):
         values = jnp.asarray(model.start) + select @ x
         _, data = engine._residuals(to_instrument(values), likelihood.plan, chunk)
         known = [(i, *p.prior) for i, p in enumerate(model.parameters) if p.free and p.prior is not None]
-        pulled = [(i, p.start, p.loose) for i, p in enumerate(model.parameters) if p.free and p.prior is None]
+        free = [(i, p) for i, p in enumerate(model.parameters) if p.free and p.prior is None]
+        pulled = [(i, p.start, p.loose) for i, p in free if p.loose is not None]
         index, mean, width = (np.array(column) for column in zip(*known, *pulled, strict=True))
         return jnp.concatenate([data.ravel(), (values[index] - mean) / width])
 

@@ -31,7 +31,6 @@ import jax
 jax.config.update("jax_enable_x64", True)
 import json, os, sys, time
 import numpy as np
-from test_runner import made
 """
 
 
@@ -77,6 +76,7 @@ def result_of(process: subprocess.Popen) -> dict:
 
 
 EXPAND = """
+from test_runner import made
 p = made()
 found = p.expand(p.model.start)
 print(json.dumps({"devices": jax.local_device_count(), "data": found.data, "rows": found.census.rows.tolist(),
@@ -105,6 +105,7 @@ from walop_jax.likelihood import limits, runner
 from walop_jax.likelihood.runner import Runner
 limits.LARGE_ABOVE, limits.SAMPLE = 0, 400
 here = runner.join(sys.argv[1])
+from test_runner import made  # makes arrays: not ahead of `join`
 p = made(runner=Runner(processes=here))
 assert p.layout.large
 """
