@@ -109,19 +109,19 @@ def test_optimistix_on_residuals_in_memory_finds_the_same(made):
     """The reference: `optimistix.LevenbergMarquardt` on the residuals themselves, derivatives by JAX."""
     sample = thinned(made.calset, 20, neighbours=1)
     likelihood = Likelihood.of(sample, made.model)
-    model, chunk = likelihood.model, next(iter(likelihood.points))
+    model, chunks = likelihood.model, list(likelihood.points)
     scale = np.array([model.parameters[i].scale for i in model.free])
     select = model.selection() * scale
     to_instrument = with_values(model.instrument())
 
     def residuals(x, _):
         values = jnp.asarray(model.start) + select @ x
-        _, data = engine._residuals(to_instrument(values), likelihood.plan, chunk)
+        data = [engine._residuals(to_instrument(values), likelihood.plan, chunk)[1] for chunk in chunks]
         known = [(i, *p.prior) for i, p in enumerate(model.parameters) if p.free and p.prior is not None]
         free = [(i, p) for i, p in enumerate(model.parameters) if p.free and p.prior is None]
         pulled = [(i, p.start, p.loose) for i, p in free if p.loose is not None]
         index, mean, width = (np.array(column) for column in zip(*known, *pulled, strict=True))
-        return jnp.concatenate([data.ravel(), (values[index] - mean) / width])
+        return jnp.concatenate([*map(jnp.ravel, data), (values[index] - mean) / width])
 
     x = jnp.zeros(len(scale))
     # The second one takes away the damping that the first still has when it stops.
