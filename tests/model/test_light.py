@@ -1,5 +1,7 @@
 """The light path against the oracle, against the paper's formula, and against identities."""
 
+import dataclasses
+
 import builders
 import equinox as eqx
 import jax.numpy as jnp
@@ -211,3 +213,11 @@ def test_what_cannot_stand_ahead_of_the_polariser_is_refused(element):
     text = f'name = "X"\nlike = "WALOP-SOUTH"\npath = {path}\n[elements.late]\nkind = "retarder"\nwavelength = 0.6\n'
     with pytest.raises(DataError, match=f"element '{element}' stands ahead of the polariser.*put it behind"):
         build(parsed(text, "a test"))
+
+
+def test_beams_go_to_the_cameras_of_their_names():
+    south = nominal_instrument("WALOP-SOUTH")
+    cameras = dataclasses.replace(south.cameras, names=south.cameras.names[::-1])
+    rows = jnp.asarray(np.random.default_rng(1).standard_normal((2, 4, 4)))
+    found = light.beams(dataclasses.replace(south, cameras=cameras), rows)
+    np.testing.assert_array_equal(found[:, ::-1], light.beams(south, rows))
