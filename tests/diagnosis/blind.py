@@ -135,6 +135,7 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
     """Shapes that are in no catalogue, with their columns; `said` are those of single sentences."""
     e, points = measured.likelihood.calset.exposures, measured.likelihood.calset.points
     point, exposure = (np.repeat(at, measured.cameras) for at in np.nonzero(measured.used))
+    shape = (len(points), len(e), measured.cameras)
     x, y = points.x / 0.3, points.y / 0.3
     r, camera = np.hypot(points.x, points.y), np.eye(measured.cameras)[:, None, None]
     through = e.clp_in
@@ -158,21 +159,20 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
         * (e.mjd - e.mjd.mean())[None, :, None]
         * camera[0],
     }
-    counts = measured.flux[..., None] * measured.model  # in standard errors
-    level = measured.level[:, None] * measured.flux[..., None] * measured.weight
-    electrons = np.divide(counts, measured.weight, out=np.zeros_like(counts), where=measured.weight > 0)
-    alone = np.arange(len(points)) == len(points) // 3
-    changes = {name: gain * counts for name, gain in gains.items()} | {
-        "quadratic non-linearity": counts * electrons * camera[2],
-        "background that varies": level * drawn[None, :, None],
-        "field point on a polarised star": level
-        * alone[:, None, None]
+    shares = {  # of the unpolarised light
+        "background that varies": drawn[None, :, None] * np.ones(shape),
+        "field point on a polarised star": (np.arange(len(points)) == len(points) // 3)[:, None, None]
         * sky[None, :, None]
         * (camera[0] - camera[1]),
     }
-    for name, change in changes.items():
-        projected = project_flux(change, measured.model, measured.known, measured.shared)
+    counts = measured.flux[..., None] * measured.model  # in standard errors
+    electrons = np.divide(counts, measured.weight, out=np.zeros_like(counts), where=measured.weight > 0)
+    gains["quadratic non-linearity"] = electrons * camera[2]
+    for name, gain in gains.items():
+        projected = project_flux(gain * counts, measured.model, measured.known, measured.shared)
         yield name, -projected[measured.used].reshape(-1)
+    for name, share in shares.items():
+        yield name, measured.column(np.broadcast_to(share, shape))
     turn, narrowed = said["turn of polariser"], said["depolarisation of polariser"] * narrow[exposure]
     polish = (x**3 - 1.5 * x * y + 0.7 * y**2)[point]
     made = {
@@ -183,7 +183,7 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
     }
     yield from made.items()
     for name, texts in OUTSIDE.items():
-        if texts and name not in changes and name not in made and set(texts) <= set(said):
+        if texts and name not in {*gains, *shares, *made} and set(texts) <= set(said):
             yield name, np.sum([said[text] for text in texts], axis=0)
 
 
@@ -210,14 +210,14 @@ class Blind:
         self._root = self.space.gram @ self._whitening
         self.dimension = self._root.shape[1]
         self.outside = {}
-        single = {
+        self.said = {
             text: column
             for probe in self.sentences
             for text, column in zip(
                 candidates.said_by(probe), examination.said[probe.name].columns.T, strict=True
             )
         }
-        for name, shape in outside(examination.design.measured, single):
+        for name, shape in outside(examination.design.measured, self.said):
             column = examination.design.projector(examination.design.stacked([shape[:, None]])[:, 0])
             along = self._whitening.T @ examination.products(column)
             self.outside[name] = along, max(float(column @ column - along @ along), 0.0)

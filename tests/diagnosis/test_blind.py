@@ -18,19 +18,10 @@ def blind():
     return suite.Blind(simulate(plan, seed=41).calset, seed=2)
 
 
-def columns(blind):
-    """Columns of single sentences, in all rows of the design."""
-    return {
-        text: column
-        for probe in blind.sentences
-        for text, column in zip(said_by(probe), blind.evidence.said[probe.name].columns.T, strict=True)
-    }
-
-
 @pytest.mark.long
 def test_shapes_are_what_their_sentences_say(blind):
     """Behind the base a group with the sentences of a shape holds all of it that matters."""
-    design, said = blind.evidence.design, columns(blind)
+    design, said = blind.evidence.design, blind.said
     for name, shape in suite.outside(design.measured, said):
         column = design.projector(design.stacked([shape[:, None]])[:, 0])
         texts = suite.truth_of(name, said)
