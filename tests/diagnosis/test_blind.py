@@ -65,3 +65,12 @@ def test_verdicts_on_hidden_effects(blind):
     assert rates["outside: wrong name, SNR 10"][0] <= 0.15
     assert rates["removed: wrong name, SNR 10"][0] <= 0.1
     assert 0.7 < found["amplitude pulls"]["rms"] < 1.3
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("shape", ["dead columns", "ring", "step"])
+def test_a_name_that_leaves_nearly_all_is_no_name(blind, shape):
+    """A local loss takes a tenth of what a column of dead pixels does; the rest has no name, and so has the whole."""
+    verdicts = [blind.judge(blind.strange(shape, 30.0)) for _ in range(6)]
+    assert not [found.named for found in verdicts if set(found.named) - {"described"}]
+    assert {found.kind for found in verdicts} == {"unexplained"}
