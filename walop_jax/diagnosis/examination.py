@@ -289,8 +289,8 @@ class Evidence:
         if evidence <= self.least_evidence:
             return False
         # Of a poor fit the final model is asked (`Policy.part`): what is missing there may be many things.
-        name = not (self.poor or effect is Described)
-        least = self.policy.least_share_of_name if name else self.policy.least_share
+        stands_in = not (noise or self.poor or effect is Described)
+        least = self.policy.least_share_of_name if stands_in else self.policy.least_share
         if self.chi2 - left < least * (self.chi2 - self.dof):
             return False
         # What is left is noise, and was not before: a pattern can only say the same with more numbers.
