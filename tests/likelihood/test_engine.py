@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import builders
 import jax
@@ -62,6 +63,7 @@ def calibration_set(block, rows=ROWS):
     )
 
 
+@functools.cache
 def make_block(seed=3, noise=True, flux_known=True):
     """Counts of a random as-built instrument at random points, at random fluxes, with some rows unused."""
     rng = np.random.default_rng(seed)
@@ -87,42 +89,44 @@ def make_block(seed=3, noise=True, flux_known=True):
     return Block(x, y, counts, sigma, used, source), instrument
 
 
-BLOCK, TRUTH = make_block()
-
-
 def likelihood_of(block, rows=ROWS, points_per_chunk=None):
     calset = calibration_set(block, rows)
     return Likelihood.of(calset, base_model(calset, throughput_degree=2), points_per_chunk=points_per_chunk)
 
 
 @pytest.fixture(scope="module")
-def likelihood():
-    return likelihood_of(BLOCK)
+def block():
+    return make_block()[0]
+
+
+@pytest.fixture(scope="module")
+def likelihood(block):
+    return likelihood_of(block)
 
 
 @pytest.fixture(scope="module")
 def values(likelihood):
     """A point of parameter space some standard deviations off the truth: residuals far from noise."""
     rng = np.random.default_rng(8)
-    return np.asarray(values_of(builders.as_built(TRUTH, rng, 0.5)))
+    return np.asarray(values_of(builders.as_built(make_block()[1], rng, 0.5)))
 
 
-TEMPLATE = likelihood_of(BLOCK).model.template
+@functools.cache
+def _derivatives():
+    there = with_values(likelihood_of(make_block()[0]).model.template)
 
+    def plain(values, plan, data):
+        model = engine._prediction(there(values), plan, data) * data.weight
+        eliminate = jax.vmap(eliminate_flux, in_axes=(0, 0, None))
+        residual = eliminate(data.counts * data.weight, model, plan.exposures.flux_known)[1]
+        return (residual, model), (residual, model)
 
-def _plain(values, plan, data):
-    model = engine._prediction(with_values(TEMPLATE)(values), plan, data) * data.weight
-    eliminate = jax.vmap(eliminate_flux, in_axes=(0, 0, None))
-    residual = eliminate(data.counts * data.weight, model, plan.exposures.flux_known)[1]
-    return (residual, model), (residual, model)
-
-
-_derivatives = compiled(jax.jacfwd(_plain, has_aux=True))
+    return compiled(jax.jacfwd(plain, has_aux=True))
 
 
 def jacobians(likelihood, values, data):
     """Residuals, weighted model, and their plain forward derivatives with respect to all parameters."""
-    (dr, da), (r, a) = _derivatives(jnp.asarray(values), likelihood.plan, data)
+    (dr, da), (r, a) = _derivatives()(jnp.asarray(values), likelihood.plan, data)
     return tuple(np.asarray(v) for v in (r, a, dr, da))
 
 
@@ -283,30 +287,30 @@ def changed(block, **changes):
     return dataclasses.replace(block, **changes)
 
 
-def test_chunks_change_nothing(likelihood, values):
+def test_chunks_change_nothing(block, likelihood, values):
     """Seven points in chunks of three: the last one is padded."""
-    chunked = likelihood_of(BLOCK, points_per_chunk=3)
+    chunked = likelihood_of(block, points_per_chunk=3)
     assert len(chunked.points) == 3
     same(chunked.expand(values), likelihood.expand(values))
     assert (chunked.dof, chunked.census.n_data) == (likelihood.dof, likelihood.census.n_data)
 
 
-def test_order_of_the_points_changes_nothing(likelihood, values):
+def test_order_of_the_points_changes_nothing(block, likelihood, values):
     order = np.random.default_rng(1).permutation(POINTS)
-    shuffled = Block(*(getattr(BLOCK, f.name)[order] for f in dataclasses.fields(Block)))
+    shuffled = Block(*(getattr(block, f.name)[order] for f in dataclasses.fields(Block)))
     same(likelihood_of(shuffled).expand(values), likelihood.expand(values))
 
 
-def test_row_that_is_not_used_is_as_good_as_removed(values):
+def test_row_that_is_not_used_is_as_good_as_removed(block, values):
     """An exposure masked everywhere (counts and errors of any size) = a set that lacks it."""
     gone = 4
-    used, counts, sigma = BLOCK.used.copy(), BLOCK.counts.copy(), BLOCK.sigma.copy()
+    used, counts, sigma = block.used.copy(), block.counts.copy(), block.sigma.copy()
     used[:, gone], counts[:, gone], sigma[:, gone] = False, 1e9, 1e-3
-    masked = likelihood_of(changed(BLOCK, used=used, counts=counts, sigma=sigma))
+    masked = likelihood_of(changed(block, used=used, counts=counts, sigma=sigma))
     keep = np.delete(np.arange(len(ROWS)), gone)
     names = ("counts", "sigma", "used", "source")
     removed = likelihood_of(
-        changed(BLOCK, **{name: getattr(BLOCK, name)[:, keep] for name in names}), [ROWS[i] for i in keep]
+        changed(block, **{name: getattr(block, name)[:, keep] for name in names}), [ROWS[i] for i in keep]
     )
     same(masked.expand(values), removed.expand(values))
     assert (masked.dof, masked.census.n_data) == (removed.dof, removed.census.n_data)
@@ -315,29 +319,29 @@ def test_row_that_is_not_used_is_as_good_as_removed(values):
     assert np.isfinite(flux).all()
 
 
-def test_unit_of_the_counts_does_not_matter(values):
+def test_unit_of_the_counts_does_not_matter(block, values):
     """N and N_ERR times anything, row by row: the flux is eliminated (KIND `flux` has none to eliminate)."""
     factor = np.random.default_rng(2).uniform(0.01, 100.0, (POINTS, len(ROWS), 1))
     factor[:, -1] = 1.0
-    scaled = changed(BLOCK, counts=BLOCK.counts * factor, sigma=BLOCK.sigma * factor)
-    plain = likelihood_of(BLOCK)
+    scaled = changed(block, counts=block.counts * factor, sigma=block.sigma * factor)
+    plain = likelihood_of(block)
     same(likelihood_of(scaled).expand(values), plain.expand(values), 1e-9)
     flux = plain.residuals(values)[0]
     np.testing.assert_allclose(likelihood_of(scaled).residuals(values)[0], flux * factor[..., 0], rtol=1e-9)
 
 
-def test_known_flux_is_not_eliminated(values):
-    used = np.zeros_like(BLOCK.used)
+def test_known_flux_is_not_eliminated(block, values):
+    used = np.zeros_like(block.used)
     used[:, -1] = True
-    alone = changed(BLOCK, used=used)
-    twice = likelihood_of(changed(alone, counts=2 * BLOCK.counts)).expand(values).data
+    alone = changed(block, used=used)
+    twice = likelihood_of(changed(alone, counts=2 * block.counts)).expand(values).data
     assert twice > 2 * likelihood_of(alone).expand(values).data
 
 
-def test_degrees_of_freedom(likelihood):
+def test_degrees_of_freedom(block, likelihood):
     """Three per row, four with known flux, one per prior, minus the free parameters; counted by hand."""
-    rows = BLOCK.used.sum()
-    flux_rows = BLOCK.used[:, -1].sum()
+    rows = block.used.sum()
+    flux_rows = block.used[:, -1].sum()
     # priors: collimator 3, calibration plate 2, pupil 2, each half 4, two standards 4; throughput 4 × 6; δ
     priors, free = 3 + 2 + 2 + 8 + 4, 3 + 2 + 2 + 8 + 4 + 24 + 1
     assert likelihood.census.n_data == 4 * rows

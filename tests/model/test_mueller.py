@@ -94,21 +94,20 @@ def test_matrix2_is_the_algebra_of_two_by_two_matrices():
 # ------------------------------------------------------------------------------------------------ identities
 
 
-def pure_elements():
-    rng = np.random.default_rng(3)
-    yield "jones", mueller.from_jones(random_jones(rng)[0])
-    yield "retarder", mueller.retarder(jnp.asarray(rng.uniform(0, 7, 20)), jnp.asarray(rng.uniform(0, 7, 20)))
-    yield "diattenuator", mueller.diattenuator(jnp.asarray(rng.uniform(-0.6, 0.6, 20)), jnp.asarray(0.5))
-    yield "rotation", mueller.rotation(jnp.asarray(ANGLES))
+PURE = {
+    "jones": lambda rng: mueller.from_jones(random_jones(rng)[0]),
+    "retarder": lambda rng: mueller.retarder(*jnp.asarray(rng.uniform(0, 7, (2, 20)))),
+    "diattenuator": lambda rng: mueller.diattenuator(
+        jnp.asarray(rng.uniform(-0.6, 0.6, 20)), jnp.asarray(0.5)
+    ),
+    "rotation": lambda _: mueller.rotation(jnp.asarray(ANGLES)),
+}
 
 
-@pytest.mark.parametrize(
-    ("name", "matrix"), list(pure_elements()), ids=lambda v: v if isinstance(v, str) else ""
-)
-def test_pure_elements_do_not_depolarise(name, matrix):
+@pytest.mark.parametrize("made", PURE.values(), ids=PURE)
+def test_pure_elements_do_not_depolarise(made):
     """Tr(MᵀM) = 4 M00² (Gil & Bernabeu 1985)."""
-    del name
-    matrix = np.asarray(matrix)
+    matrix = np.asarray(made(np.random.default_rng(3)))
     np.testing.assert_allclose(np.sum(matrix**2, (-2, -1)), 4 * matrix[..., 0, 0] ** 2, rtol=1e-12)
 
 
