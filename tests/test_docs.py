@@ -318,7 +318,7 @@ def catalogue_tables() -> str:
             lines += ["| effect | parameter | unit | width | what it is |", "| --- | --- | --- | --- | --- |"]
         choices = [f.name for f in dataclasses.fields(effect) if f.metadata.get("static")]
         choices = [name for name in choices if name not in ("positions", "ids")]
-        equation = effect.head().partition("Equation")[2].partition("\nSymbols")[0]
+        equation = re.split(r"\n(?=Symbols|Source)", effect.head().partition("Equation")[2])[0]
         told = [
             inspect.cleandoc(effect.__doc__ or "").splitlines()[0].rstrip("."),
             *(f"choice: `{name}`" for name in choices),

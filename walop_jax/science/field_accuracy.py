@@ -156,7 +156,7 @@ def _with_size(calibration: Calibration, name: str) -> str:
     return (
         f"{name} (if wrong by {rounded(size, '.2g')} {unit})"
         if unit
-        else f"{name} (if wrong by {100 * size:.2g} %)"
+        else f"{name} (if wrong by {rounded(100 * size, '.2g')} %)"
     )
 
 

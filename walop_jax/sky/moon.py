@@ -78,7 +78,9 @@ def body_direction(
         )
     if not site.known:
         raise fail(
-            "the site is not known", column="SITELAT, SITELONG, SITEELEV", advice="add them to the header"
+            "the site is not known",
+            column="SITELAT, SITELONG, SITEELEV",
+            advice="add them to the header, or [site] to the description of the instrument",
         )
     with _offline():
         # Imported here: coordinates take half a second, and only Moon exposures need them.

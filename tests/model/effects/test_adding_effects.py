@@ -121,10 +121,9 @@ def test_the_class_of_the_page_is_an_effect(tmp_path):
     path = tmp_path / "spot.py"
     path.write_text(example("A class", '"""A dark spot.'), encoding="utf-8")
     own = catalogue_with(path)[-1].of(scenes.CONTEXT, x=0.21, size=0.1, depth=0.2)
-    left = 1.0 - 0.2 * np.exp(-((scenes.X - 0.21) ** 2 + scenes.Y**2) / 0.02)
-    np.testing.assert_allclose(
-        scenes.observe(own) / scenes.observe(), left[:, None, None] * np.ones((2, 9, 4))
-    )
+    left = np.ones((2, 9, 4))
+    left[..., :2] -= 0.2 * np.exp(-((scenes.X - 0.21) ** 2 + scenes.Y**2) / 0.02)[:, None, None]
+    np.testing.assert_allclose(scenes.observe(own) / scenes.observe(), left)
 
 
 ENTRY = 'about = "a"\nsource = "b"\nrevealed_by = "c"\nseparated_by = "d"\n'
@@ -138,6 +137,7 @@ GOOD = 'angle = { does = "turn of polariser", unit = "deg", width = 0.1, about =
         (f"[a]\n{GOOD}", r"\[a\] needs about"),
         (f"[a]\n{ENTRY}{GOOD.replace('turn of', 'tun of')}", "cannot read 'tun of polariser'"),
         (f"[a]\n{ENTRY}{GOOD.replace('polariser', 'polariser * heat')}", "there is no factor 'heat'"),
+        (f"[a]\n{ENTRY}{GOOD.replace('polariser', '{kamera}')}", "there is no choice of angle 'kamera'"),
         (
             f"[a]\n{ENTRY}{GOOD.replace('width', 'widht')}",
             "there is no key of angle 'widht'; did you mean 'width'",

@@ -14,6 +14,7 @@ from walop_jax.likelihood import engine
 from walop_jax.model import light
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.parameters import values_of, with_values
+from walop_jax.simulation.simulate import effect_from_text
 
 COUNTS = jnp.array([[1e5, 2e5, 3e5, 4e5]] * 9)
 
@@ -70,8 +71,16 @@ def test_gain_drift_by_hand():
 @pytest.mark.parametrize("camera", [4, -1])
 def test_a_camera_that_does_not_exist_is_refused(name, camera):
     """An index out of range would otherwise change nothing, and a negative one another camera."""
-    with pytest.raises(ValueError, match=f"{name}: camera {camera} does not exist, there are 4"):
+    with pytest.raises(ValueError, match=f"{name}: camera {camera} does not exist; cameras are O1"):
         scenes.instrument(make(name, camera=camera)).patched()
+
+
+def test_a_camera_goes_by_its_name_or_its_number():
+    text = "camera_gain_drift=camera:{},rate:0.01"
+    by_name, by_number = (effect_from_text(text.format(given), scenes.CONTEXT) for given in ("E2", "3"))
+    assert by_name.choices() == by_number.choices() == {"camera": 3}
+    with pytest.raises(ValueError, match=r"camera 'E3' does not exist; cameras are O1 \(0\), E1 \(1\)"):
+        effect_from_text(text.format("E3"), scenes.CONTEXT)
 
 
 def test_blemish_by_hand():

@@ -27,19 +27,22 @@ from walop_jax.model.parameters import Component, field_declarations, unknown_na
 Scalar = Float[Array, ""]
 
 
+CAMERAS = ("O1", "E1", "O2", "E2")
+
+
 class Context(NamedTuple):
     """Facts about the data for effects that grow with them.
 
     `moon` holds the positions of the Moon exposures and `moon_ids` their EXPOSURE numbers; `sources` the
-    names of the standards, `exposures` the number of exposures, `cameras` that of cameras; `extinction` is that of the
-    polariser without the effect.
+    names of the standards, `exposures` the number of exposures, `cameras` the names of the cameras; `extinction` is
+    that of the polariser without the effect.
     """
 
     exposures: int = 0
     moon: tuple[int, ...] = ()
     moon_ids: tuple[int, ...] = ()
     sources: tuple[str, ...] = ()
-    cameras: int = 4
+    cameras: tuple[str, ...] = CAMERAS
     extinction: float = EXTINCTION
 
 
@@ -83,7 +86,8 @@ class Effect(Component):
     def of(cls, context: Context, **values: Any) -> Self:
         """The neutral effect with some values replaced; a scalar fills a parameter that has many elements.
 
-        Raises ValueError, with the nearest names, for a parameter that the effect does not have.
+        A camera goes by its name, or by its number from 0. Raises ValueError, with the nearest names, for a parameter
+        that the effect does not have, and for a camera that does not exist.
         """
         effect = cls.neutral(context)
         names = [field.name for field in dataclasses.fields(effect)]
@@ -92,10 +96,8 @@ class Effect(Component):
                 raise unknown_name(f"parameter of {cls.name}", name, names)
             if name in field_declarations(cls):
                 values[name] = jnp.broadcast_to(jnp.asarray(value, float), np.shape(getattr(effect, name)))
-        if values.get("camera", 0) not in range(context.cameras):
-            raise ValueError(
-                f"{cls.name}: camera {values['camera']!r} does not exist, there are {context.cameras}"
-            )
+        if "camera" in values:
+            values["camera"] = numbered_camera(cls.name, values["camera"], context.cameras)
         return dataclasses.replace(effect, **values)
 
     @classmethod
@@ -179,9 +181,11 @@ def with_amplitudes(
     return [getattr(effects[i], name) for i, name in names], put
 
 
-def check_camera(effect: Effect, camera: int, names: Sequence[str]) -> int:
-    """The number of a camera of an instrument; ValueError where it does not exist."""
-    if not 0 <= camera < len(names):
-        known = ", ".join(f"{number} ({name})" for number, name in enumerate(names))
-        raise ValueError(f"{effect.name}: camera {camera!r} does not exist; cameras are {known}")
-    return camera
+def numbered_camera(effect: str, camera: int | str, names: Sequence[str]) -> int:
+    """The number of a camera that is given by name or number; ValueError, naming the effect, where it is not there."""
+    if camera in names:
+        return names.index(camera)  # type: ignore[arg-type]
+    if camera not in range(len(names)):
+        known = ", ".join(f"{name} ({number})" for number, name in enumerate(names))
+        raise ValueError(f"{effect}: camera {camera!r} does not exist; cameras are {known}")
+    return int(camera)

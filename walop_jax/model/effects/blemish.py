@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model.cameras import Transmission
-from walop_jax.model.effects.base import Context, Effect, Scalar, check_camera
+from walop_jax.model.effects.base import Context, Effect, Scalar, numbered_camera
 from walop_jax.model.effects.change import Change
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import param
@@ -91,7 +91,7 @@ class Blemish(Effect):
     @classmethod
     def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
         """Spots on a grid over the field, in any of the cameras."""
-        places = itertools.product(range(context.cameras), GRID, GRID)
+        places = itertools.product(range(len(context.cameras)), GRID, GRID)
         return tuple((cls.of(context, camera=camera, x=x, y=y, size=0.06),) for camera, x, y in places)
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
@@ -102,6 +102,6 @@ class Blemish(Effect):
     def patch(self, instrument: Instrument) -> Instrument:
         """Darken the camera around the spot."""
         names = instrument.cameras.names
-        camera = check_camera(self, self.camera, names)
+        camera = numbered_camera(self.name, self.camera, names)
         spot = Spot(self.x, self.y, self.size, self.depth, camera, len(names))
         return instrument.with_part("transmission", spot)

@@ -33,6 +33,7 @@ import importlib
 import inspect
 import itertools
 import os
+import re
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -52,7 +53,7 @@ from walop_jax.io.text import parse_toml
 from walop_jax.model.alternatives import alternatives, changed
 from walop_jax.model.compiled import array
 from walop_jax.model.conventions import EXTINCTION
-from walop_jax.model.effects.base import Context, Effect, Scalar, check_camera
+from walop_jax.model.effects.base import Context, Effect, Scalar, numbered_camera
 from walop_jax.model.effects.change import Change, patched
 from walop_jax.model.elements import WavePlate
 from walop_jax.model.instrument import Instrument
@@ -127,7 +128,7 @@ class Entry(Effect):
         values: dict[str, Any] = {}
         for member in cls.members:
             if member.each == "camera":
-                values[member.name] = array(np.zeros(context.cameras))
+                values[member.name] = array(np.zeros(len(context.cameras)))
             elif member.each:
                 values[member.name] = array(np.zeros(len(context.moon)))
                 values |= {"positions": context.moon, "ids": context.moon_ids}
@@ -140,7 +141,7 @@ class Entry(Effect):
     @classmethod
     def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
         """Every choice; of a polar pair both directions."""
-        known = {"cameras": range(context.cameras), "stars": context.sources}
+        known = {"cameras": range(len(context.cameras)), "stars": context.sources}
         options = [known.get(one, one) if isinstance(one, str) else one for one in cls.options.values()]
         polar = next((member for member in cls.members if member.polar), None)
         shapes: list[dict[str, Any]] = [{}]
@@ -253,7 +254,7 @@ class Entry(Effect):
         chosen = self.choices()
         if "camera" in chosen:
             names = instrument.cameras.names
-            chosen["camera"] = names[check_camera(self, chosen["camera"], names)]
+            chosen["camera"] = names[numbered_camera(self.name, chosen["camera"], names)]
         text = text.format_map({name: str(value).replace(" ", "_") for name, value in chosen.items()})
         every = list(_expanded(text, instrument))
         if member.each == "camera":
@@ -337,17 +338,16 @@ def _made(name: str, table: Mapping[str, Any], module: str) -> type[Effect]:
             raise ValueError(f"needs {key} = a text")
     if not parameters and "arrangement" not in table:
         raise ValueError("needs a parameter, a key that holds a table with does = …")
-    members, fields = [], {}
+    members, fields, choices = [], {}, dict(table.get("choices", {}))
     for key, own in parameters.items():
         for each in own:
             if each not in PARAMETER_KEYS:
                 raise unknown_name(f"key of {key}", each, PARAMETER_KEYS)
         fields[key] = _field(key, own, table["source"])
         if "does" in own:
-            members.append(_member(key, own, parameters))
+            members.append(_member(key, own, parameters, choices))
         elif key not in (other.get("polar") for other in parameters.values()):
             raise ValueError(f"{key}: needs does = a change")
-    choices = dict(table.get("choices", {}))
     page = {
         "Equation": table.get("equation", ""),
         "Symbols": "; ".join(_symbol(key, own) for key, own in parameters.items()),
@@ -400,14 +400,19 @@ def _field(name: str, own: Mapping[str, Any], source: str) -> tuple[Any, Any]:
     return field, Float[Array, " n"] if "each" in own else Scalar
 
 
-def _member(name: str, own: Mapping[str, Any], parameters: Mapping[str, Any]) -> Member:
+def _member(
+    name: str, own: Mapping[str, Any], parameters: Mapping[str, Any], choices: Mapping[str, Any]
+) -> Member:
     def texts(key: str, otherwise: tuple[str, ...]) -> tuple[str, ...]:
         value = own.get(key, otherwise)
         return (value,) if isinstance(value, str) else tuple(value)
 
     does = texts("does", ())
-    for text in does:
-        Change.parsed(text.replace("every ", "every_").format_map(_Any()))
+    for text in (*does, *texts("said", ())):
+        for choice in re.findall(r"{(\w*)}", text):
+            if choice not in choices:
+                raise unknown_name(f"choice of {name}", choice, choices)
+        Change.parsed(re.sub(r"[{}]", "", text.replace("every ", "every_")))
     per_unit = own.get("per_unit", 1.0)
     sizes = tuple(map(float, per_unit)) if isinstance(per_unit, Sequence) else (float(per_unit),) * len(does)
     polar, each = own.get("polar", ""), own.get("each", "")
@@ -417,11 +422,6 @@ def _member(name: str, own: Mapping[str, Any], parameters: Mapping[str, Any]) ->
         raise unknown_name("each", each, EACH)
     turns, absolute = float(own.get("turns", 1.0)), bool(own.get("absolute", False))
     return Member(name, does, sizes, texts("said", does), each, polar, turns, absolute)
-
-
-class _Any(dict[str, str]):
-    def __missing__(self, key: str) -> str:
-        return key
 
 
 def own_entries(path: str | os.PathLike[str]) -> tuple[type[Effect], ...]:

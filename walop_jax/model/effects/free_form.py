@@ -125,10 +125,10 @@ class FreeForm(Effect):
             if name not in BLOCKS:
                 raise unknown_name("block of free_form", name, BLOCKS)
         shapes = {
-            "vectors": (context.cameras, 2, len(_SMOOTH_TERMS)),
-            "harmonics": (context.cameras, len(HARMONICS), 2, len(_GRADIENT_TERMS)),
-            "fine": (context.cameras, len(_FINE_TERMS)),
-            "exposures": (context.exposures, context.cameras),
+            "vectors": (len(context.cameras), 2, len(_SMOOTH_TERMS)),
+            "harmonics": (len(context.cameras), len(HARMONICS), 2, len(_GRADIENT_TERMS)),
+            "fine": (len(context.cameras), len(_FINE_TERMS)),
+            "exposures": (context.exposures, len(context.cameras)),
         }
         zeros = {
             name: jnp.zeros(shape if name in blocks else (0, *shape[1:])) for name, shape in shapes.items()
