@@ -28,7 +28,6 @@ Limits      One effect at a time, to first order in its amplitude, for the shape
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -36,7 +35,7 @@ from jaxtyping import Float
 from scipy import special
 
 from walop_jax.calibration.matrix import change_of_qu, effect_slopes, first_setting, matrix_slopes
-from walop_jax.diagnosis.candidates import Probe, applicable
+from walop_jax.diagnosis.candidates import Probe, applicable, has_fringes
 from walop_jax.diagnosis.candidates import probes as all_probes
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM, Examination, examine, most_points
@@ -55,9 +54,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.fit.stand_in import on_field_points
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood import limits
-from walop_jax.model.dependence import needs
 from walop_jax.model.effects import Effect
-from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.specification import effect_context
 
@@ -146,14 +143,10 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     slopes = slopes @ result.model.selection()
     chosen = _representative(columns)
     probes, changes = [], [np.zeros((*matrix.shape, 0))]
-    # Effects that need more wavelength nodes than the others (fringes) have a program of their own.
-    by_nodes = sorted(
-        (_path_difference(instrument, probe), number, probe)
-        for number, probe in enumerate(examination.probes)
-        if probe.name in chosen
-    )
-    for _, group in itertools.groupby(by_nodes, key=lambda item: item[0]):
-        some = [probe for _, _, probe in group]
+    template = result.model.template
+    # Fringes need more wavelength nodes than all others: they have a program of their own.
+    for fringes in (False, True):
+        some = [p for p in examination.probes if p.name in chosen and has_fringes(p, template) == fringes]
         members = tuple(member for probe in some for member in probe.group)
         changes.append(effect_slopes(instrument, setting, calset.filters, x, y, members))
         probes += some
@@ -173,11 +166,6 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
         own = change[..., place[column.probe.name] + column.number]
         found[i] = change_of_qu(matrix, matrix + column.detected * (own - slopes @ taken_up))
     return found
-
-
-def _path_difference(instrument: Instrument, probe: Probe) -> float:
-    """Path difference (µm) that the wavelength nodes must follow with the effect of a probe in the light path."""
-    return needs(dataclasses.replace(instrument, effects=(*instrument.effects, *probe.group))).path_difference
 
 
 def _representative(columns: Sequence[_Column]) -> set[str]:
