@@ -169,12 +169,6 @@ def all_candidates(
     return named, said
 
 
-def has_fringes(probe: Probe, template: Instrument) -> bool:
-    """True if an effect makes fringes, which need more wavelength nodes than anything else."""
-    changes = (change for member in probe.group for change in member.first_order(template) or ())
-    return any(True for change in changes for _ in _fringes(change))
-
-
 def _fringes(change: Change) -> Iterator[Sentence]:
     return (sentence for _, sentence in change if sentence.kind == "fringes")
 

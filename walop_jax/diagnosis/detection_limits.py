@@ -35,7 +35,7 @@ from jaxtyping import Float
 from scipy import special
 
 from walop_jax.calibration.matrix import change_of_qu, effect_slopes, first_setting, matrix_slopes
-from walop_jax.diagnosis.candidates import Probe, applicable, has_fringes
+from walop_jax.diagnosis.candidates import Probe, applicable
 from walop_jax.diagnosis.candidates import probes as all_probes
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM, Examination, examine, most_points
@@ -55,6 +55,7 @@ from walop_jax.fit.stand_in import on_field_points
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Effect
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.specification import effect_context
 
@@ -146,7 +147,7 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     template = result.model.template
     # Fringes need more wavelength nodes than all others: they have a program of their own.
     for fringes in (False, True):
-        some = [p for p in examination.probes if p.name in chosen and has_fringes(p, template) == fringes]
+        some = [p for p in examination.probes if p.name in chosen and _has_fringes(p, template) == fringes]
         members = tuple(member for probe in some for member in probe.group)
         changes.append(effect_slopes(instrument, setting, calset.filters, x, y, members))
         probes += some
@@ -166,6 +167,11 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
         own = change[..., place[column.probe.name] + column.number]
         found[i] = change_of_qu(matrix, matrix + column.detected * (own - slopes @ taken_up))
     return found
+
+
+def _has_fringes(probe: Probe, template: Instrument) -> bool:
+    changes = (change for member in probe.group for change in member.first_order(template))
+    return any(sentence.kind == "fringes" for change in changes for _, sentence in change)
 
 
 def _representative(columns: Sequence[_Column]) -> set[str]:

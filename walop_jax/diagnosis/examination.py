@@ -288,10 +288,13 @@ class Evidence:
         evidence /= self.floor**2
         if evidence <= self.least_evidence:
             return False
+        missing = self.chi2 - self.dof
+        least = self.policy.least_share * missing
         # Of a poor fit the final model is asked (`Policy.part`): what is missing there may be many things.
-        stands_in = not (noise or self.poor or effect is Described)
-        least = self.policy.least_share_of_name if stands_in else self.policy.least_share
-        if self.chi2 - left < least * (self.chi2 - self.dof):
+        if not (self.poor or effect is Described):
+            surely = missing - 2.0 * np.sqrt(2.0 * self.dof)
+            least = max(least, self.policy.least_share_of_name * surely)
+        if self.chi2 - left < least:
             return False
         # What is left is noise, and was not before: a pattern can only say the same with more numbers.
         if noise and not explains(self.chi2, self.dof):

@@ -57,7 +57,7 @@ class Policy:
     least_share: float = 0.1
     """Share of what is missing that an addition must explain."""
     least_share_of_name: float = 0.2
-    """The same of a name that leaves more than noise of a fit that is not poor: it stands in for what has none."""
+    """Of what is surely missing (2 σ of χ²) a name, where the fit is not poor: else it stands in for what has none."""
     least_evidence: float = 1.0
     """Evidence that an effect must be worth to the final model to stay in it."""
     part: float = 10.0
