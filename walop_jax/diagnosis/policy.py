@@ -56,7 +56,7 @@ class Policy:
     """Below it the data cannot tell two candidates apart."""
     least_share: float = 0.1
     """Share of what is missing that an addition must explain."""
-    least_share_of_name: float = 0.2
+    least_share_of_name: float = 0.25
     """Of what is surely missing (2 σ of χ²) a name, where the fit is not poor: else it stands in for what has none."""
     least_evidence: float = 1.0
     """Evidence that an effect must be worth to the final model to stay in it."""
