@@ -55,6 +55,14 @@ def throughput_ratios(analysis, table):
     return ratios
 
 
+def as_made(south, data):
+    """The numbers that a set was made with, as a start; throughputs are nominal, standards those of the catalogue."""
+    catalogue, true = data["sources"], read_truth(south)[0]
+    start = forward.nominal(catalogue["Q"].size)
+    start |= {name: value for name, value in true.items() if np.shape(start.get(name, ())) == np.shape(value)}
+    return start | {"q": catalogue["Q"].copy(), "u": catalogue["U"].copy()}
+
+
 def compare(params, table, wavelengths, weights):
     """Model minus truth of every element and plate setting, throughput ratios taken from the truth."""
     params = {**params, "throughput": np.eye(1, 15).repeat(4, 0)}

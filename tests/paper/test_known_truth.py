@@ -192,11 +192,12 @@ def observe(result, truth, electrons, tmp_path):
 def test_apply_on_light_of_the_true_instrument(either_south_set, south_fit, tmp_path):
     """Errors as large as `apply` says they are.
 
-    Faint stars test the photon part; for bright ones only the calibration is left, and that is one draw of it.
+    Faint stars test the photon part; for bright ones (5e-6) only the calibration is left, and that is one draw of it.
+    At 1e13 electrons the arithmetic of the two programs, 1e-6, is what the stars disagree by, and `apply` says so.
     """
     south = either_south_set("b")
     truth = TrueInstrument(south)
-    for electrons, low, high in ((1e6, 0.9, 1.1), (1e13, 0.3, 2.0)):
+    for electrons, low, high in ((1e6, 0.9, 1.1), (1e10, 0.3, 2.0)):
         found, off = observe(south_fit(south), truth, electrons, tmp_path)
         chi2 = np.einsum("si,sij,sj->s", off, np.linalg.inv(found.covariance), off)
         spread = 4 / np.sqrt(len(chi2))  # of the mean of χ²/2 of stars that do not share their errors
@@ -209,7 +210,7 @@ def test_apply_on_light_of_the_true_instrument(either_south_set, south_fit, tmp_
 def test_errors_of_bright_stars_on_set_b(whole_south_set, south_fit, tmp_path):
     """p ≤ 5 %, calibration alone, the strip without u included."""
     south = whole_south_set("b")
-    _, off = observe(south_fit(south), TrueInstrument(south), 1e13, tmp_path)
+    _, off = observe(south_fit(south), TrueInstrument(south), 1e10, tmp_path)
     assert np.abs(off).max() < 3e-4
 
 
