@@ -102,10 +102,14 @@ def test_one_number_is_among_those_that_are_told(change, what, size):
 @pytest.mark.parametrize(
     ("change", "what", "size"),
     [
-        (displaced, "X of all field points changed by", -0.02),
-        (turned, "the angle of the field changed by", -0.002),
-        pytest.param(shifted, "the wavelengths of filter SDSS-r changed by", -0.004, marks=pytest.mark.long),
-        pytest.param(cooler, "TEFF of exposures of kind clp", 5772.0, marks=pytest.mark.long),
+        (displaced, "ask for X of all field points changed by", -0.02),
+        (turned, "ask for the angle of the field changed by", -0.002),
+        # The effect that does the same is told first, and with the same number.
+        pytest.param(shifted, "ask for filter_shift, wavelength", -0.004, marks=pytest.mark.long),
+        pytest.param(
+            shifted, "um; or for the wavelengths of filter SDSS-r changed by", -0.004, marks=pytest.mark.long
+        ),
+        pytest.param(cooler, "ask for TEFF of exposures of kind clp", 5772.0, marks=pytest.mark.long),
     ],
 )
 def test_a_number_that_is_wrong_is_told_with_its_size(change, what, size):

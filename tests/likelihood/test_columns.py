@@ -66,9 +66,8 @@ def laid():
     model = base_model(simulate(WITH_PLATE, seed=4).calset)
     values = np.array([p.start + 0.3 * (p.prior[1] if p.prior else 0.0) for p in model.parameters])
     calset, truth = simulate(WITH_PLATE, seed=4, instrument=model.instrument(values), noiseless=True)
-    values = np.asarray(
-        values_of(truth)
-    )  # with the stars as they are: what a model expects is what was measured
+    # With the stars as they are: what a model expects is what was measured.
+    values = np.asarray(values_of(truth))
     e, number = calset.exposures, np.arange(len(calset.exposures))
     moved = dataclasses.replace(e, temp=10.0 + np.sin(number), ha=np.cos(2.0 * number))
     calset = dataclasses.replace(calset, exposures=moved)

@@ -142,12 +142,12 @@ def all_candidates(
         each = [member.first_order(template) for member in probe.group]
         if all(one and all(columns.has(change) for change in one) for one in each):
             changes[number] = [change for one in each for change in one]
-    gaps = [sentence.gap for some in changes.values() for change in some for sentence in _fringes(change)]
+    gaps = [sentence.gap for some in changes.values() for change in some for sentence in fringes_of(change)]
     survives = columns.survives(gaps)
     blurred = {
         number
         for number, some in changes.items()
-        if not all(survives[sentence.gap] for change in some for sentence in _fringes(change))
+        if not all(survives[sentence.gap] for change in some for sentence in fringes_of(change))
     }
     kept = {number: some for number, some in changes.items() if number not in blurred}
     exact = sum(len(some) for number, some in kept.items() if number < len(shown))
@@ -169,7 +169,8 @@ def all_candidates(
     return named, said
 
 
-def _fringes(change: Change) -> Iterator[Sentence]:
+def fringes_of(change: Change) -> Iterator[Sentence]:
+    """The sentences of a change that are about fringes, which need more wavelength nodes than all others."""
     return (sentence for _, sentence in change if sentence.kind == "fringes")
 
 

@@ -35,7 +35,7 @@ from jaxtyping import Float
 from scipy import special
 
 from walop_jax.calibration.matrix import change_of_qu, effect_slopes, first_setting, matrix_slopes
-from walop_jax.diagnosis.candidates import Probe, applicable
+from walop_jax.diagnosis.candidates import Probe, applicable, fringes_of
 from walop_jax.diagnosis.candidates import probes as all_probes
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM, Examination, examine, most_points
@@ -171,7 +171,7 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
 
 def _has_fringes(probe: Probe, template: Instrument) -> bool:
     changes = (change for member in probe.group for change in member.first_order(template))
-    return any(sentence.kind == "fringes" for change in changes for _, sentence in change)
+    return any(True for change in changes for _ in fringes_of(change))
 
 
 def _representative(columns: Sequence[_Column]) -> set[str]:

@@ -354,7 +354,7 @@ def model_without_data(
         )
         model = make_model(nominal.name, nominal, frozen=(GAUGE,))
         model = dataclasses.replace(model, catalogue=known_to(header, catalogue))
-        known = context or Context(sources=nominal.standard.names, cameras=tuple(nominal.cameras.names))
+        known = context or Context(sources=nominal.standard.names, cameras=nominal.cameras.names)
         return _with_effects(model, header, known)
 
     return parse(text, build)

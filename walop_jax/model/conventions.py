@@ -22,4 +22,5 @@ def matrix_elements(arms: int) -> tuple[str, ...]:
     return tuple(f"m{row}{column}" for row in range(2, 2 + arms) for column in (1, 2, 3))
 
 
+CAMERAS = ("O1", "E1", "O2", "E2")  # of WALOP, in the order of N
 EXTINCTION = 2e-5  # of the calibration polariser of WALOP, unwanted over wanted transmission

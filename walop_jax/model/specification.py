@@ -169,7 +169,7 @@ def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
         moon=tuple(moon.tolist()),
         moon_ids=tuple(np.asarray(exposures.exposure)[moon].tolist()),
         sources=instrument.standard.names,
-        cameras=tuple(instrument.cameras.names),
+        cameras=instrument.cameras.names,
         extinction=float(polariser.extinction) if (polariser := instrument.polariser) else EXTINCTION,
     )
 

@@ -384,7 +384,7 @@ class ObservingPlan:
             moon=tuple(int(i) for i in moon),
             moon_ids=tuple(int(i) for i in exposures.exposure[moon]),
             sources=self.star_names,
-            cameras=tuple(self.design.cameras.names),
+            cameras=self.design.cameras.names,
         )
 
 

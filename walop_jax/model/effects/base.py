@@ -19,15 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from walop_jax.model.conventions import EXTINCTION
+from walop_jax.model.conventions import CAMERAS, EXTINCTION
 from walop_jax.model.effects.change import Change
 from walop_jax.model.instrument import Instrument, NoSuchPlaceError
 from walop_jax.model.parameters import Component, field_declarations, unknown_name
 
 Scalar = Float[Array, ""]
-
-
-CAMERAS = ("O1", "E1", "O2", "E2")
 
 
 class Context(NamedTuple):
