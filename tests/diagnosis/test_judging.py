@@ -12,7 +12,7 @@ from scipy import integrate, stats
 from walop_jax.calibration.matrix import largest_change
 from walop_jax.diagnosis import search
 from walop_jax.diagnosis.design import Design, Measured, strata
-from walop_jax.diagnosis.examination import upper_limit
+from walop_jax.diagnosis.examination import Evidence, upper_limit
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
@@ -263,3 +263,27 @@ def test_patterns_of_the_optics_predict_settings_that_they_have_not_seen():
     calset = simulate(PLAN, seed=1, effects=[hidden]).calset
     optics = Design.of(fit(Likelihood.of(calset, base_model(calset))))
     assert search.predicts_unseen(optics, vectors(optics), POLICY.useful)
+
+
+@pytest.mark.parametrize(
+    ("effect", "chi2", "explained", "told"),
+    [
+        # χ² 11 000 of 10 000: 1000 are missing, 1000 − 2 √20 000 = 717 surely, a quarter of which is 179.
+        (effect_by_name("blemish"), 11_000.0, 175.0, False),
+        (effect_by_name("blemish"), 11_000.0, 183.0, True),
+        (Described, 11_000.0, 105.0, True),
+        (Described, 11_000.0, 95.0, False),
+        # χ² 10 300: 17 are surely missing, and the tenth of all that is, 30, is more than their quarter.
+        (effect_by_name("blemish"), 10_300.0, 35.0, True),
+        (effect_by_name("blemish"), 10_300.0, 25.0, False),
+        # A poor fit may lack many things: a tenth.
+        (effect_by_name("blemish"), 16_000.0, 650.0, True),
+        (effect_by_name("blemish"), 16_000.0, 550.0, False),
+    ],
+)
+def test_a_name_must_explain_a_quarter_of_what_is_surely_missing(effect, chi2, explained, told):
+    state = SimpleNamespace(
+        chi2=chi2, dof=10_000, poor=chi2 > 15_000, floor=1.0, policy=POLICY, probes=(), stands=lambda *_: True
+    )
+    worth = Evidence.is_worth_telling(state, effect, 50.0, chi2 - explained, noise=False)
+    assert worth is told

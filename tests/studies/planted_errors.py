@@ -162,6 +162,8 @@ ERRORS = (
             "jacobian.shape[0] - jacobian.shape[1]", "diagnosis/test_score.py"),
     planted("diagnosis/score.py", "- np.log1p(value)", "+ np.log1p(value)", "diagnosis/test_score.py"),
     planted("diagnosis/score.py", "t * s**2", "s**2", "diagnosis/test_score.py"),
+    planted("diagnosis/examination.py", "missing - 2.0 * np.sqrt", "missing + 2.0 * np.sqrt",
+            "diagnosis/test_judging.py"),
     planted("diagnosis/search.py", "information - np.diag(width**-2.0)", "information", "diagnosis/test_judging.py"),
     planted("diagnosis/trust.py", "2.0 * min(above, 1.0 - above)", "min(above, 1.0)", "diagnosis/test_trust.py"),
     planted("diagnosis/trust.py", "variance = 2.0 * (own[0]", "variance = 4.0 * (own[0]", "diagnosis/test_trust.py"),
