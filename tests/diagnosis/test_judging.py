@@ -283,7 +283,14 @@ def test_patterns_of_the_optics_predict_settings_that_they_have_not_seen():
 )
 def test_a_name_must_explain_a_quarter_of_what_is_surely_missing(effect, chi2, explained, told):
     state = SimpleNamespace(
-        chi2=chi2, dof=10_000, poor=chi2 > 15_000, floor=1.0, policy=POLICY, probes=(), stands=lambda *_: True
+        chi2=chi2,
+        dof=10_000,
+        poor=chi2 > 15_000,
+        floor=1.0,
+        least_evidence=POLICY.least_evidence,
+        policy=POLICY,
+        probes=(),
+        stands=lambda *_: True,
     )
     worth = Evidence.is_worth_telling(state, effect, 50.0, chi2 - explained, noise=False)
     assert worth is told
