@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from walop_jax.data.settings import Settings
-from walop_jax.likelihood import field_table
+from walop_jax.likelihood import optics
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects import effect_by_name
@@ -56,15 +56,16 @@ def test_derivatives_are_those_of_forward_differentiation(instrument, plan):
         value = matrix_of(there, light.band_rows(there, plan, X, Y), there.throughput.at(X, Y))
         return value, value
 
-    def quantity(rows, values, local):
-        return matrix_of(to_instrument(values), rows, local)
+    def quantity(values, local):
+        return matrix_of(
+            to_instrument(values), optics.band_rows(values, instrument, plan, X, Y), local
+        )
 
     def pieces(values):
         there = to_instrument(values)
-        rows, slopes = field_table.rows_and_slopes(there, plan, X, Y)
-        found = field_table.linearised(there, quantity, rows, slopes, there.throughput.at(X, Y))
+        found = optics.linearised(there, quantity, there.throughput.at(X, Y))
         basis = there.throughput.basis(X, Y)[None]
-        return field_table.to_all(there, found.plain, found.local, basis), found.value
+        return optics.to_all(there, found.plain, found.local, basis), found.value
 
     # Compiled as wholes: operation by operation they take 700 compilations.
     values = values_of(instrument)
@@ -83,7 +84,7 @@ def test_derivatives_are_those_of_forward_differentiation(instrument, plan):
 
 
 def test_positions_are_all_parameters_once(instrument):
-    plain, series = field_table.plain_positions(instrument), series_indices(instrument)
+    plain, series = optics.plain_positions(instrument), series_indices(instrument)
     assert sorted([*plain, *series]) == list(range(values_of(instrument).size))
     assert all(leaves(instrument)[i].name.startswith("throughput.n") for i in series)
 
@@ -97,9 +98,9 @@ def test_local_derivatives_go_through_the_series():
         for camera in range(3):
             for term in range(6):
                 expected[:, camera, term] += local[:, site, camera] * basis[site, term]
-    found = field_table.through_series(local, basis)
+    found = optics.through_series(local, basis)
     assert isinstance(found, np.ndarray)
     np.testing.assert_allclose(found, expected.reshape(5, 18), rtol=0, atol=1e-14)
-    same = field_table.through_series(jnp.asarray(local), jnp.asarray(basis))
+    same = optics.through_series(jnp.asarray(local), jnp.asarray(basis))
     assert isinstance(same, jax.Array)
     np.testing.assert_allclose(same, found, rtol=0, atol=1e-14)

@@ -24,15 +24,9 @@ from jaxtyping import Array, Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import in_chunks, sky_vectors
 from walop_jax.data.settings import Settings
-from walop_jax.likelihood.field_table import (
-    FieldTable,
-    accurate_table,
-    held_out,
-    linearised,
-    plain_positions,
-    rows_and_slopes,
-    through_series,
-)
+from walop_jax.likelihood import optics
+from walop_jax.likelihood.field_table import FieldTable, accurate_table, held_out
+from walop_jax.likelihood.optics import linearised, plain_positions, through_series
 from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import compiled
@@ -83,14 +77,11 @@ def _derivatives(
     """Derivatives to the plain parameters, then to the local throughputs."""
     to_instrument = with_values(instrument)
 
-    def vectors(
-        rows: Float[Array, "b r 4"], all_values: Float[Array, " n"], local: Float[Array, " k"]
-    ) -> Float[Array, "b k 3"]:
-        there = to_instrument(all_values)
+    def vectors(values: Float[Array, " n"], local: Float[Array, " k"]) -> Float[Array, "b k 3"]:
+        there, rows = to_instrument(values), optics.band_rows(values, instrument, plan, x, y)
         return (light.camera_vectors(there, rows, local, x, y) @ light.telescope(there, x, y))[..., :3]
 
-    rows, slopes = rows_and_slopes(instrument, plan, x, y)
-    found = linearised(instrument, vectors, rows, slopes, instrument.throughput.at(x, y))
+    found = linearised(instrument, vectors, instrument.throughput.at(x, y))
     return jnp.concatenate([found.plain, found.local])
 
 

@@ -26,8 +26,9 @@ from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import Hidden, Structure
-from walop_jax.likelihood import limits
-from walop_jax.likelihood.field_table import Vector, accurate_table, linearised, rows_and_slopes, to_all
+from walop_jax.likelihood import limits, optics
+from walop_jax.likelihood.field_table import Vector, accurate_table
+from walop_jax.likelihood.optics import linearised, to_all
 from walop_jax.likelihood.runner import usual_threads
 from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
@@ -158,15 +159,12 @@ def point_matrix(
     """Instrument matrices of a field point and their derivatives with respect to all parameters."""
     to_instrument = with_values(instrument)
 
-    def matrix(
-        rows: Float[Array, "b r 4"], all_values: Float[Array, " n"], local: Float[Array, " k"]
-    ) -> Float[Array, "b a 3"]:
-        there = to_instrument(all_values)
+    def matrix(values: Float[Array, " n"], local: Float[Array, " k"]) -> Float[Array, "b a 3"]:
+        there, rows = to_instrument(values), optics.band_rows(values, instrument, plan, x, y)
         vectors = light.camera_vectors(there, rows, local, x, y)
         return light.instrument_matrix(vectors @ light.telescope(there, x, y), there.cameras.pairs)
 
-    rows, slopes = rows_and_slopes(instrument, plan, x, y)
-    m, plain, local = linearised(instrument, matrix, rows, slopes, instrument.throughput.at(x, y))
+    m, plain, local = linearised(instrument, matrix, instrument.throughput.at(x, y))
     return m, to_all(instrument, plain, local, instrument.throughput.basis(x, y)[None])
 
 

@@ -25,16 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from walop_jax.likelihood import limits
-from walop_jax.likelihood.field_table import (
-    FieldTable,
-    LocalDerivatives,
-    linearised,
-    plain_positions,
-    rows_and_slopes,
-    to_all,
-)
+from walop_jax.likelihood import limits, optics
+from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.flux import eliminate_flux, project_flux, sharing
+from walop_jax.likelihood.optics import LocalDerivatives, linearised, plain_positions, to_all
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
@@ -78,31 +72,24 @@ def field_sites(instrument: Instrument, point: PointData) -> tuple[Float[Array, 
     return point.x[None], point.y[None]
 
 
-def _rows_at(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
+def rows_at(
+    values: Vector, template: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
 ) -> Float[Array, "m b r 4"]:
-    sites = field_sites(instrument, point)
-    if nodes is not None:
-        return nodes(*sites)[0]
-    return jax.vmap(light.band_rows, (None, None, 0, 0))(instrument, plan, *sites)
+    """Band rows at the sites of a point, of an instrument with these values of its parameters; with their slopes."""
+    sites = field_sites(template, point)
+    if nodes is None:
+        return jax.vmap(optics.band_rows, (None, None, None, 0, 0))(values, template, plan, *sites)
+    rows, slopes = nodes(*sites)
+    index = jnp.asarray(optics.directions(template, plan).index)
+    return optics.with_slopes(values, rows, jnp.swapaxes(slopes, 0, 1), index)
 
 
-def _rows_and_slopes_at(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None
-) -> tuple[Float[Array, "m b r 4"], Float[Array, "o m b r 4"]]:
-    sites = field_sites(instrument, point)
-    if nodes is not None:
-        rows, slopes = nodes(*sites)
-    else:
-        rows, slopes = jax.vmap(rows_and_slopes, (None, None, 0, 0))(instrument, plan, *sites)
-    return rows, jnp.swapaxes(slopes, 0, 1)
-
-
-def _throughput_at(instrument: Instrument, point: PointData) -> Float[Array, "m k"]:
+def throughput_at(instrument: Instrument, point: PointData) -> Float[Array, "m k"]:
+    """Throughputs of the cameras at the sites of a point."""
     return jax.vmap(instrument.throughput.at)(*field_sites(instrument, point))
 
 
-def _unit_counts(
+def unit_counts(
     instrument: Instrument,
     plan: Plan,
     rows: Float[Array, "m b r 4"],
@@ -124,16 +111,16 @@ def point_prediction(
     instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
 ) -> Float[Array, "e k"]:
     """Counts of one point for light of unit flux, ahead of the detectors."""
-    rows, throughput = _rows_at(instrument, plan, point, nodes), _throughput_at(instrument, point)
-    return _unit_counts(instrument, plan, rows, throughput, point)
+    rows = rows_at(values_of(instrument), instrument, plan, point, nodes)
+    return unit_counts(instrument, plan, rows, throughput_at(instrument, point), point)
 
 
 def vectors_at(
     instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
 ) -> Float[Array, "b k 4"]:
     """Analysis vectors of a point in every band."""
-    rows, throughput = _rows_at(instrument, plan, point, nodes)[0], _throughput_at(instrument, point)[0]
-    return light.camera_vectors(instrument, rows, throughput, point.x, point.y)
+    rows = rows_at(values_of(instrument), instrument, plan, point, nodes)[0]
+    return light.camera_vectors(instrument, rows, throughput_at(instrument, point)[0], point.x, point.y)
 
 
 def best_flux(
@@ -175,13 +162,11 @@ def _linear_unit_counts(
     """Counts of one point for light of unit flux, and their derivatives with respect to its local quantities."""
     to_instrument = with_values(instrument)
 
-    def unit_counts(
-        rows: Float[Array, "m b r 4"], all_values: Vector, local: Float[Array, "m k"]
-    ) -> Float[Array, "e k"]:
-        return _unit_counts(to_instrument(all_values), plan, rows, local, point)
+    def counts(values: Vector, local: Float[Array, "m k"]) -> Float[Array, "e k"]:
+        rows = rows_at(values, instrument, plan, point, nodes)
+        return unit_counts(to_instrument(values), plan, rows, local, point)
 
-    rows, slopes = _rows_and_slopes_at(instrument, plan, point, nodes)
-    return linearised(instrument, unit_counts, rows, slopes, _throughput_at(instrument, point))
+    return linearised(instrument, counts, throughput_at(instrument, point))
 
 
 def unit_slopes(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e k n"]:
@@ -200,7 +185,7 @@ def _point_jacobian(
     exposures and cameras.
     """
     to_instrument = with_values(instrument)
-    throughput = _throughput_at(instrument, point)
+    throughput = throughput_at(instrument, point)
     unit, d_plain, d_local = _linear_unit_counts(instrument, plan, point, nodes)
     # From unit flux to counts: `along` is the derivative with respect to the flux itself.
     flux = best_flux(instrument, plan, unit, point)

@@ -15,9 +15,9 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
 from walop_jax.likelihood.layout import Layout, MeasuredPoints, PointReader
+from walop_jax.likelihood.optics import directions
 from walop_jax.likelihood.runner import Runner, SlabSums
 from walop_jax.model.compiled import require_double_precision
-from walop_jax.model.dependence import optical_indices
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
@@ -248,7 +248,7 @@ class Likelihood:
         hint = None if near is None else near.optics.nodes_per_side
         if not self.layout.interpolated or (near is not None and hint is None):
             return None, OpticsUsed(None)
-        scale = np.array([p.scale for p in self.model.parameters])[optical_indices(instrument)]
+        scale = np.array([p.scale for p in self.model.parameters])[directions(instrument, self.plan).index]
         nodes, error = accurate_nodes(instrument, self.plan, self.layout.rectangle, scale, hint)
         return (None, OpticsUsed(None)) if nodes is None else (nodes, OpticsUsed(nodes.count, error))
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 POINTS_PER_CHUNK = 16
 """Field points of a chunk whose optics are solved point by point: what 144 of them need at a time leaves the cache of
 the processor and takes twice as long. One program serves sets of any size."""
+FORWARD_CHUNK = 8
+"""Field points of a chunk of the forward model: a gradient of few compiles in two thirds of the time of one of many."""
 LARGE_CHUNK = 1024
 """Field points of a chunk whose optics are interpolated: each of them costs less, and the engine divides it further."""
 MEMORY = 2e9

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.model import light
 from walop_jax.model.cameras import DetectorPart
@@ -29,7 +29,7 @@ from walop_jax.model.effects.base import Effect
 from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Shapes, leaves, of_shapes, parameter_places, shapes_of
-from walop_jax.model.plan import blank_plan
+from walop_jax.model.plan import Plan, blank_plan
 from walop_jax.model.ray import Conditions, NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays, Sight
 
@@ -53,6 +53,36 @@ def optical_indices(instrument: Instrument) -> Int[np.ndarray, " o"]:
     flags = [reached[place] for place, count in parameter_places(instrument) for _ in range(count)]
     assert len(flags) == len(leaves(instrument))
     return np.flatnonzero(flags)
+
+
+def optical_reach(instrument: Instrument, plan: Plan) -> Bool[np.ndarray, "a n"]:
+    """True where a parameter (columns) reaches the band rows of an arm (rows) in the settings of a plan."""
+    structure, shapes = shapes_of((instrument, plan))
+    reached = np.array(_reach(structure, shapes), bool)
+    places = [place for place, count in parameter_places(instrument) for _ in range(count)]
+    return reached[:, places]
+
+
+@functools.lru_cache(maxsize=256)
+def _reach(structure: Any, shapes: Shapes) -> tuple[tuple[bool, ...], ...]:
+    """For every arm the arrays of instrument and plan that reach its rows."""
+
+    def find() -> tuple[tuple[bool, ...], ...]:
+        def rows_of(number: int) -> Any:
+            def run(*arrays: Array) -> Array:
+                instrument, plan = jax.tree_util.tree_unflatten(structure, arrays)
+                patched = instrument.patched()
+                one_arm = dataclasses.replace(patched, arms=patched.arms[number : number + 1])
+                # At an odd place, as in `_follow`.
+                return light.band_rows(one_arm, plan, jnp.asarray(0.11), jnp.asarray(0.07))
+
+            return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(s, d) for s, d in shapes))
+
+        arms = len(of_shapes(structure, shapes)[0].arms)
+        programs = map(rows_of, range(arms))
+        return tuple(_reaching(program, program.jaxpr.outvars[0]) for program in programs)
+
+    return answer("optical_reach", structure, shapes, find)
 
 
 @functools.lru_cache(maxsize=256)

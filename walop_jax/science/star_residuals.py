@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import special
 
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.field_table import through_series
+from walop_jax.likelihood.optics import through_series
 from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.inverses import whitening
 

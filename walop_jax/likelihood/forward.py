@@ -1,0 +1,202 @@
+"""The forward model of a calibration set as pure functions of JAX: counts, residuals, densities.
+
+    χ²(θ) = Σ ((N − F a(θ)) / σ)²,    ln L = −χ² / 2,    ln p = −½ Σ ((θ − μ) / s)²
+
+Symbols     θ parameters of the model, in its order and units; N ± σ used intensities (electrons); a(θ) counts for light
+            of unit flux (`model.light`), through the detectors where their response is not linear; F flux of each
+            (point, exposure), the one that fits best (`likelihood.flux`); μ, s mean and width of a prior
+Gauges      constants are left out of the densities. A free parameter without a prior may have a weak pull to its start
+            value, which keeps what the data do not determine from running away; it is part of ln p, as in a fit
+Ties        a tied parameter has the value of its master, whatever stands in its place
+Derivatives in any mode and order; the optics by the rule of `likelihood.optics`. Points are worked on in chunks, in a
+            scan, and a gradient computes each chunk anew: its memory is that of one chunk
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from walop_jax.data.records import CalibrationSet
+from walop_jax.likelihood import engine, limits, optics
+from walop_jax.likelihood.engine import PointData
+from walop_jax.likelihood.layout import Layout, PointReader
+from walop_jax.likelihood.likelihood import PriorRows, prior_rows
+from walop_jax.model.compiled import array, require_double_precision
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import check_names, values_of, with_values
+from walop_jax.model.plan import Plan
+from walop_jax.model.specification import Model
+
+Values = Float[Array, " n"]
+
+
+class Forward(eqx.Module):
+    """Counts, residuals and densities of one calibration set under one model; every array is a leaf.
+
+    Methods take the vector of all parameters in the order of `names`, or an `Instrument`, and may be composed with
+    `jax.jit`, `grad`, `jacfwd`, `jacrev`, `hessian` and `vmap`. Points, exposures and cameras are in the order of the set.
+
+    >>> forward = walop.forward(calset)
+    >>> forward.counts(forward.start).shape  # point, exposure, camera
+    (29, 14, 4)
+    """
+
+    template: Instrument
+    plan: Plan
+    data: PointData  # with leading axes (chunk, point)
+    used: Int[Array, " d"]
+    master: Int[Array, " n"]
+    free: Int[Array, " f"]
+    start: Values
+    prior: tuple[Int[Array, " k"], Float[Array, " k"], Float[Array, " k"]]
+    names: tuple[str, ...] = eqx.field(static=True)
+    shape: tuple[int, int, int] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, calset: CalibrationSet, model: Model) -> Forward:
+        """The forward model of a set that fits into memory. Raises RuntimeError when float64 is switched off."""
+        require_double_precision()
+        layout = Layout.of(calset, model, points_per_chunk=limits.FORWARD_CHUNK, interpolate=False)
+        reader = PointReader(calset, layout.plan, layout.mirrored, model.template.cameras.floor)
+        chunks = reader.chunks(0, layout.points, layout.chunk)
+        data = jax.tree.map(lambda *parts: array(np.stack(parts)), *chunks)
+        rows: PriorRows = prior_rows(model)
+        place = {name: i for i, name in enumerate(model.names)}
+        return cls(
+            template=model.template,
+            plan=layout.plan,
+            data=data,
+            used=array(np.flatnonzero(np.asarray(data.weight))),
+            master=array([place[p.tie or p.name] for p in model.parameters], int),
+            free=array(model.free),
+            start=array(model.start),
+            prior=(array(rows.index), array(rows.mean), array(rows.width)),
+            names=model.names,
+            shape=(layout.points, len(calset.exposures), calset.cameras),
+        )
+
+    def __getattribute__(self, name: str) -> Any:
+        # Methods of Equinox modules are trees, which `jax.jit` cannot hash; these are plain methods.
+        return object.__getattribute__(self, name)
+
+    def __repr__(self) -> str:
+        points, exposures, cameras = self.shape
+        return (
+            f"Forward model of {self.template.name}: {len(self.names)} parameters, {len(self.free)} free; {points} points, "
+            f"{exposures} exposures, {cameras} cameras, {len(self.used)} used intensities"
+        )
+
+    # ----------------------------------------------------------------------------------------- vectors
+
+    def named(self, values: Values) -> dict[str, Float[Array, ""]]:
+        """The values by the names of their parameters."""
+        return dict(zip(self.names, values, strict=True))
+
+    def values(self, named: dict[str, Any]) -> Values:
+        """All values from some by name, the others at their start.
+
+        Raises ValueError, with the nearest names, for one that does not exist.
+        """
+        check_names("parameter", named, self.names)
+        return self._tied(jnp.stack([jnp.asarray(named.get(n, s)) for n, s in zip(self.names, self.start, strict=True)]))
+
+    def full(self, free: Float[Array, " f"]) -> Values:
+        """All values from those of the free parameters."""
+        return self._tied(self.start.at[self.free].set(free))
+
+    def _tied(self, values: Values) -> Values:
+        return values[self.master]
+
+    def instrument(self, values: Values) -> Instrument:
+        """The instrument with these values in the place of its parameters."""
+        return with_values(self.template)(self._tied(jnp.asarray(values)))
+
+    # ------------------------------------------------------------------------------------ what is measured
+
+    def counts(
+        self, values: Values | Instrument, flux: Float[Array, "p e"] | None = None
+    ) -> Float[Array, "p e k"]:
+        """Counts (electrons) of every camera, for a flux (electrons per unit of unpolarised light) or the best one.
+
+        With the best flux they are 0 where no intensity is used.
+        """
+        given = None if flux is None else self._chunked(jnp.asarray(flux)[..., None])
+
+        def of(point: PointData, flux: Array | None) -> Array:
+            instrument, unit = self._unit(values, point)
+            flux = engine.best_flux(instrument, self.plan, unit, point) if flux is None else flux
+            return engine.real_counts(instrument, self.plan, unit, flux)
+
+        return self._whole(jax.lax.map(lambda part: jax.vmap(of)(*part), (self.data, given)))
+
+    def flux(self, values: Values | Instrument) -> Float[Array, "p e f"]:
+        """Best flux of every (point, exposure), one for each group of cameras that has one in common."""
+
+        def of(point: PointData) -> Array:
+            instrument, unit = self._unit(values, point)
+            return engine.best_flux(instrument, self.plan, unit, point)
+
+        return self._whole(jax.lax.map(jax.vmap(of), self.data))
+
+    def residuals(self, values: Values | Instrument) -> Float[Array, " d"]:
+        """(measured − model) / error of the used intensities, fluxes eliminated; by point, exposure, camera."""
+        every = jax.lax.map(lambda part: self._residuals(values, part), self.data)
+        return every.reshape(-1)[self.used]
+
+    # ----------------------------------------------------------------------------------------- densities
+
+    def chi2(self, values: Values | Instrument) -> Float[Array, ""]:
+        """Sum of the squared residuals."""
+        part = jax.checkpoint(lambda data: jnp.sum(self._residuals(values, data) ** 2))
+        return jax.lax.scan(lambda total, data: (total + part(data), None), jnp.zeros(()), self.data)[0]
+
+    def log_likelihood(self, values: Values | Instrument) -> Float[Array, ""]:
+        """−χ²/2 of the data."""
+        return -0.5 * self.chi2(values)
+
+    def log_prior(self, values: Values) -> Float[Array, ""]:
+        """Logarithm of the prior of the free parameters, weak pulls included, without its constant."""
+        index, mean, width = self.prior
+        return -0.5 * jnp.sum(((self._tied(jnp.asarray(values))[index] - mean) / width) ** 2)
+
+    def log_density(self, values: Values) -> Float[Array, ""]:
+        """Logarithm of the posterior density, without its constant."""
+        return self.log_likelihood(values) + self.log_prior(values)
+
+    # --------------------------------------------------------------------------------------- point by point
+
+    def _unit(self, values: Values | Instrument, point: PointData) -> tuple[Instrument, Float[Array, "e k"]]:
+        """The instrument, and the counts of a point for light of unit flux."""
+        if isinstance(values, Instrument):
+            instrument, vector = values, values_of(values)
+        else:
+            vector = self._tied(jnp.asarray(values))
+            instrument = with_values(self.template)(vector)
+        x, y = engine.field_sites(instrument, point)
+        base = values if isinstance(values, Instrument) else self.template
+        rows = jax.vmap(optics.band_rows, (None, None, None, 0, 0))(vector, base, self.plan, x, y)
+        throughput = jax.vmap(instrument.throughput.at)(x, y)
+        return instrument, engine.unit_counts(instrument, self.plan, rows, throughput, point)
+
+    def _residuals(self, values: Values | Instrument, data: PointData) -> Float[Array, "m e k"]:
+        def of(point: PointData) -> Array:
+            instrument, unit = self._unit(values, point)
+            flux = engine.best_flux(instrument, self.plan, unit, point)
+            return (point.counts - engine.real_counts(instrument, self.plan, unit, flux)) * point.weight
+
+        return jax.vmap(of)(data)
+
+    def _whole(self, chunks: Float[Array, "c m e k"]) -> Float[Array, "p e k"]:
+        """All points, without those that fill up the last chunk."""
+        return chunks.reshape(-1, *chunks.shape[2:])[: self.shape[0]]
+
+    def _chunked(self, points: Float[Array, "p e f"]) -> Float[Array, "c m e f"]:
+        chunks, size = self.data.x.shape
+        filled = jnp.concatenate([points, jnp.repeat(points[-1:], chunks * size - len(points), axis=0)])
+        return filled.reshape(chunks, size, *points.shape[1:])

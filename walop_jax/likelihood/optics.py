@@ -1,0 +1,199 @@
+"""Band rows of a field point with one rule of differentiation: all the optics there is, and its slopes.
+
+Some ten parameters enter before the band integral; all that follows is dot products. Hence one rule, for every
+derivative that anyone takes: the rows R of a point come with their slopes in these parameters, computed once,
+
+    dR = Σ_o (∂R/∂θ_o) dθ_o
+
+whatever the number of directions dθ, exposures or cameras. Slopes are forward derivatives of `light.band_rows`, exact;
+parameters that no arm has in common share one, as a plate of the one half of the pupil leaves the rows of the other as
+they are (the colouring of a sparse Jacobian; Curtis, Powell & Reid 1974, J. Inst. Maths Applics 13, 117). Which
+parameter reaches which rows is found by following it through the operations, not declared.
+
+Units       parameters in their units; field coordinates deg.
+Limits      what is not a parameter (field position, wavelengths, other arrays of the instrument) is differentiated as it
+            stands, by JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Bool, Float, Int
+
+from walop_jax.model import light
+from walop_jax.model.dependence import optical_reach
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import values_of, with_values
+from walop_jax.model.plan import Plan
+from walop_jax.model.specification import series_indices
+
+Scalar = Float[Array, ""]
+
+
+class Directions(NamedTuple):
+    """Directions in which the rows are differentiated: parameter `index[o]` with others in direction `colour[o]`.
+
+    `reached[o]` is True for the rows that the parameter changes.
+    """
+
+    index: Int[np.ndarray, " o"]
+    colour: Int[np.ndarray, " o"]
+    reached: Bool[np.ndarray, "o r"]
+
+    @property
+    def count(self) -> int:
+        """Number of directions."""
+        return int(self.colour.max(initial=-1)) + 1
+
+    def seeds(self, parameters: int) -> Float[np.ndarray, "c n"]:
+        """The directions as changes of all parameters."""
+        seeds = np.zeros((self.count, parameters))
+        seeds[self.colour, self.index] = 1.0
+        return seeds
+
+
+def directions(instrument: Instrument, plan: Plan) -> Directions:
+    """The fewest directions that a greedy choice gives; parameters that share one reach no row in common."""
+    reach = optical_reach(instrument, plan)
+    rows = np.repeat(reach, [arm.analyser.rows for arm in instrument.arms], axis=0).T
+    if light.is_dispersed(instrument):
+        rows = np.tile(rows, 2)
+    index = np.flatnonzero(rows.any(axis=1))
+    colour, taken = [], []
+    for reached in rows[index]:
+        k = next((k for k, rows_taken in enumerate(taken) if not (rows_taken & reached).any()), len(taken))
+        if k == len(taken):
+            taken.append(np.zeros(rows.shape[1], bool))
+        taken[k] = taken[k] | reached
+        colour.append(k)
+    return Directions(index, np.array(colour, int), rows[index])
+
+
+def _slopes(
+    values: Float[Array, " n"], instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
+) -> tuple[Directions, Float[Array, "b r 4"], Float[Array, "c b r 4"]]:
+    """Band rows and their derivatives along `directions`."""
+    along = directions(instrument, plan)
+    rows, push = jax.linearize(lambda v: light.band_rows(with_values(instrument)(v), plan, x, y), values)
+    return along, rows, jax.vmap(push)(jnp.asarray(along.seeds(values.size)))
+
+
+@jax.custom_jvp
+def band_rows(
+    values: Float[Array, " n"], instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
+) -> Float[Array, "b r 4"]:
+    """Band rows at a field position (deg), as `light.band_rows`, of an instrument with these values of its parameters."""
+    return light.band_rows(with_values(instrument)(values), plan, x, y)
+
+
+def _rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+    values, *others = primals
+    along, rows, slopes = _slopes(values, *others)
+    change = jnp.zeros_like(rows)
+    if not isinstance(tangents[0], SymbolicZero):
+        # Share of every direction in the change of every row.
+        share = jnp.zeros(slopes.shape[:1] + rows.shape[1:2])
+        share = share.at[along.colour].add(tangents[0][along.index][:, None] * along.reached)
+        change = jnp.einsum("cr,cbrs->brs", share, slopes)
+    if not all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(tangents[1:])):
+        rest = jax.tree.map(_instantiated, tangents[1:], is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
+        change = change + jax.jvp(lambda *o: band_rows.fun(values, *o), tuple(others), rest)[1]
+    return rows, change
+
+
+def _instantiated(tangent: Any) -> Any:
+    if not isinstance(tangent, SymbolicZero):
+        return tangent
+    return np.zeros(tangent.aval.shape, tangent.aval.dtype)
+
+
+band_rows.defjvp(_rule, symbolic_zeros=True)
+
+
+def rows_and_slopes(
+    instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
+) -> tuple[Float[Array, "b r 4"], Float[Array, "o b r 4"]]:
+    """Band rows at a field position (deg) and their exact derivatives in the parameters of `directions`."""
+    along, rows, slopes = _slopes(values_of(instrument), instrument, plan, x, y)
+    return rows, slopes[along.colour] * along.reached[:, None, :, None]
+
+
+@jax.custom_jvp
+def with_slopes(
+    values: Float[Array, " n"],
+    rows: Float[Array, "*m b r 4"],
+    slopes: Float[Array, "o *m b r 4"],
+    index: Int[Array, " o"],
+) -> Float[Array, "*m b r 4"]:
+    """Rows that were computed before, at these values, as a function of the parameters `index`: with known slopes."""
+    return rows
+
+
+@with_slopes.defjvp
+def _with_slopes_rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+    _, rows, slopes, index = primals
+    return rows, tangents[1] + jnp.tensordot(tangents[0][index], slopes, 1)
+
+
+# ------------------------------------------------------------------------------------------- small Jacobians
+
+
+class LocalDerivatives(NamedTuple):
+    """A quantity of a field point and its derivatives: in the plain parameters, and in the throughputs there.
+
+    Plain are all parameters but the coefficients of the throughput series; these enter through the throughputs at the
+    point alone (`to_all`). Leading axes are the parameters, and the throughputs, flattened.
+    """
+
+    value: Float[Array, ...]
+    plain: Float[Array, "o ..."]
+    local: Float[Array, "l ..."]
+
+
+def plain_positions(instrument: Instrument) -> Int[np.ndarray, " o"]:
+    """Positions of all parameters but the coefficients of the throughput series."""
+    return np.setdiff1d(np.arange(values_of(instrument).size), series_indices(instrument))
+
+
+def linearised(
+    instrument: Instrument, quantity: Callable[[Array, Array], Array], local: Float[Array, ...]
+) -> LocalDerivatives:
+    """A quantity of all parameters and the local throughputs, and its derivatives at those of an instrument."""
+    values, plain = values_of(instrument), plain_positions(instrument)
+    value, push = jax.linearize(quantity, values, local)
+    each = jnp.eye(local.size).reshape(-1, *local.shape)
+    return LocalDerivatives(
+        value,
+        jax.vmap(lambda change: push(change, jnp.zeros_like(local)))(jnp.eye(values.size)[plain]),
+        jax.vmap(lambda change: push(jnp.zeros_like(values), change))(each),
+    )
+
+
+def through_series(local: Float[Any, "... m k"], basis: Float[Any, "... m t"]) -> Float[Any, "... kt"]:
+    """Derivatives with respect to the coefficients of the series from those with respect to the throughputs.
+
+    `basis` holds the values of the terms at the sites m; leading axes broadcast. Arrays of numpy stay so.
+    """
+    xp = jnp if isinstance(local, jax.Array) else np
+    spread = xp.einsum("...mk,...mt->...kt", local, basis)
+    return spread.reshape(*spread.shape[:-2], -1)
+
+
+def to_all(
+    instrument: Instrument,
+    plain: Float[Array, "o ..."],
+    local: Float[Array, "l ..."],
+    basis: Float[Array, "m t"],
+) -> Float[Array, "... n"]:
+    """Derivatives with respect to all parameters, in their order; `basis` as in `through_series`."""
+    cameras = len(instrument.cameras)
+    by_site = jnp.moveaxis(local, 0, -1).reshape(*local.shape[1:], -1, cameras)
+    full = jnp.zeros((*plain.shape[1:], values_of(instrument).size))
+    full = full.at[..., plain_positions(instrument)].set(jnp.moveaxis(plain, 0, -1))
+    return full.at[..., series_indices(instrument)].set(through_series(by_site, basis))
