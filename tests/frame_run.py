@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from walop_jax.data.frames import Grid
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 
 
@@ -11,3 +12,10 @@ def frame_run(side: int) -> ObservingPlan:
         grid=side, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
         polariser_angles=polariser_turn(8, full_turn=True), throughput_degree=2,
     )  # fmt: skip
+
+
+def raster(side: int) -> Grid:
+    """The pixels of a square detector at the points of `frame_run`."""
+    field = frame_run(side).field
+    step = 2.0 * field / (side - 1)
+    return Grid(side, side, (1.0, 1.0), (-field, -field), ((step, 0.0), (0.0, step)))

@@ -57,9 +57,7 @@ def test_derivatives_are_those_of_forward_differentiation(instrument, plan):
         return value, value
 
     def quantity(values, local):
-        return matrix_of(
-            to_instrument(values), optics.band_rows(values, instrument, plan, X, Y), local
-        )
+        return matrix_of(to_instrument(values), optics.band_rows(values, instrument, plan, X, Y), local)
 
     def pieces(values):
         there = to_instrument(values)

@@ -23,7 +23,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.optics import rows_and_slopes

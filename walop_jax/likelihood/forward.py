@@ -14,6 +14,7 @@ Derivatives in any mode and order; the optics by the rule of `likelihood.optics`
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -33,14 +34,14 @@ from walop_jax.model.parameters import check_names, values_of, with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import Model
 
-Values = Float[Array, " n"]
+Values = Float[Any, " n"]
 
 
 class Forward(eqx.Module):
     """Counts, residuals and densities of one calibration set under one model; every array is a leaf.
 
-    Methods take the vector of all parameters in the order of `names`, or an `Instrument`, and may be composed with
-    `jax.jit`, `grad`, `jacfwd`, `jacrev`, `hessian` and `vmap`. Points, exposures and cameras are in the order of the set.
+    Methods take the vector of all parameters in the order of `names`, or an `Instrument`, and compose with `jax.jit`,
+    `grad`, `jacfwd`, `jacrev`, `hessian` and `vmap`. Points, exposures and cameras are in the order of the set.
 
     >>> forward = walop.forward(calset)
     >>> forward.counts(forward.start).shape  # point, exposure, camera
@@ -59,10 +60,16 @@ class Forward(eqx.Module):
     shape: tuple[int, int, int] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, calset: CalibrationSet, model: Model) -> Forward:
-        """The forward model of a set that fits into memory. Raises RuntimeError when float64 is switched off."""
+    def of(cls, calset: CalibrationSet, model: Model, chunk: int | None = None) -> Forward:
+        """The forward model of a set that fits into memory, `chunk` points at a time (None: by the kind of machine).
+
+        Raises RuntimeError when float64 is switched off.
+        """
         require_double_precision()
-        layout = Layout.of(calset, model, points_per_chunk=limits.FORWARD_CHUNK, interpolate=False)
+        if chunk is None:
+            on_cpu = jax.default_backend() == "cpu"
+            chunk = limits.FORWARD_CHUNK if on_cpu else limits.FORWARD_CHUNK_OF_ACCELERATORS
+        layout = Layout.of(calset, model, points_per_chunk=chunk, interpolate=False)
         reader = PointReader(calset, layout.plan, layout.mirrored, model.template.cameras.floor)
         chunks = reader.chunks(0, layout.points, layout.chunk)
         data = jax.tree.map(lambda *parts: array(np.stack(parts)), *chunks)
@@ -88,8 +95,8 @@ class Forward(eqx.Module):
     def __repr__(self) -> str:
         points, exposures, cameras = self.shape
         return (
-            f"Forward model of {self.template.name}: {len(self.names)} parameters, {len(self.free)} free; {points} points, "
-            f"{exposures} exposures, {cameras} cameras, {len(self.used)} used intensities"
+            f"Forward model of {self.template.name}: {len(self.names)} parameters, {len(self.free)} free; "
+            f"{points} points, {exposures} exposures, {cameras} cameras, {len(self.used)} used intensities"
         )
 
     # ----------------------------------------------------------------------------------------- vectors
@@ -98,15 +105,16 @@ class Forward(eqx.Module):
         """The values by the names of their parameters."""
         return dict(zip(self.names, values, strict=True))
 
-    def values(self, named: dict[str, Any]) -> Values:
+    def values(self, named: Mapping[str, Any]) -> Values:
         """All values from some by name, the others at their start.
 
         Raises ValueError, with the nearest names, for one that does not exist.
         """
         check_names("parameter", named, self.names)
-        return self._tied(jnp.stack([jnp.asarray(named.get(n, s)) for n, s in zip(self.names, self.start, strict=True)]))
+        index = [self.names.index(name) for name in named]
+        return self._tied(self.start.at[np.array(index, int)].set(jnp.array(list(named.values()), float)))
 
-    def full(self, free: Float[Array, " f"]) -> Values:
+    def full(self, free: Float[Any, " f"]) -> Values:
         """All values from those of the free parameters."""
         return self._tied(self.start.at[self.free].set(free))
 
@@ -120,7 +128,7 @@ class Forward(eqx.Module):
     # ------------------------------------------------------------------------------------ what is measured
 
     def counts(
-        self, values: Values | Instrument, flux: Float[Array, "p e"] | None = None
+        self, values: Values | Instrument, flux: Float[Any, "p e"] | None = None
     ) -> Float[Array, "p e k"]:
         """Counts (electrons) of every camera, for a flux (electrons per unit of unpolarised light) or the best one.
 

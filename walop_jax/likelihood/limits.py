@@ -12,6 +12,8 @@ POINTS_PER_CHUNK = 16
 the processor and takes twice as long. One program serves sets of any size."""
 FORWARD_CHUNK = 8
 """Field points of a chunk of the forward model: a gradient of few compiles in two thirds of the time of one of many."""
+FORWARD_CHUNK_OF_ACCELERATORS = 512
+"""The same where thousands of threads have to be kept busy: 40 MB of optics for a gradient."""
 LARGE_CHUNK = 1024
 """Field points of a chunk whose optics are interpolated: each of them costs less, and the engine divides it further."""
 MEMORY = 2e9

@@ -11,8 +11,8 @@ they are (the colouring of a sparse Jacobian; Curtis, Powell & Reid 1974, J. Ins
 parameter reaches which rows is found by following it through the operations, not declared.
 
 Units       parameters in their units; field coordinates deg.
-Limits      what is not a parameter (field position, wavelengths, other arrays of the instrument) is differentiated as it
-            stands, by JAX.
+Limits      what is not a parameter (field position, wavelengths, other arrays of the instrument) is differentiated
+            by JAX, without a rule.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _slopes(
 def band_rows(
     values: Float[Array, " n"], instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
 ) -> Float[Array, "b r 4"]:
-    """Band rows at a field position (deg), as `light.band_rows`, of an instrument with these values of its parameters."""
+    """Band rows (`light.band_rows`) at a field position (deg), of an instrument with these values of its parameters."""
     return light.band_rows(with_values(instrument)(values), plan, x, y)
 
 

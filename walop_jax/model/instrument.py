@@ -11,13 +11,14 @@ import functools
 import itertools
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from walop_jax.instruments.description import (
@@ -29,14 +30,14 @@ from walop_jax.instruments.description import (
     shipped,
 )
 from walop_jax.io.errors import nearest
-from walop_jax.model import legendre
+from walop_jax.model import fold, legendre
 from walop_jax.model.build import parts
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.compiled import array
 from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate
 from walop_jax.model.elements.wave_plate import MODELS
 from walop_jax.model.parameters import Component, check_names, leaves, number, unknown_name
-from walop_jax.model.ray import NotPlannedError, Ray
+from walop_jax.model.ray import Conditions, NotPlannedError, Ray
 from walop_jax.model.sources import SOURCES, Source, Standards
 
 Scalar = Float[Array, ""]
@@ -196,6 +197,48 @@ class Instrument(Component):
             if effect.name == name:
                 return effect
         raise unknown_name("active effect", name, [effect.name for effect in self.effects])
+
+    def mueller(
+        self,
+        x: ArrayLike,
+        y: ArrayLike,
+        wavelength: ArrayLike,
+        angles: Mapping[str, float] | None = None,
+        **conditions: Any,
+    ) -> Float[Array, "k *w 4 4"]:
+        """Mueller matrices of the light path of every camera, behind the polariser and ahead of its analyser.
+
+        Differentiable in field position (deg), wavelength (µm) and the numbers of the instrument. `angles` (deg) are
+        those of moving elements in the beam, by the prefix of their columns ({"CHWP": 45.0}); the others are out.
+        `conditions` are those of `ray.CONDITIONS` that the optics depend on (temperature in Celsius, hour_angle in h).
+        Raises ValueError for a moving element that the instrument does not have, and `NotPlannedError` for a condition
+        that is missing.
+        """
+        instrument, angles = self.patched(), dict(angles or {})
+        moving = instrument.moving()
+        check_names("moving element", angles, moving)
+        nodes = jnp.atleast_1d(jnp.asarray(wavelength, float))
+        planned = {name: jnp.full_like(nodes, value) for name, value in conditions.items()}
+        ray = Ray.entering(
+            jnp.asarray(x, float), jnp.asarray(y, float), (nodes, Conditions(jnp.zeros_like(nodes), planned))
+        )
+        common, ray = fold.stations(instrument.behind_polariser(), ray)
+        arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
+        state = tuple(angles.get(prefix) for prefix in moving)
+        matrices = fold.solved([*common, *itertools.chain(*arms)], moving, [state])
+        of_arm, number = [], len(common)
+        for arm in arms:
+            numbers = (*range(len(common)), *range(number, number + len(arm)))
+            number += len(arm)
+            path = (
+                fold.stacked(matrices, i, element, moving, [state])
+                for i, (element, _) in zip(numbers, (*common, *arm), strict=True)
+            )
+            whole = fold.product(m[0] if m is not None and m.ndim == 4 else m for m in path)
+            whole = jnp.eye(4) if whole is None else whole
+            of_arm.append(jnp.broadcast_to(whole, (len(nodes), 4, 4)).reshape(*jnp.shape(wavelength), 4, 4))
+        place = {camera: i for i, arm in enumerate(instrument.arms) for camera in arm.analyser.cameras}
+        return jnp.stack([of_arm[place[camera]] for camera in instrument.cameras.names])
 
     # ------------------------------------------------------------------------------- changing it
 

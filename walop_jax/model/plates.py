@@ -30,6 +30,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -167,8 +168,8 @@ def _stack(
     return jones
 
 
-def stack_mueller(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real) -> Float[Array, "... 4 4"]:
-    """Mueller matrix of plates in contact, in air, for rays of direction (sx, sy, √(1 − s²)).
+def stack_jones(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real) -> Matrix2:
+    """Jones matrix of plates in contact, in air, for rays of direction (sx, sy, √(1 − s²)).
 
     Referred to the carried axes on both sides, Fresnel losses of every face included. All arguments
     broadcast; `wavelength` in µm.
@@ -187,7 +188,12 @@ def stack_mueller(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Rea
         media, face = [air, *inside, air], _face
     per_wavelength = 1.0 / wavelength
     phases = [p.thickness * w.phase * per_wavelength for p, w in zip(plates, inside, strict=True)]
-    return from_jones(_stack(media, phases, face))
+    return _stack(media, phases, face)
+
+
+def stack_mueller(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real) -> Float[Array, "... 4 4"]:
+    """Mueller matrix of the plates of `stack_jones`."""
+    return from_jones(stack_jones(sx, sy, plates, wavelength))
 
 
 def fixed_axis_mueller(
@@ -199,10 +205,32 @@ def fixed_axis_mueller(
     to 1–2 % of the cross-talk of thick crossed plates at 10° (kept for comparison). Both crystals are
     positive (n_e > n_o), so the optic axis is the slow one and the fast axis of a plate lies at axis + 90°.
     """
+    return retarder(fixed_axis_retardance(sx, sy, plates, wavelength), plates[-1].axis + 0.5 * jnp.pi)
+
+
+def fixed_axis_retardance(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real) -> Real:
+    """Retardance (rad) of `fixed_axis_mueller`: the sum over the plates, not modulo 2π."""
     total = jnp.zeros_like(sx)
     last = plates[-1].axis
     for plate in plates:
         crystal = _crystal(sx, sy, plate) if plate.cut is None else _crystal_both_ways(sx, sy, plate).forward
         sign = jnp.cos(2.0 * (plate.axis - last))
         total = total + sign * 2.0 * jnp.pi * plate.thickness * crystal.phase / wavelength
-    return retarder(total, last + 0.5 * jnp.pi)
+    return total
+
+
+def stack_retardance(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real) -> Real:
+    """Retardance (rad) of plates in contact for rays of direction (sx, sy), of the order of `fixed_axis_retardance`.
+
+    With U = J / √det J = cos(δ/2) + i sin(δ/2) n·σ up to losses, n near the fast axis; unlike the trace of a Mueller
+    matrix, cos(δ/2) has a slope at half a wave.
+    """
+    a, b, c, d = stack_jones(sx, sy, plates, wavelength)
+    scale = 0.5 / jnp.sqrt(a * d - b * c)
+    cosine = ((a + d) * scale).real
+    fast = plates[-1].axis + 0.5 * jnp.pi
+    along = (((a - d) * jnp.cos(2.0 * fast) + (b + c) * jnp.sin(2.0 * fast)) * scale).imag
+    sine = jnp.sqrt(jnp.maximum(1.0 - cosine**2, 0.0))
+    delta = 2.0 * jnp.arctan2(jnp.where(along < 0, sine, -sine), cosine)
+    turns = (fixed_axis_retardance(sx, sy, plates, wavelength) - delta) / (2.0 * jnp.pi)
+    return delta + 2.0 * jnp.pi * jax.lax.stop_gradient(jnp.round(turns))

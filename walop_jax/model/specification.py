@@ -127,9 +127,15 @@ class Model:
         start = self.start
         return start + self.selection() @ (np.asarray(free_values) - start[self.free])
 
-    def instrument(self, values: Vector | None = None) -> Instrument:
-        """The instrument at a full vector of values (default: start values)."""
-        return with_values(self.template)(np.asarray(self.start if values is None else values, float))
+    def named(self, values: Float[Any, " n"]) -> dict[str, Any]:
+        """A full vector of values by the names of the parameters."""
+        return dict(zip(self.names, values, strict=True))
+
+    def instrument(self, values: Float[Any, " n"] | None = None) -> Instrument:
+        """The instrument at a full vector of values (default: start values); differentiable in arrays of JAX."""
+        if values is None or not isinstance(values, jax.Array):
+            values = np.asarray(self.start if values is None else values, float)
+        return with_values(self.template)(values)
 
 
 def series_indices(instrument: Instrument) -> Int[np.ndarray, " kt"]:

@@ -27,9 +27,9 @@ from jaxtyping import Bool, Float, Int
 from scipy import special
 
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.optics import through_series
 from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.inverses import whitening
+from walop_jax.likelihood.optics import through_series
 
 TRIMMED = 1e-3
 CROWDED = 1.5

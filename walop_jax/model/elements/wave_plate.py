@@ -19,6 +19,7 @@ from typing import Any, ClassVar, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from walop_jax.io.errors import nearest
@@ -26,7 +27,7 @@ from walop_jax.model import materials, mueller, plates
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.parameters import Component, Parameter, number
-from walop_jax.model.ray import Ray, Real
+from walop_jax.model.ray import Conditions, Ray, Real
 
 Scalar = Float[Array, ""]
 Known = dict[tuple[str, int], tuple[Real, Real]]
@@ -140,6 +141,31 @@ class WavePlate(Element):
     def mueller(self, ray: Ray) -> Mueller | None:
         """The plate with the air gap ahead of it."""
         return self.solved([(self, ray)])[0]
+
+    def retardance(
+        self,
+        incidence: ArrayLike,
+        azimuth: ArrayLike,
+        wavelength: ArrayLike,
+        temperature: float = materials.REFERENCE_TEMPERATURE,
+    ) -> Real:
+        """Retardance (deg, not modulo 360) for rays in air at an angle `incidence` (deg) to the normal, differentiable.
+
+        `azimuth` (deg) of the plane of incidence counts from +X toward +Y, `wavelength` is in µm, the temperature in
+        Celsius. Arrays broadcast. Positive is a lead of the wave along the fast axis of the last layer.
+        Raises ValueError for a plate without layers.
+        """
+        if not self.layers:
+            raise ValueError(f"element {self.name!r} has no layers, hence no retardance")
+        incidence, azimuth, wavelength = jnp.broadcast_arrays(
+            *(jnp.asarray(v, float) for v in (incidence, azimuth, wavelength))
+        )
+        sine, direction = jnp.sin(jnp.deg2rad(incidence)), jnp.deg2rad(azimuth)
+        planned = {"temperature": jnp.full_like(wavelength, temperature)}
+        ray = Ray.entering(sine, sine, (wavelength, Conditions(jnp.zeros_like(wavelength), planned)))
+        kx, ky = sine * jnp.cos(direction), sine * jnp.sin(direction)
+        crystals = self.crystals(ray.toward(kx, ky))
+        return jnp.rad2deg(plates.stack_retardance(kx, ky, crystals, wavelength))
 
     @classmethod
     def solved(cls, cases: Sequence[tuple[WavePlate, Ray]]) -> list[Mueller | None]:
