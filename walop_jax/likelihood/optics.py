@@ -17,6 +17,7 @@ Limits      what is not a parameter (field position, wavelengths, other arrays o
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -36,7 +37,8 @@ from walop_jax.model.specification import series_indices
 Scalar = Float[Array, ""]
 
 
-class Directions(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Directions:
     """Directions in which the rows are differentiated: parameter `index[o]` with others in direction `colour[o]`.
 
     `reached[o]` is True for the rows that the parameter changes.
@@ -110,7 +112,8 @@ def _rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, A
 def _instantiated(tangent: Any) -> Any:
     if not isinstance(tangent, SymbolicZero):
         return tangent
-    return np.zeros(tangent.aval.shape, tangent.aval.dtype)
+    aval: Any = tangent.aval
+    return np.zeros(aval.shape, aval.dtype)
 
 
 band_rows.defjvp(_rule, symbolic_zeros=True)
