@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from walop_jax.fit.minimise import MAXIMUM_STEPS, Minimum, minimise
 from walop_jax.io.errors import fail
@@ -83,14 +82,10 @@ def _search(
     `expand` takes the place of `Likelihood.expand`; `how` goes to `minimise`.
     """
     expand, model = expand or likelihood.expand, likelihood.model
-    select, origin = model.selection(), first[model.free]
-
-    def full(x: Vector) -> Float[np.ndarray, " all"]:
-        return first + select @ (x - origin)
 
     def evaluate(x: Vector) -> Posterior:
         nonlocal near
-        near = expand(full(x), noise_scale, near)
+        near = expand(model.full(x, first), noise_scale, near)
         return near
 
     def tell(step: int, best: Posterior) -> None:
@@ -98,14 +93,14 @@ def _search(
 
     minimum = minimise(
         evaluate,
-        origin,
+        first[model.free],
         free_scales(model),
         maximum_steps=maximum_steps,
         far_off=lambda found: not _misfit(found) < FAR_OFF,
         progress=tell,
         **how,
     )
-    return FoundMinimum(minimum, full(minimum.x))
+    return FoundMinimum(minimum, model.full(minimum.x, first))
 
 
 def nearer(likelihood: Likelihood, values: Vector, distance: float) -> Vector:
@@ -272,18 +267,13 @@ def check_identifiable(likelihood: Likelihood) -> None:
 
 
 def _order_starts(likelihood: Likelihood) -> Iterator[tuple[str, Vector]]:
-    """Start values one order of retardance away: first-order plates wrap every 2π."""
-    wavelength = np.asarray(likelihood.plan.wavelength).mean()
-    birefringence = float(
-        materials.MGF2_E.refractive_index(wavelength) - materials.MGF2_O.refractive_index(wavelength)
-    )
-    one_wave = wavelength / birefringence
-    thick = [name for name in reversed(likelihood.model.names) if name.endswith("plate.mgf2")]
-    for name in thick:
-        for sign in (-1, 1):
-            start = likelihood.model.start.copy()
-            start[likelihood.model.index(name)] += sign * one_wave
-            yield (
-                f"checking for a second minimum ({name} one wave {'thicker' if sign > 0 else 'thinner'})",
-                start,
-            )
+    """Start values with one crystal layer a wave of its retardance thicker or thinner: plates wrap every 2π."""
+    model, wavelength = likelihood.model, np.asarray(likelihood.plan.wavelength).mean()
+    for place, layer in model.thicknesses().items():
+        one_wave = wavelength / abs(materials.CRYSTALS[layer.material].birefringence(wavelength))
+        for sign, word in ((-1, "thinner"), (1, "thicker")):
+            start = model.start
+            start[place] += sign * one_wave
+            if start[place] > 0:
+                label = f"checking for a second minimum ({model.names[place]} one wave {word})"
+                yield label, model.full(start[model.free])

@@ -76,8 +76,11 @@ def values_then(result: FitResult) -> Float[np.ndarray, " n"]:
     """Values at which the pixels of a set were summed; parameters that were not there then have their start values."""
     compression = result.calset.compression
     assert compression is not None
-    names, start = [p.name for p in result.model.parameters], result.model.start
-    return np.array([compression.values.get(name, value) for name, value in zip(names, start, strict=True)])
+    model = result.model
+    values = [
+        compression.values.get(name, value) for name, value in zip(model.names, model.start, strict=True)
+    ]
+    return np.array(values)[model.masters]
 
 
 def moved(result: FitResult) -> float:

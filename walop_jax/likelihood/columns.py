@@ -279,9 +279,8 @@ class Columns:
     @functools.cached_property
     def fringe_plan(self) -> Plan:
         """The exposures with nodes that follow the fringes of air."""
-        template, calset = self.likelihood.model.template, self.likelihood.calset
+        patched, calset = self.patched, self.likelihood.calset
         gap = AirGap(0.0, 1.0, LARGEST_GAP)  # pyright: ignore[reportArgumentType]
-        patched = template.patched()
         for place in patched.places(WavePlate):
             patched = patched.changed(place, air_gaps=lambda gaps: (*gaps, gap))
         return plan_for(patched, calset.exposures, calset.filters, calset.sources)

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model import mueller
@@ -39,6 +40,13 @@ class Retarder(Element):
         """The retarder."""
         delta = self.delta if self.wavelength is None else self.delta * self.wavelength / ray.wavelength
         return mueller.retarder(delta, jnp.deg2rad(self.axis))
+
+    def retardances(self, wavelength: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], ...]:
+        """One retardance."""
+        if self.wavelength is None:
+            return ()
+        waves = float(self.delta) / (2.0 * np.pi) * float(self.wavelength) / wavelength
+        return waves, waves
 
 
 class Rotator(Element):
