@@ -25,8 +25,10 @@ from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.inverses import whitening
+from walop_jax.likelihood.layout import curves_of
 from walop_jax.likelihood.likelihood import Likelihood, Posterior
 from walop_jax.likelihood.runner import Journal, Processes, Progress, Runner, fingerprint
+from walop_jax.model.planning import extrapolations
 from walop_jax.model.specification import Model
 
 Vector = Float[np.ndarray, " n"]
@@ -350,6 +352,9 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
             f"the errors of the data had to be multiplied by {result.noise_scale:.3g} for a fit: the model is far off",
             blocking=False,
         )
+    there = result.model.instrument(result.values).patched()
+    for sentence in extrapolations(there, curves_of(result.calset)):
+        yield Doubt(Quality(0), sentence, blocking=False)
     for name in result.at_prior_edge:
         p, value = result.model[name], result.value(name)[0]
         assert p.prior is not None

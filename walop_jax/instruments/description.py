@@ -29,6 +29,7 @@ REQUIRED = ("name", "path", "field", "cameras", "throughput", "elements", "arms"
 SITE_KEYS = ("telescope", "latitude", "longitude", "elevation", "full_moon")
 FIELD_KEYS = ("limit", "scale", "raster", "edge")
 RASTERS = ("square", "line")
+NO_SOURCE = "description file"  # of numbers, where a file names none
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 LARGEST = 1e300
 CAMERA_KEYS = ("names", "split", "floor")
@@ -134,7 +135,9 @@ def _whole(text: str, where: str, seen: tuple[str, ...]) -> Table:
         raise DataError(
             f"{where}: like = {like!r} must name a shipped instrument; {nearest(str(like), shipped())}"
         )
-    return merged(_whole(_shipped_text(known[like.upper()]), like, (*seen, like)), table)
+    base = dict(_whole(_shipped_text(known[like.upper()]), like, (*seen, like)))
+    base.pop("default", None)  # of one instrument alone
+    return merged(base, table)
 
 
 def merged(old: Table, new: Table) -> Table:
@@ -255,7 +258,7 @@ def _description(read: Reader, table: Table, text: str) -> Description:
     return Description(
         name=read.text(table["name"], "name", ""),
         about=read.text(table["about"], "about", "") if "about" in table else "",
-        source=read.text(table.get("source", "description file"), "source", ""),
+        source=read.text(table.get("source", NO_SOURCE), "source", ""),
         path=read.words(table["path"], "path", "") if table["path"] else (),
         elements=elements,
         arms=arms,
@@ -272,6 +275,6 @@ def _description(read: Reader, table: Table, text: str) -> Description:
         edge=read.number(field.get("edge", field.get("limit", 0.0)), "edge", "field"),
         split=split,
         floor=floor,
-        default=table.get("default") is True and "default" in text,
+        default=table.get("default") is True,
         text=text,
     )

@@ -78,7 +78,8 @@ class Posterior:
     `gradient` is half the gradient of the total and `matrix` half its Gauss–Newton Hessian, both with the
     errors of the data times `noise_scale`; `data` and `chi2` are with the errors as given. `loose` is the
     share of the weak pulls that are no prior knowledge; it is in the gradient and the matrix, not in
-    `chi2`. `dof` counts three per used row (four when the flux is known), one per prior, minus the free parameters.
+    `chi2`. `dof` counts the independent data of every used row (`Likelihood.data_per_row`), one per prior, less the
+    free parameters.
     """
 
     data: float
@@ -374,7 +375,7 @@ class Likelihood:
 
         The flux is the mean over the arms where each has its own.
 
-        All of them at once: for whole frames take a sample (`thinning.thinned`).
+        All of them at once: for whole frames take a sample (`layout.thinned`).
         """
         instrument = self.model.instrument(values)
         nodes, _ = self.nodes(instrument)

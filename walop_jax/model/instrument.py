@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.instruments.description import (
+    NO_SOURCE,
     Description,
     Reader,
     default_name,
@@ -81,7 +82,8 @@ class Instrument(Component):
     `rotator_zero` (deg) is added to ROTATOR, `filter_shift` (µm) displaces broad bands; None: there is none. Field
     coordinates reach to ±`field_limit` (deg); `site` is telescope, latitude and longitude (deg, east positive),
     elevation (m) and MJD of a full Moon, `raster` how the points of a simulated run lie, and how far out (deg).
-    `description` is the text it was described in, empty for an instrument that comes with the package.
+    `description` is the text it was described in, empty for an instrument that comes with the package, `source` where
+    its numbers are from.
 
     >>> walop.Instrument.read("WALOP-NORTH").cameras.names
     ('O1', 'E1', 'O2', 'E2')
@@ -101,6 +103,7 @@ class Instrument(Component):
     site: tuple[str, float, float, float, float] = eqx.field(static=True, default=NO_SITE)
     raster: tuple[str, float] = eqx.field(static=True, default=("square", 0.0))
     description: str = eqx.field(static=True, default="", repr=False)
+    source: str = eqx.field(static=True, default="", repr=False)
 
     def __repr__(self) -> str:
         arms = "; ".join(f"{arm.name}: {' > '.join(arm.path)}" for arm in self.arms)
@@ -323,6 +326,7 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
         site=description.place,
         raster=(description.raster, description.edge),
         description="" if description.name in shipped() else description.text,
+        source=description.source if description.source != NO_SOURCE else "",
     )
     _check(instrument, description.read)
     return adapted(instrument, **options)

@@ -12,6 +12,7 @@ Limits      up to `EXTRAPOLATED` times beyond the measured wavelengths a fit rem
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -117,4 +118,5 @@ CRYSTALS |= {
     ),
 }
 GLASSES = {"BK7": Glass(BK7, (0.3, 2.5), "Schott 2017, data sheet of N-BK7")}
+MATERIALS: Mapping[str, Crystal | Glass] = CRYSTALS | GLASSES
 """Materials that a description file may name."""

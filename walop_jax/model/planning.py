@@ -12,9 +12,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.records import Exposures, FilterCurve, Sources
 from walop_jax.data.settings import Settings
+from walop_jax.io.errors import fail
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.materials import EXTRAPOLATED, MATERIALS
 from walop_jax.model.plan import Plan, blank_exposures, exposure_arrays, hours_of
 from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, rounded_up, waves_over
 from walop_jax.model.ray import CONDITIONS, Conditions
@@ -112,6 +114,31 @@ def outgrown(planned: Instrument, instrument: Instrument, curves: Iterable[Filte
     )
 
 
+def extrapolations(instrument: Instrument, curves: Iterable[FilterCurve]) -> tuple[str, ...]:
+    """Sentences on materials (patched instrument) that bands use beyond the wavelengths at which they were measured.
+
+    Raises `DataError` where that is too far for the formulae.
+    """
+    behind = (element for arm in instrument.arms for element in arm.train())
+    names = dict.fromkeys(name for element in (*instrument.train(), *behind) for name in element.materials)
+    sentences = []
+    for curve in curves:
+        seen = curve.wavelength[curve.throughput > 0]
+        for name in names if seen.size else ():
+            (low, high), source = (one := MATERIALS[name]).measured, one.source.split(";")[0]
+            first, last = float(seen.min()), float(seen.max())
+            if low <= first and last <= high:
+                continue
+            what = f"filter {curve.name}, {first:g} to {last:g} µm: the refractive index of {name} was measured at "
+            what += f"{low:g} to {high:g} µm ({source})"
+            if first < low / EXTRAPOLATED or last > high * EXTRAPOLATED:
+                raise fail(
+                    what, advice="give a filter within them, or another material (walop-jax docs model)"
+                )
+            sentences.append(f"{what}; its formula is used beyond")
+    return tuple(sentences)
+
+
 def _fringes(instrument: Instrument, curve: FilterCurve, room: float = ROOM) -> tuple[float, float]:
     """Waves of the fringes of an instrument (patched) in a band: at full strength, and of all layers of a plate.
 
@@ -156,6 +183,7 @@ def _plan(
 
     groups = sorted({(name, moment) for _, name, moment, _ in bands})
     curves = {name: filters[name] for name, _ in groups}
+    extrapolations(patched, curves.values())
     rules = {
         name: _rule(
             tuple(c.wavelength.tolist()),

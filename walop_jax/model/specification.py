@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from walop_jax.data.records import Exposures
 from walop_jax.model.conventions import EXTINCTION
-from walop_jax.model.effects import EFFECTS, effect_by_name, in_order
+from walop_jax.model.effects import EFFECTS, Described, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.elements import WavePlate
 from walop_jax.model.elements.wave_plate import Layer
@@ -200,7 +200,7 @@ def with_effects(model: Model, effects: Sequence[str | type[Effect] | Effect], c
 
     A name or a class adds the effect at its neutral value, at the shape of its first probe; an instance starts where it
     stands. Priors are centred on neutral, with the widths of the declarations. Raises ValueError for a name
-    that does not exist and for an effect that is there already.
+    that does not exist, for an effect that is there already, and for two that state one number.
 
     >>> context = walop.ObservingPlan(grid=3).context()
     >>> walop.with_effects(walop.base_model(calset), ["hwp1_axis"], context).effect_names
@@ -219,6 +219,12 @@ def with_effects(model: Model, effects: Sequence[str | type[Effect] | Effect], c
         names = [f"{effect.name}.{leaf.name}" for leaf in leaves(effect)]
         values = zip(np.asarray(values_of(effect)), np.asarray(values_of(neutral)), strict=True)
         starts |= dict(zip(names, values, strict=True))
+    told = {text for effect in active if isinstance(effect, Described) for text in effect.sentences}
+    for effect in active:
+        for text in told.intersection(effect.stated):
+            raise ValueError(
+                f"effect {effect.name!r} is the number that {text!r} adds to: leave one of them out"
+            )
     instrument = dataclasses.replace(model.template, effects=in_order(active))
     jax.eval_shape(lambda i: i.patched(), instrument)  # whatever does not fit the instrument is an error here
     known = {p.name: p for p in model.parameters}

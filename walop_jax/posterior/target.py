@@ -63,7 +63,7 @@ class Target:
 
     @property
     def measured(self) -> int:
-        """Independent data: three per used row of four intensities, four where the flux is known."""
+        """Independent data of all used rows: an intensity for each camera, less its part of the unknown fluxes."""
         return round(float(self.likelihood.used.sum(axis=0) @ self.likelihood.data_per_row))
 
     @property

@@ -146,6 +146,11 @@ class Effect(Component):
         """For each amplitude the changes whose sum, with their coefficients, it is to first order; none: not known."""
         return ()
 
+    @property
+    def stated(self) -> tuple[str, ...]:
+        """Changes of numbers that a parameter of it is itself: beside such a change it would be another number."""
+        return ()
+
     def at_neutral(self, context: Context) -> Self:
         """The same effect, discrete choices included, with values that change nothing."""
         return type(self).of(context, **self.choices())

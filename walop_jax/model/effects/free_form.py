@@ -9,7 +9,7 @@ Equation    vectors     a_k → a_k + a_k0 · Σ_t v_kst P_t(x, y) e_s, s = q, u
             exposures   N_k → N_k + N⁰_k · g_ek
 Symbols     a_k analysis vector of camera k, a_k0 its response to unpolarised light; N_k counts and N⁰_k those that
             unpolarised light of the same flux would give; P_t products of Legendre polynomials
-Source      the strata of the free-form score test (`diagnose.freeform`), with the same plausible size
+Source      the strata of the free-form score test (`diagnosis.design`), with the same plausible size
 Neutral     all zero
 Revealed by any data that no model explains
 """

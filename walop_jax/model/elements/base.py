@@ -80,6 +80,11 @@ class Element(Component):
         """See the class."""
         return 0.0
 
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Names of the materials whose refractive indices it asks for."""
+        return ()
+
     def retardances(self, wavelength: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], ...]:
         """Retardance along the axis at wavelengths (µm), in waves, and the sum of those of all layers; none: no waves.
 

@@ -122,6 +122,11 @@ class WavePlate(Element):
         """Of the air gaps: there and back."""
         return 2.0 * max((gap.longest for gap in self.air_gaps), default=0.0)
 
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """The crystals."""
+        return tuple(layer.material for layer in self.layers)
+
     def retardances(self, wavelength: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], ...]:
         """Of the whole, with the sign that an axis along that of the first layer or across it gives; and the sum."""
         waves = [layer.waves(wavelength) for layer in self.layers]
