@@ -366,7 +366,9 @@ def model_without_data(
         )
         model = make_model(nominal.name, nominal, frozen=(GAUGE,))
         model = dataclasses.replace(model, catalogue=known_to(header, catalogue))
-        known = context or Context(sources=nominal.standard.names, cameras=nominal.cameras.names)
+        known = context or Context(
+            sources=nominal.standard.names, cameras=nominal.cameras.names, units=nominal.units
+        )
         return _with_effects(model, header, known)
 
     return parse(text, build)

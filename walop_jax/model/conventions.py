@@ -13,8 +13,20 @@ Oblique     The Stokes parameters of a ray of direction k refer to the ICS axes 
             the smallest rotation (`geometry.transport_rotation`).
 """
 
+from typing import NamedTuple
+
 REFERENCE_WAVELENGTH = 0.62  # µm: where dispersions, colours and fringes are counted from
 FIELD_SCALE = 0.3  # degrees: the unit of the field polynomials of WALOP
+
+
+class Units(NamedTuple):
+    """Scales of an instrument that changes over its field (deg) and its bands (µm) are counted in."""
+
+    field: float = FIELD_SCALE
+    wavelength: float = REFERENCE_WAVELENGTH
+
+
+OF_WALOP = Units()
 
 
 def matrix_elements(arms: int) -> tuple[str, ...]:

@@ -192,6 +192,7 @@ def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
         sources=instrument.standard.names,
         cameras=instrument.cameras.names,
         extinction=float(polariser.extinction) if (polariser := instrument.polariser) else EXTINCTION,
+        units=instrument.units,
     )
 
 
