@@ -13,10 +13,12 @@ from walop_jax.data.records import Compression
 from walop_jax.fit.minimise import TOLERANCE
 from walop_jax.fit.model_file import base_model, model_without_data
 from walop_jax.fit.refit import _start
-from walop_jax.fit.search import _order_starts, _search
+from walop_jax.fit.search import _order_starts, _search, find_minimum
 from walop_jax.instruments.description import parsed
 from walop_jax.likelihood.likelihood import Census, Likelihood, OpticsUsed, Posterior
+from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import build
+from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.simulation.simulate import simulate
 
 # One wave is 0.62 µm / (n_e − n_o): 1.38892 − 1.37714 of MgF2 (Dodge 1984), 1.55211 − 1.54305 of quartz (Ghosh 1999).
@@ -153,3 +155,51 @@ def test_a_search_ends_with_equal_plates_wherever_it_began(north):
     np.testing.assert_allclose(end[model.free], goal, rtol=0, atol=TOLERANCE)  # errors are 1
     for values in (*seen, end):
         assert all(values[i] == values[master] for i, master in ties(model))
+
+
+# ----------------------------------------------------------------------------------------------- orders of fringes
+
+BANDS = np.concatenate([0.58 + np.linspace(-0.0075, 0.0075, 5), 0.66 + np.linspace(-0.0075, 0.0075, 5)])  # µm
+GAP, CONTRAST, SIGMA, DOF = 11.0, 0.01, 1e-4, 10_000
+
+
+def fringe(contrast, gap):
+    """Diattenuation in each of some wavelengths (docs: etalon), and its derivatives."""
+    phase = 4.0 * np.pi * gap / BANDS
+    slope = -contrast * np.sin(phase) * 4.0 * np.pi / BANDS
+    return contrast * np.cos(phase), np.stack([np.cos(phase), slope], axis=1)
+
+
+@pytest.mark.parametrize("start", [11.0, 10.7, 11.3, 10.0, 11.6])
+def test_fringes_of_another_order_are_no_end(start, monkeypatch):
+    """A gap that begins some fringes off is found: 10.70 µm is a minimum of its own beside 11.00 µm."""
+    counts = 1e5 * (1.0 + np.random.default_rng(1).random((2, 4, 4)))
+    calset = walop.from_arrays(counts, np.sqrt(counts), [0.0, 0.1], [0.1, 0.0], [0.0, 30.0, 60.0, 90.0])
+    bare = base_model(calset)
+    context = effect_context(bare.template, calset.exposures)
+    etalon = effect_by_name("etalon").of(context, contrast=CONTRAST, gap=start)
+    model = with_effects(bare, [etalon], context)
+    likelihood = Likelihood.of(calset, model)
+    at = [int(np.flatnonzero(model.free == model.index(f"etalon.{name}"))[0]) for name in ("contrast", "gap")]
+    truth, begin = fringe(CONTRAST, GAP)[0], model.start[model.free]
+
+    def expand(self, values, scale=1.0, near=None):
+        x = values[model.free]
+        there, slopes = fringe(*x[at])
+        residual, jacobian = (there - truth) / SIGMA, slopes / SIGMA
+        others = np.eye(len(x))
+        others[at, at] = 0.0
+        gradient = others @ (x - begin)
+        square = float(residual @ residual + gradient @ gradient)
+        gradient[at] += jacobian.T @ residual
+        matrix = others.copy()
+        matrix[np.ix_(at, at)] += jacobian.T @ jacobian
+        census = Census(np.ones(4, int), (0.0, 0.1, 0.0, 0.1), 4)
+        return Posterior(square, 0.0, 0.0, scale, gradient, matrix, census, DOF, OpticsUsed(None))
+
+    monkeypatch.setattr(Likelihood, "expand", expand)
+    assert model.gaps() == (model.index("etalon.gap"),)
+    assert bare.gaps() == ()
+    found = find_minimum(likelihood, model.start, None, None)
+    assert found.values[model.index("etalon.gap")] == pytest.approx(GAP, abs=2e-3)
+    assert found.values[model.index("etalon.contrast")] == pytest.approx(CONTRAST, abs=1e-4)

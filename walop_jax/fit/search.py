@@ -29,6 +29,7 @@ FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors sca
 MAXIMUM_RESCALINGS = 4
 FIRST_STEPS = 20
 OTHER_STEPS = 12  # of a start one order of retardance away
+MOST_ORDERS = 8  # times that fringes of air are tried some orders away from the best so far
 # Scaled gradient of a large set: 10⁻³ of a standard error is 10⁻⁶ in χ², and of a χ² of 10⁹ rounding leaves 10⁻⁷.
 LARGE_TOLERANCE = 1e-3
 
@@ -181,7 +182,40 @@ def _of_sample(
 def _from_afar(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
 ) -> FoundMinimum:
-    """The minimum from start values that may be far away, the errors of the data scaled if need be."""
+    """The minimum from start values that may be far away, of fringes that of the best order (`_best_gaps`)."""
+    return _best_gaps(likelihood, _of_one_order(likelihood, first, noise_scale, worth))
+
+
+def _best_gaps(likelihood: Likelihood, found: FoundMinimum) -> FoundMinimum:
+    """The lowest minimum with air gaps some orders of their fringes thicker or thinner.
+
+    Fringes of gaps a quarter of a wavelength apart differ by their sign, within a narrow band: each is a minimum of its
+    own. Steps go on while they lower the objective.
+    """
+    model, quarter = likelihood.model, 0.25 * float(np.asarray(likelihood.plan.wavelength).mean())
+    for gap in model.gaps() if found.minimum.converged else ():
+        for _ in range(MOST_ORDERS):
+            before = found
+            for order in (-2, -1, 1, 2):
+                start = before.values.copy()
+                start[gap] += order * quarter
+                if start[gap] <= 0:
+                    continue
+                label = f"checking for another order of fringes ({model.names[gap]} = {start[gap]:.4g} µm)"
+                scale = before.posterior.noise_scale
+                trial = _search(likelihood, label, start, scale, before.posterior, maximum_steps=OTHER_STEPS)
+                found = dataclasses.replace(found, starts=found.starts + 1)
+                if trial.minimum.converged and trial.posterior.objective < found.posterior.objective:
+                    found = dataclasses.replace(trial, starts=found.starts)
+            if found.minimum is before.minimum:
+                break
+    return found
+
+
+def _of_one_order(
+    likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
+) -> FoundMinimum:
+    """The minimum near start values that may be far away, the errors of the data scaled if need be."""
     check_identifiable(likelihood)
     given = noise_scale or 1.0
     found = _search(likelihood, "fit", first, given, maximum_steps=FIRST_STEPS)

@@ -148,6 +148,22 @@ class Model:
                     (behind if i == len(layers) - 1 else inside).setdefault(master, layer)
         return behind | {master: layer for master, layer in inside.items() if master not in behind}
 
+    def gaps(self) -> tuple[int, ...]:
+        """Positions of the free parameters that are thicknesses of air gaps ahead of plates; effects alone have them."""
+        instrument = self.template.patched()
+        if not any(instrument.element(place).air_gaps for place in instrument.places(WavePlate)):
+            return ()
+
+        def moves_one(position: int) -> bool:
+            marked = self.start
+            marked[position] = np.nan
+            there = self.instrument(marked[self.masters]).patched()
+            plates = (there.element(place) for place in there.places(WavePlate))
+            return any(bool(np.isnan(gap.gap)) for plate in plates for gap in plate.air_gaps)
+
+        of_effects = np.concatenate([self.positions(name) for name in self.effect_names])
+        return tuple(i for i in self.free.tolist() if i in of_effects and moves_one(i))
+
     def instrument(self, values: Vector | None = None) -> Instrument:
         """The instrument at a full vector of values (default: start values)."""
         return with_values(self.template)(np.asarray(self.start if values is None else values, float))
