@@ -164,7 +164,7 @@ GAP, CONTRAST, SIGMA, DOF = 11.0, 0.01, 1e-4, 10_000
 
 
 def fringe(contrast, gap):
-    """Diattenuation in each of some wavelengths (docs: etalon), and its derivatives."""
+    """Diattenuation in each of some wavelengths (head of `effects.etalon`), and its derivatives."""
     phase = 4.0 * np.pi * gap / BANDS
     slope = -contrast * np.sin(phase) * 4.0 * np.pi / BANDS
     return contrast * np.cos(phase), np.stack([np.cos(phase), slope], axis=1)

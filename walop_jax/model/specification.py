@@ -149,7 +149,7 @@ class Model:
         return behind | {master: layer for master, layer in inside.items() if master not in behind}
 
     def gaps(self) -> tuple[int, ...]:
-        """Positions of the free parameters that are thicknesses of air gaps ahead of plates; effects alone have them."""
+        """Positions of the free thicknesses of air gaps ahead of plates, which effects alone have."""
         instrument = self.template.patched()
         if not any(instrument.element(place).air_gaps for place in instrument.places(WavePlate)):
             return ()
