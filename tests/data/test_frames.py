@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -227,3 +228,15 @@ def test_frames_of_two_nights_and_a_table(scene, handmade, tmp_path):
     assert not np.any(block.used[:5, 7:14])
     assert not np.any(block.used[5:, :7])
     assert mixed.intensities.rows == 2 * int(whole.used.sum()) + 21
+
+
+def test_counting_the_pixels_of_gigabytes_of_frames_is_no_silent_work(scene, tmp_path, monkeypatch):
+    write_frames(tmp_path / "frames.fits", scene, GRID)
+    small = read_calibration_set(tmp_path / "frames.fits").intensities
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rows = small.rows
+    monkeypatch.setattr("walop_jax.data.frames._LONG", 10)
+    again = read_calibration_set(tmp_path / "frames.fits").intensities
+    with pytest.warns(UserWarning, match="reads all 7 frames of every camera, .* pixels each"):
+        assert again.rows == rows

@@ -212,6 +212,22 @@ def test_a_set_that_stands_for_pixels_says_what_these_hold(calset, clean, ratio,
     assert np.sqrt(made[0, 0, 0]) > 0.6 * gain  # (N₁ − N₂)/(N₁ + N₂) of gains that differ by √2 of it
 
 
+def test_exposures_beside_summed_pixels_count_by_themselves(calset, clean):
+    """χ² of the pixels, and that of the stars and the sky beside them; three data a row of four intensities."""
+    exposures, values = calset.exposures, dict(zip(clean.model.names, clean.values.tolist(), strict=True))
+    through = exposures.clp_in
+    record = Compression(
+        10_000, 330_000.0, 330_000, values, (), 0.0, 0.0, tuple(exposures.exposure[through].tolist())
+    )
+    found = refit(dataclasses.replace(calset, compression=record))
+    residual, used = clean.likelihood.residuals(clean.values)[1], clean.likelihood.used
+    beside = float(np.sum(residual[:, ~through] ** 2))
+    assert beside > 100.0
+    priors = clean.chi2 - clean.posterior.data
+    assert found.chi2 == pytest.approx(330_000.0 + beside + priors, abs=0.1)
+    assert found.dof == 330_000 + 3 * used[:, ~through].sum()
+
+
 def test_squares_of_groups_follow_their_distribution(south_set, south_fit):
     """Over draws of noise the p of every group is uniform: its moments are those of projected noise."""
     design = Design.of(south_fit(south_set("a")))

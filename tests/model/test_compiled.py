@@ -1,6 +1,7 @@
 """Compilation: the derivative of the optics must stay clear of the trap of XLA's fusion emitters."""
 
 import time
+from pathlib import Path
 
 import builders
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import walop_jax
 from walop_jax.data import builtin_filter
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled, knows, require_double_precision
@@ -79,3 +81,10 @@ def test_an_option_that_xla_does_not_have_is_noticed():
     """Versions of XLA drop options, and refuse to compile with one that they do not know."""
     assert knows("xla_cpu_enable_fast_math")
     assert not knows("xla_of_another_day")
+
+
+def test_programs_of_a_session_stay():
+    """The caches of JAX belong to the session: what a user has compiled is there after any work of the package."""
+    package = Path(walop_jax.__file__).parent
+    clearing = [p.name for p in package.rglob("*.py") if "clear_caches" in p.read_text(encoding="utf-8")]
+    assert clearing == []

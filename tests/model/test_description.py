@@ -246,3 +246,11 @@ def test_like_names_a_shipped_one(own, like):
 def test_the_text_of_a_description_gives_its_instrument_again():
     for name in shipped():
         assert table(build(parsed(described(name).text, name))) == table(nominal_instrument(name))
+
+
+def test_only_an_instrument_that_says_so_is_the_default():
+    """A comment is no statement, and an instrument that stands on the default one is another."""
+    text = '# not the default\nname = "OTHER"\nlike = "WALOP-SOUTH"\n'
+    assert parsed('name = "WALOP-SOUTH"\nlike = "WALOP-SOUTH"\ndefault = true', "a text").default
+    assert not parsed(text, "a text").default
+    assert described("WALOP-SOUTH").default

@@ -1,10 +1,23 @@
 """Refractive indices against check values worked out outside this project (numbers.md, section 3)."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import walop_jax as walop
+from walop_jax.data.records import FilterCurve
+from walop_jax.data.settings import Settings
+from walop_jax.fit.minimise import minimise
+from walop_jax.fit.model_file import model_for
+from walop_jax.fit.refit import FitResult
+from walop_jax.instruments.description import parsed
+from walop_jax.io.errors import DataError
+from walop_jax.likelihood.likelihood import Census, Likelihood, OpticsUsed, Posterior
 from walop_jax.model import materials
+from walop_jax.model.instrument import build
+from walop_jax.model.planning import extrapolations, plan_for_settings
 
 CHECKS = {
     "BK7": (1.515539, 1.515089),
@@ -61,3 +74,92 @@ def test_quartz_of_1951_has_the_handbook_values_in_sodium_light():
         float(c.refractive_index(jnp.asarray(0.5893))) for c in (crystal.ordinary, crystal.extraordinary)
     ]
     np.testing.assert_allclose(found, (1.54424, 1.55335), rtol=0, atol=1e-5)
+
+
+# ------------------------------------------------------------------------------------- beyond what was measured
+
+LAYER = """
+[[elements.plate.layers]]
+name = "only"
+material = "{material}"
+thickness = {{ value = 100.0, sigma = 1.0, unit = "um" }}
+"""
+PLATE = """
+name = "INFRARED"
+path = ["plate"]
+[field]
+limit = 0.1
+[cameras]
+names = ["a", "b"]
+[throughput]
+degree = 0
+[elements.plate]
+kind = "wave_plate"
+{layer}
+[arms.main]
+path = ["analyser"]
+[arms.main.elements.analyser]
+kind = "analyser"
+cameras = ["a", "b"]
+"""
+
+
+def plan_of(material, first, last):
+    instrument = build(parsed(PLATE.format(layer=LAYER.format(material=material)), "a text"))
+    wavelength = np.linspace(first, last, 41)
+    curve = FilterCurve("K", wavelength, np.ones(41))
+    settings = dataclasses.replace(Settings.default(1), filter=np.array(["K"]))
+    return instrument, curve, lambda: plan_for_settings(instrument, settings, {"K": curve})
+
+
+@pytest.mark.parametrize(
+    ("material", "first", "last", "measured"),
+    [("quartz", 8.0, 12.0, "0.198 to 2.05"), ("quartz", 2.0, 3.0, "0.198 to 2.05"), ("mgf2", 7.0, 20.0, "0.2 to 7"),
+     ("quartz_1951", 0.1, 0.2, "0.18 to 3")],
+)  # fmt: skip
+def test_no_light_path_far_beyond_the_measured_wavelengths(material, first, last, measured):
+    """Toward the poles of the formulae an index means nothing, and is NaN beyond them."""
+    _, _, plan = plan_of(material, first, last)
+    with pytest.raises(DataError, match=rf"filter K, .*index of {material} .* {measured} µm"):
+        plan()
+
+
+def test_a_band_somewhat_beyond_them_is_remarked_on():
+    """Quartz to 2.37 µm, as in the K band: 2.05 µm was measured, the formula still holds to 10⁻³ of 1.5195.
+
+    Radhakrishnan 1951 measured to 3 µm: n_o of his curve there.
+    """
+    instrument, curve, plan = plan_of("quartz", 2.0, 2.37)
+    index = materials.CRYSTALS["quartz"].ordinary.refractive_index(np.asarray(plan().wavelength))
+    other = materials.CRYSTALS["quartz_1951"].ordinary.refractive_index(np.asarray(plan().wavelength))
+    np.testing.assert_allclose(index, other, atol=1e-3)
+    (sentence,) = extrapolations(instrument, [curve])
+    assert (
+        "filter K, 2 to 2.37 µm: the refractive index of quartz was measured at 0.198 to 2.05 µm" in sentence
+    )
+    assert (
+        extrapolations(
+            plan_of("quartz", 1.0, 2.0)[0], [FilterCurve("J", curve.wavelength - 0.7, np.ones(41))]
+        )
+        == ()
+    )
+
+
+def test_a_fit_says_so_and_is_not_forbidden():
+    instrument, curve, _ = plan_of("quartz", 2.0, 2.37)
+    counts = 1e5 * (1.0 + np.random.default_rng(1).random((2, 4, 2)))
+    calset = walop.from_arrays(
+        counts, np.sqrt(counts), [0.0, 0.1], [0.1, 0.0], np.full(4, np.nan), "lamp",
+        instrument="INFRARED", filters={"K": curve}, filter="K",
+    )  # fmt: skip
+    likelihood = Likelihood.of(calset, model_for(calset, "", instrument))
+    census = Census(np.ones(4, int), (0.0, 0.1, 0.0, 0.1), 2)
+    n = len(likelihood.model.free)
+    posterior = Posterior(5.0, 0.0, 0.0, 1.0, np.zeros(n), np.eye(n), census, 5, OpticsUsed(None))
+    minimum = minimise(lambda x: posterior, np.zeros(n), np.ones(n))
+    size = len(likelihood.model.names)
+    result = FitResult(
+        likelihood, likelihood.model.start, np.zeros((size, size)), posterior, minimum, starts=1, seconds=0.0
+    ).judged()
+    assert any("quartz was measured at 0.198 to 2.05 µm" in text for text in result.warnings)
+    assert result.trusted

@@ -254,7 +254,7 @@ def matrix_draws(
     """Elements of the instrument matrix at field positions (deg) for every draw of all parameters."""
     result = np.empty((len(draws), len(x), 3 * len(model.template.cameras.pairs)))
     for setting, rows in settings.distinct():
-        plan = plan_for_settings(model.template, setting, filters)
+        plan = plan_for_settings(model.instrument(draws.mean(axis=0)), setting, filters)
         for i, values in enumerate(draws):
             matrix = planned_matrices(model.instrument(values), plan, x[rows], y[rows])
             result[i, rows] = matrix.reshape(len(rows), -1)

@@ -32,6 +32,7 @@ def cite(
     """
     from walop_jax import Run, __version__
     from walop_jax.calibration import product_path
+    from walop_jax.data.settings import DEFAULT_FILTER
     from walop_jax.fit import minimise
     from walop_jax.fit.model_file import model_without_data
     from walop_jax.model.instrument import nominal_instrument
@@ -43,12 +44,13 @@ def cite(
     if isinstance(run, str | os.PathLike) and Path(run).is_dir():
         sampled = (Path(run) / POSTERIOR).exists()
     if run is None:
-        model = model_without_data(nominal_instrument())
+        model, filters = model_without_data(nominal_instrument()), [DEFAULT_FILTER]
     else:
         path = product_path(run) if isinstance(run, str | os.PathLike) else None
         with errors_naming(path):
-            model = calibration_of(run if path is None else path, catalogue_of(effects)).model
-    found = (*references(model), Reference("fit", minimise.SOURCE))
+            calibration = calibration_of(run if path is None else path, catalogue_of(effects))
+            model, filters = calibration.model, calibration.exposures.filter.tolist()
+    found = (*references(model, filters), Reference("fit", minimise.SOURCE))
     lines = [f"{entry.what}: {entry.source}" for entry in found]
     return Outcome(
         found,

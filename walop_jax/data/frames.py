@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import threading
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +25,7 @@ from walop_jax.data.schema import Place, convert_unit
 from walop_jax.data.table_intensities import empty_block, usable
 from walop_jax.io.errors import fail
 
+_LONG = 1 << 28  # (exposure, pixel) pairs: gigabytes of frames, which are not counted without a word
 _SLAB = 1 << 19  # values of one camera that are looked at together when whole frames are gone through
 
 
@@ -158,7 +160,10 @@ class FrameIntensities(Intensities):
 
     @functools.cached_property
     def rows(self) -> int:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Number of used (exposure, pixel) pairs; the first call reads all frames, slab by slab."""
+        """Number of used (exposure, pixel) pairs; the first call reads all frames, slab by slab, and warns of many."""
+        if (size := self.exposures * self.grid.pixels) > _LONG:
+            what = f"counting the used pixels reads all {self.exposures} frames of every camera, {size:,} pixels each"
+            warnings.warn(f"{what}: minutes; the number of a fit is `n_data`", stacklevel=2)
         step = max(1, _SLAB // max(1, self.exposures))
         starts = range(0, self.grid.pixels, step)
         return sum(int(np.count_nonzero(self.block(start, start + step).used)) for start in starts)

@@ -22,12 +22,13 @@ import math
 from collections import Counter
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.frames import FrameIntensities, Grid
 from walop_jax.data.records import (
     Block,
     CalibrationSet,
+    Compression,
     Exposures,
     FilterCurve,
     Intensities,
@@ -60,15 +61,25 @@ class _Rows:
 
 
 def check_repeats(
-    intensities: Intensities, exposures: Exposures, points: Points, file: object
+    intensities: Intensities,
+    exposures: Exposures,
+    points: Points,
+    file: object,
+    compression: Compression | None = None,
 ) -> tuple[str, ...]:
     """Refuse measurements that are there twice: exposures, or field points at one place, with the same noise.
 
     Of frames a sample of the pixels is looked at. Where too few exposures say whether there is any noise, copies with
-    equal settings are only remarked on. Exposures of KIND flux, which may be exact, are left out. Raises `DataError`
-    with identifiers and rows of what is there twice; returns remarks.
+    equal settings are only remarked on. Exposures of KIND flux, which may be exact, are left out, and those of which
+    pixels were summed (`compression`). Raises `DataError` with identifiers and rows of what is there twice; returns
+    remarks.
     """
-    rows = _rows_of(intensities, exposures, points)
+    counted = exposures.kind != "flux"
+    if compression is not None:
+        counted &= ~compression.covers(exposures)
+    if not counted.any():
+        return ()
+    rows = _rows_of(intensities, counted, points)
     pairs = _agreeing(rows)
     if not pairs:
         return ()
@@ -89,9 +100,8 @@ def check_repeats(
     return (f"{alike[0]}{more}; remove one if they are copies",) if alike else ()
 
 
-def _rows_of(intensities: Intensities, exposures: Exposures, points: Points) -> _Rows:
-    """The used measurements, or those at a sample of the places."""
-    counted = exposures.kind != "flux"
+def _rows_of(intensities: Intensities, counted: Bool[np.ndarray, " e"], points: Points) -> _Rows:
+    """The used measurements in some exposures, or those at a sample of the places."""
     if isinstance(intensities, TableIntensities):
         table, places = intensities, _places(points.x, points.y)
         step = 1 + len(table.used) // _MOST_ROWS
@@ -253,20 +263,24 @@ class JoinedIntensities(Intensities):
         return Block.joined(pieces)
 
 
+def parts_of(calset: CalibrationSet) -> tuple[tuple[Intensities, Points, Int[np.ndarray, " r"]], ...]:
+    """The parts of a set with field points of their own (`JoinedIntensities`), one where it has no others."""
+    whole = calset.intensities
+    if isinstance(whole, JoinedIntensities):
+        return whole.parts
+    return ((whole, calset.points, np.arange(len(calset.exposures))),)
+
+
 def frames_among(calset: CalibrationSet) -> tuple[FrameIntensities, Int[np.ndarray, " r"]] | None:
     """The frames of a set and the exposures (positions) that they hold; None where there are none, or on two grids."""
-    whole = calset.intensities
-    if isinstance(whole, FrameIntensities):
-        return whole, np.arange(len(calset.exposures))
-    parts = whole.parts if isinstance(whole, JoinedIntensities) else ()
+    parts = parts_of(calset)
     found = [(part, exposures) for part, _, exposures in parts if isinstance(part, FrameIntensities)]
     return found[0] if len(found) == 1 else None
 
 
 def without_frames(calset: CalibrationSet) -> CalibrationSet | None:
     """Part of a set beside its frames, with the exposures of all of it; None with no frames or nothing else."""
-    whole = calset.intensities
-    parts = whole.parts if isinstance(whole, JoinedIntensities) else ()
+    parts = parts_of(calset)
     beside = tuple(part for part in parts if not isinstance(part[0], FrameIntensities))
     if len(beside) in (0, len(parts)):
         return None
@@ -281,15 +295,16 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
     Exposure and point identifiers that collide are renumbered (and this is remarked on); points of tables
     with identical coordinates become one, sources with the same name and values likewise. Frames on the same
     grid share their pixels; frames and tables keep field points of their own. A moving element that a set does
-    not have is out there.
+    not have is out there. The record of a set that stands for pixels goes with its exposures.
 
-    Raises `DataError` for different instruments, numbers of cameras or sites, and for a filter or source that has
-    one name and two meanings.
+    Raises `DataError` for different instruments, numbers of cameras or sites, for a filter or source that has
+    one name and two meanings, and for a set that stands for pixels beside another one, or beside frames.
     """
     first = sets[0]
     for other in sets[1:]:
         _refuse_another_instrument(first, other)
     exposures, remarks = _join_exposures(sets)
+    compression = _joined_record(sets, exposures)
     sources, source_rows = _join_sources(sets)
     parts = _parts(sets, source_rows)
     names = ", ".join(str(entry_input.path) for entry in sets for entry_input in entry.inputs)
@@ -301,7 +316,7 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
     else:
         intensities = JoinedIntensities(tuple(parts), len(exposures))
         points = _stack_points([part[1] for part in parts])
-    remarks += check_repeats(intensities, exposures, points, names)
+    remarks += check_repeats(intensities, exposures, points, names, compression)
     return CalibrationSet(
         instrument=first.instrument,
         site=first.site,
@@ -313,7 +328,29 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
         intensities=intensities,
         inputs=tuple(entry_input for entry in sets for entry_input in entry.inputs),
         remarks=tuple(dict.fromkeys([remark for entry in sets for remark in entry.remarks] + remarks)),
+        compression=compression,
     )
+
+
+def _joined_record(sets: tuple[CalibrationSet, ...], exposures: Exposures) -> Compression | None:
+    """The record of the one set that stands for pixels, with its exposures as they are numbered now."""
+    first = 0
+    record: Compression | None = None
+    for entry in sets:
+        here, first = slice(first, first + len(entry.exposures)), first + len(entry.exposures)
+        if entry.compression is None:
+            continue
+        others = [one for one in sets if one is not entry]
+        if any(one.compression is not None or frames_among(one) for one in others):
+            what = "stands for pixels that were summed at one set of values; so do other sets here, or there are frames"
+            raise _conflict(
+                what, entry, "", "compress the frames of all together: walop-jax compress A.fits B.fits"
+            )
+        numbers = exposures.exposure[here][entry.compression.covers(entry.exposures)]
+        record = dataclasses.replace(
+            entry.compression, exposures=tuple(numbers.tolist()) if others else entry.compression.exposures
+        )
+    return record
 
 
 def _refuse_another_instrument(first: CalibrationSet, other: CalibrationSet) -> None:

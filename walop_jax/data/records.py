@@ -253,6 +253,7 @@ class Compression:
 
     The pixels were summed at `values` of the model's parameters, where their χ² and its degrees of freedom were these.
     `gain` and `response` are by how much single pixels differ there (`fit.verdict.Structure`); None: nobody asked.
+    `exposures` are those of the pixels, by their EXPOSURE, in a set that has others beside them; None: all are.
     """
 
     pixels: int
@@ -262,6 +263,13 @@ class Compression:
     frames: tuple[InputFile, ...] = ()
     gain: float | None = None
     response: float | None = None
+    exposures: tuple[int, ...] | None = None
+
+    def covers(self, exposures: Exposures) -> Bool[np.ndarray, " e"]:
+        """True for the exposures whose pixels were summed."""
+        if self.exposures is None:
+            return np.ones(len(exposures), bool)
+        return np.isin(exposures.exposure, self.exposures)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -7,7 +7,8 @@ The extension COMPRESSION says of a calibration set that stands for the pixels o
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.io.atomic import atomic_path
 
 EXTENSION = "COMPRESSION"
+MOST_EXPOSURES = 1_000_000  # of a run that a header may claim
 
 
 def compression_hdu(found: Compression, path: object) -> fits.BinTableHDU:
@@ -36,6 +38,8 @@ def compression_hdu(found: Compression, path: object) -> fits.BinTableHDU:
     if found.gain is not None and found.response is not None:
         hdu.header["STRUCTG"] = (found.gain, "rms gain of a camera at a pixel")
         hdu.header["STRUCTR"] = (found.response, "rms response of a camera to q, u there")
+    if found.exposures is not None:
+        hdu.header["EXPOSURE"] = _in_runs(found.exposures)
     for number, entry in enumerate(found.frames, start=1):
         hdu.header[f"FILE{number}"] = str(entry.path.name)
         hdu.header[f"SHA{number}"] = entry.sha256
@@ -68,7 +72,26 @@ def read_compression(hdu: Any, path: Path) -> Compression:
         frames=tuple(frames),
         gain=_asked(header, "STRUCTG"),
         response=_asked(header, "STRUCTR"),
+        exposures=None if "EXPOSURE" not in header else _of_runs(header["EXPOSURE"], place),
     )
+
+
+def _in_runs(numbers: Iterable[int]) -> str:
+    """Whole numbers as runs, the first and the last of each: "0:23,40:41"."""
+    ordered = np.unique(np.array([*numbers], int))
+    runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
+    return ",".join(f"{run[0]}:{run[-1]}" for run in runs if len(run))
+
+
+def _of_runs(text: object, place: Place) -> tuple[int, ...]:
+    """The whole numbers of runs; `DataError` for what are none."""
+    runs = [re.fullmatch(r"(-?\d{1,18}):(-?\d{1,18})", run) for run in str(text).strip().split(",")]
+    ends = [(int(run[1]), int(run[2])) for run in runs if run]
+    if len(ends) < len(runs) or any(not 0 <= last - first < MOST_EXPOSURES for first, last in ends):
+        raise place.fail(
+            f"is {text!r}, not runs of numbers like 0:23", "EXPOSURE", "compress the frames again"
+        )
+    return tuple(number for first, last in ends for number in range(first, last + 1))
 
 
 def _asked(header: Any, name: str) -> float | None:

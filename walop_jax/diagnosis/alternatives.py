@@ -148,18 +148,18 @@ def _judged(one: Alternative, calset: CalibrationSet, model: Model, left: float,
 
 def _left(likelihood: Likelihood, before: float, steps: int) -> float:
     """χ²/dof after some steps, the errors of the data scaled as `before`, then as the step before, asks for."""
-    select, values, least = likelihood.model.selection(), likelihood.model.start, before
+    model, least = likelihood.model, before
+    x = model.start[model.free]
     here, found = None, np.inf
     for number in range(steps + 1):
-        here = likelihood.expand(values, np.sqrt(max(least, 1.0)), here)
+        here = likelihood.expand(model.full(x), np.sqrt(max(least, 1.0)), here)
         if here.dof <= 0 or not np.isfinite(here.chi2):
             break
         least = here.chi2 / here.dof
         found = min(found, least)
         if number < steps:
             width = np.sqrt(np.diag(here.matrix))
-            step = np.linalg.solve(here.matrix / np.outer(width, width), here.gradient / width) / width
-            values = values - select @ step
+            x = x - np.linalg.solve(here.matrix / np.outer(width, width), here.gradient / width) / width
     return found
 
 

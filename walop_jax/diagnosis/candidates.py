@@ -38,11 +38,12 @@ from walop_jax.diagnosis.score import Candidate
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.columns import Change, Columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.conventions import Units
 from walop_jax.model.dependence import conditions_of_effect
 from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.effects.change import BAND, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
-from walop_jax.model.effects.etalon import GAPS, QUARTER
+from walop_jax.model.effects.etalon import probed_gaps
 from walop_jax.model.effects.numbers import OF_SOURCES
 from walop_jax.model.effects.optics import DISPLACEMENTS
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
@@ -488,16 +489,13 @@ def _of_plates(instrument: Instrument, exposures: Exposures, asked: _Asked) -> I
             yield (Sentence("cut", "of", layer),)
     if warm and asked.kelvin:
         yield tuple(warm)
-    yield from _fringes_ahead([sentence.place for sentence in warm])
+    yield from _fringes_ahead([sentence.place for sentence in warm], instrument.units)
 
 
-def _fringes_ahead(plates: Sequence[str]) -> Iterator[tuple[Sentence, ...]]:
+def _fringes_ahead(plates: Sequence[str], units: Units) -> Iterator[tuple[Sentence, ...]]:
     """Cosine and sine of the fringes of an air gap ahead of one plate, and of the same gap ahead of all of them."""
-    for gap in GAPS if plates else ():
-        pairs = [
-            tuple(Sentence("fringes", "of", place, (f"gap {g:g}",)) for g in (gap, gap + QUARTER))
-            for place in plates
-        ]
+    for pair in probed_gaps(units) if plates else ():
+        pairs = [tuple(Sentence("fringes", "of", place, (f"gap {g:g}",)) for g in pair) for place in plates]
         yield from pairs
         if len(pairs) > 1:
             yield tuple(itertools.chain(*pairs))

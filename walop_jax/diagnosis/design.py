@@ -197,8 +197,9 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
     further = [(f" {prefix}", prefix) for prefix in measured.likelihood.plan.moving if prefix in e.moving]
     turning = [("θ", POLARISER), *further]
 
-    smooth = legendre.basis(points.x, points.y, SMOOTH)
-    fine = legendre.basis(points.x, points.y, FINE)[:, smooth.shape[1] :]
+    scale = measured.likelihood.model.template.units.field
+    smooth = legendre.basis(points.x, points.y, SMOOTH, scale)
+    fine = legendre.basis(points.x, points.y, FINE, scale)[:, smooth.shape[1] :]
     square = points.x**2 + points.y**2
     rings = legvander(2.0 * square / max(float(square.max()), 1e-300) - 1.0, RINGS[-1])[:, RINGS]
     stokes = measured.likelihood.stokes(measured.values)

@@ -64,7 +64,7 @@ def _harmonics(
 
 def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
     points = design.fit.calset.points
-    basis = legendre.basis(points.x, points.y, 4)
+    basis = legendre.basis(points.x, points.y, 4, design.fit.model.template.units.field)
     degree = np.array([i + j for i, j in legendre.terms(4)])
     if len(field) <= len(degree):
         return "too few points to tell"
@@ -312,9 +312,13 @@ def told(result: FitResult) -> tuple[tuple[Change, float, float], ...]:
         return ()
     effect = result.model.instrument(result.values).effect(Described.name)
     assert isinstance(effect, Described)
-    index = result.model.index
+    index, units = result.model.index, result.model.template.units
     return tuple(
-        (change, float(amplitude), float(result.sigma[index(f"{Described.name}.{change.label}")]))
+        (
+            change.counted_in(units),
+            float(amplitude),
+            float(result.sigma[index(f"{Described.name}.{change.label}")]),
+        )
         for change, amplitude in effect.terms()
     )
 

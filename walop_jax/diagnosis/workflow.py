@@ -63,7 +63,6 @@ from walop_jax.likelihood import limits
 from walop_jax.likelihood.columns import columns
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.compiled import forget_programs
 from walop_jax.model.effects import Context, Described, Effect, FreeForm, OtherDescription
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model, effect_context
@@ -151,16 +150,8 @@ def _left(first: Examination, judge: Refit, policy: Policy) -> Examination:
     return last
 
 
-def _forget(result: FitResult) -> None:
-    """Give back the memory of programs, where they are of so many pairs that they take gigabytes together."""
-    if result.likelihood.pairs > limits.FORGOTTEN_ABOVE:
-        forget_programs()
-
-
 def _examined(found: Diagnosis) -> Diagnosis:
     """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked."""
-    if found.before is not found.after:
-        _forget(found.after)
     after = examined(with_honest_errors(found.after), as_written=True)
     if found.before is found.after:
         return dataclasses.replace(found, before=after, after=after)
@@ -236,11 +227,7 @@ class Refit:
 
     def examined(self, earlier: Examination | None = None) -> Examination:
         """The current fit, scored."""
-        if earlier is not None:
-            _forget(self.fit)  # models with fewer effects: they are not asked for again
         found = examine(self.fit, self.wanted, self.rng, earlier, self.sentences, self.parts, self.policy)
-        if earlier is not None:
-            _forget(self.fit)  # columns
         if found.alarm:
             self.tell(Stage(f"p = {found.table.p_global:.2g}: something is missing", "naming"))
         return found

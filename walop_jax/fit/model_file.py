@@ -16,6 +16,7 @@ from typing import Any
 
 import tomlkit
 
+from walop_jax.data.merge import parts_of
 from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet, Sources
 from walop_jax.data.settings import Settings
 from walop_jax.instruments.description import shipped
@@ -211,11 +212,7 @@ def base_model(
     """
     names = standard_names(calset.sources)
     sources = calset.sources
-    level = LEVEL
-    if has_known_flux(calset):  # a camera gets half of the unpolarised light: N = T/2
-        block = calset.intensities.block(0, min(limits.LEVEL_POINTS, len(calset.points)))
-        rows = block.used & (calset.exposures.kind == "flux")
-        level = float(2.0 * block.counts[rows].mean())
+    level = _level(calset)
     instrument = as_designed(instrument or instrument_of(calset))
     if instrument.name != calset.instrument:
         raise ValueError(
@@ -247,6 +244,21 @@ def base_model(
     if not ((calset.exposures.kind == "moon") & ~calset.exposures.clp_in).any():
         model = model.change("sky.depolarisation", free=False)
     return model
+
+
+def _level(calset: CalibrationSet) -> float:
+    """Level of the throughput: that of the first field points with a known flux, `LEVEL` where there are none.
+
+    A camera gets half of the unpolarised light: N = T/2.
+    """
+    for part, points, exposures in parts_of(calset):
+        known = calset.exposures.kind[exposures] == "flux"
+        for start in range(0, len(points) if known.any() else 0, limits.LEVEL_POINTS):
+            block = part.block(start, min(start + limits.LEVEL_POINTS, len(points)))
+            counts = block.counts[block.used & known]
+            if counts.size:
+                return float(2.0 * counts.mean())
+    return LEVEL
 
 
 def _gauges(model: Model, flux_known: bool) -> list[str]:
@@ -354,7 +366,9 @@ def model_without_data(
         )
         model = make_model(nominal.name, nominal, frozen=(GAUGE,))
         model = dataclasses.replace(model, catalogue=known_to(header, catalogue))
-        known = context or Context(sources=nominal.standard.names, cameras=nominal.cameras.names)
+        known = context or Context(
+            sources=nominal.standard.names, cameras=nominal.cameras.names, units=nominal.units
+        )
         return _with_effects(model, header, known)
 
     return parse(text, build)

@@ -25,8 +25,10 @@ from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.inverses import whitening
+from walop_jax.likelihood.layout import curves_of
 from walop_jax.likelihood.likelihood import Likelihood, Posterior
 from walop_jax.likelihood.runner import Journal, Processes, Progress, Runner, fingerprint
+from walop_jax.model.planning import extrapolations
 from walop_jax.model.specification import Model
 
 Vector = Float[np.ndarray, " n"]
@@ -37,6 +39,7 @@ NEARLY = 1.15  # χ²/dof that errors stated seven per cent too small give
 TOO_LOW = 0.8  # χ²/dof below which the stated errors are those of something else
 PRIOR_EDGE = 4.0  # standard deviations
 EXCESS_NOISE = 0.5  # sigma
+LAYOUTS = 5  # times that wavelength nodes are laid out anew for thicker retarders
 ILL_CONDITIONED = (
     1e6  # for each intensity: eigenvalues of data grow with their number, those of priors do not
 )
@@ -260,6 +263,12 @@ def fit(
     began, model = time.perf_counter(), likelihood.model
     first = _start(likelihood) if start is None else np.asarray(start, float)
     found = find_minimum(likelihood, first, noise_scale, worth)
+    for _ in range(LAYOUTS):
+        # Retarders that a fit has made thicker need more wavelengths than those that it began with.
+        before, likelihood = likelihood, likelihood.following(found.values)
+        if likelihood is before:
+            break
+        found = find_minimum(likelihood, found.values, noise_scale, worth)
     check_constrained(model, found.posterior)
     return FitResult(
         likelihood=likelihood,
@@ -275,11 +284,9 @@ def fit(
 def _start(likelihood: Likelihood) -> Vector:
     """The start values of the model; of a set that stands for pixels, the values at which these were summed."""
     model, compression = likelihood.model, likelihood.calset.compression
-    start = model.start.copy()
-    if compression is not None:
-        known = [i for i in model.free if model.parameters[i].name in compression.values]
-        start[known] = [compression.values[model.parameters[i].name] for i in known]
-    return start
+    known = {} if compression is None else compression.values
+    x = [known.get(model.names[i], model.start[i]) for i in model.free]
+    return model.full(np.array(x))
 
 
 def with_honest_errors(result: FitResult) -> FitResult:
@@ -345,6 +352,9 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
             f"the errors of the data had to be multiplied by {result.noise_scale:.3g} for a fit: the model is far off",
             blocking=False,
         )
+    there = result.model.instrument(result.values).patched()
+    for sentence in extrapolations(there, curves_of(result.calset)):
+        yield Doubt(Quality(0), sentence, blocking=False)
     for name in result.at_prior_edge:
         p, value = result.model[name], result.value(name)[0]
         assert p.prior is not None

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from walop_jax.fit.minimise import MAXIMUM_STEPS, Minimum, minimise
 from walop_jax.io.errors import fail
@@ -30,6 +29,7 @@ FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors sca
 MAXIMUM_RESCALINGS = 4
 FIRST_STEPS = 20
 OTHER_STEPS = 12  # of a start one order of retardance away
+MOST_ORDERS = 8  # times that fringes of air are tried some orders away from the best so far
 # Scaled gradient of a large set: 10⁻³ of a standard error is 10⁻⁶ in χ², and of a χ² of 10⁹ rounding leaves 10⁻⁷.
 LARGE_TOLERANCE = 1e-3
 
@@ -83,14 +83,10 @@ def _search(
     `expand` takes the place of `Likelihood.expand`; `how` goes to `minimise`.
     """
     expand, model = expand or likelihood.expand, likelihood.model
-    select, origin = model.selection(), first[model.free]
-
-    def full(x: Vector) -> Float[np.ndarray, " all"]:
-        return first + select @ (x - origin)
 
     def evaluate(x: Vector) -> Posterior:
         nonlocal near
-        near = expand(full(x), noise_scale, near)
+        near = expand(model.full(x, first), noise_scale, near)
         return near
 
     def tell(step: int, best: Posterior) -> None:
@@ -98,14 +94,14 @@ def _search(
 
     minimum = minimise(
         evaluate,
-        origin,
+        first[model.free],
         free_scales(model),
         maximum_steps=maximum_steps,
         far_off=lambda found: not _misfit(found) < FAR_OFF,
         progress=tell,
         **how,
     )
-    return FoundMinimum(minimum, full(minimum.x))
+    return FoundMinimum(minimum, model.full(minimum.x, first))
 
 
 def nearer(likelihood: Likelihood, values: Vector, distance: float) -> Vector:
@@ -186,7 +182,40 @@ def _of_sample(
 def _from_afar(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
 ) -> FoundMinimum:
-    """The minimum from start values that may be far away, the errors of the data scaled if need be."""
+    """The minimum from start values that may be far away, of fringes that of the best order (`_best_gaps`)."""
+    return _best_gaps(likelihood, _of_one_order(likelihood, first, noise_scale, worth))
+
+
+def _best_gaps(likelihood: Likelihood, found: FoundMinimum) -> FoundMinimum:
+    """The lowest minimum with air gaps some orders of their fringes thicker or thinner.
+
+    Fringes of gaps a quarter of a wavelength apart differ by their sign, within a narrow band: each is a minimum of its
+    own. Steps go on while they lower the objective.
+    """
+    model, quarter = likelihood.model, 0.25 * float(np.asarray(likelihood.plan.wavelength).mean())
+    for gap in model.gaps() if found.minimum.converged else ():
+        for _ in range(MOST_ORDERS):
+            before = found
+            for order in (-2, -1, 1, 2):
+                start = before.values.copy()
+                start[gap] += order * quarter
+                if start[gap] <= 0:
+                    continue
+                label = f"checking for another order of fringes ({model.names[gap]} = {start[gap]:.4g} µm)"
+                scale = before.posterior.noise_scale
+                trial = _search(likelihood, label, start, scale, before.posterior, maximum_steps=OTHER_STEPS)
+                found = dataclasses.replace(found, starts=found.starts + 1)
+                if trial.minimum.converged and trial.posterior.objective < found.posterior.objective:
+                    found = dataclasses.replace(trial, starts=found.starts)
+            if found.minimum is before.minimum:
+                break
+    return found
+
+
+def _of_one_order(
+    likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
+) -> FoundMinimum:
+    """The minimum near start values that may be far away, the errors of the data scaled if need be."""
     check_identifiable(likelihood)
     given = noise_scale or 1.0
     found = _search(likelihood, "fit", first, given, maximum_steps=FIRST_STEPS)
@@ -272,18 +301,13 @@ def check_identifiable(likelihood: Likelihood) -> None:
 
 
 def _order_starts(likelihood: Likelihood) -> Iterator[tuple[str, Vector]]:
-    """Start values one order of retardance away: first-order plates wrap every 2π."""
-    wavelength = np.asarray(likelihood.plan.wavelength).mean()
-    birefringence = float(
-        materials.MGF2_E.refractive_index(wavelength) - materials.MGF2_O.refractive_index(wavelength)
-    )
-    one_wave = wavelength / birefringence
-    thick = [name for name in reversed(likelihood.model.names) if name.endswith("plate.mgf2")]
-    for name in thick:
-        for sign in (-1, 1):
-            start = likelihood.model.start.copy()
-            start[likelihood.model.index(name)] += sign * one_wave
-            yield (
-                f"checking for a second minimum ({name} one wave {'thicker' if sign > 0 else 'thinner'})",
-                start,
-            )
+    """Start values with one crystal layer a wave of its retardance thicker or thinner: plates wrap every 2π."""
+    model, wavelength = likelihood.model, np.asarray(likelihood.plan.wavelength).mean()
+    for place, layer in model.thicknesses().items():
+        one_wave = wavelength / abs(materials.CRYSTALS[layer.material].birefringence(wavelength))
+        for sign, word in ((-1, "thinner"), (1, "thicker")):
+            start = model.start
+            start[place] += sign * one_wave
+            if start[place] > 0:
+                label = f"checking for a second minimum ({model.names[place]} one wave {word})"
+                yield label, model.full(start[model.free])

@@ -60,33 +60,44 @@ def with_pixel_structure(calset: CalibrationSet, structure: Structure) -> Calibr
 def with_pixels(result: FitResult) -> FitResult:
     """The fit of a set that stands for pixels with the χ² and the degrees of freedom of these; any other as it is.
 
-    From where they were summed χ² of the pixels changes as that of the field points does.
+    From where they were summed χ² of the pixels changes as that of the field points does. What the set holds beside
+    them counts by itself, and so do parameters that there were not.
     """
-    compression = result.calset.compression
+    compression, likelihood = result.calset.compression, result.likelihood
     if compression is None:
         return result
-    there = values_then(result)
-    before = float(np.sum(result.likelihood.residuals(there)[1] ** 2))
+    summed = compression.covers(result.calset.exposures)
+    before = float(np.sum(likelihood.residuals(values_then(result))[1][:, summed] ** 2))
+    beside = np.where(summed, 0, likelihood.used.sum(axis=0)) @ likelihood.data_per_row
+    new = [result.model.parameters[i] for i in result.model.free]
+    more = sum((p.prior is not None) - 1 for p in new if p.name not in compression.values)
     data = compression.chi2 + result.posterior.data - before
-    posterior = dataclasses.replace(result.posterior, data=data, dof=compression.dof)
-    return dataclasses.replace(result, posterior=posterior)
+    dof = compression.dof + round(float(beside)) + more
+    return dataclasses.replace(result, posterior=dataclasses.replace(result.posterior, data=data, dof=dof))
 
 
 def values_then(result: FitResult) -> Float[np.ndarray, " n"]:
     """Values at which the pixels of a set were summed; parameters that were not there then have their start values."""
     compression = result.calset.compression
     assert compression is not None
-    names, start = [p.name for p in result.model.parameters], result.model.start
-    return np.array([compression.values.get(name, value) for name, value in zip(names, start, strict=True)])
+    model = result.model
+    values = [
+        compression.values.get(name, value) for name, value in zip(model.names, model.start, strict=True)
+    ]
+    return np.array(values)[model.masters]
 
 
 def moved(result: FitResult) -> float:
     """Distance (standard errors, all parameters together) of a fit from where the pixels of its set were summed.
 
-    0 for a set that stands for no pixels. Parameters that were not there then count from their start values.
+    0 for a set that stands for no pixels. Parameters that were not there then count from their start values, those of
+    sources that the pixels did not see not at all.
     """
-    compression = result.calset.compression
+    compression, model, exposures = result.calset.compression, result.model, result.calset.exposures
     if compression is None:
         return 0.0
-    step = (result.values - values_then(result))[result.model.free]
+    kinds = exposures.kind[compression.covers(exposures)]
+    unseen = [source.name for source in model.template.sources if source.kind not in kinds]
+    step = (result.values - values_then(result))[model.free]
+    step[[model.parameters[i].part in unseen for i in model.free]] = 0.0
     return float(np.sqrt(max(step @ result.posterior.matrix @ step, 0.0)))

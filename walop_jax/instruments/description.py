@@ -23,12 +23,14 @@ from walop_jax.io.text import parse_toml, read_text
 Table = Mapping[str, Any]
 
 KEYS = (
-    "name", "default", "like", "about", "source", "path", "site", "field", "cameras", "throughput", "elements", "arms",
+    "name", "default", "like", "about", "source", "path", "wavelength", "site", "field",
+    "cameras", "throughput", "elements", "arms",
 )  # fmt: skip
 REQUIRED = ("name", "path", "field", "cameras", "throughput", "elements", "arms")
 SITE_KEYS = ("telescope", "latitude", "longitude", "elevation", "full_moon")
 FIELD_KEYS = ("limit", "scale", "raster", "edge")
 RASTERS = ("square", "line")
+NO_SOURCE = "description file"  # of numbers, where a file names none
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 LARGEST = 1e300
 CAMERA_KEYS = ("names", "split", "floor")
@@ -40,7 +42,8 @@ class Description:
     """An instrument as described; `path` names the elements ahead of the arms in the order light meets them.
 
     `elements` and `arms` are their tables, which the model reads that builds them, as `read` does; `field_limit`,
-    `field_scale` and `edge` in degrees; `degree`, `level`, `scale` and `loose` of the throughput; `split` and `floor`
+    `field_scale` and `edge` in degrees; `wavelength` (µm) is where colours are counted from, None: where WALOP's are;
+    `degree`, `level`, `scale` and `loose` of the throughput; `split` and `floor`
     as in `model.cameras.Cameras`; `raster` is how the field points of a simulated run lie.
     """
 
@@ -63,6 +66,7 @@ class Description:
     edge: float = 0.0
     split: bool = False
     floor: float = 0.0
+    wavelength: float | None = None
     default: bool = False
     text: str = ""
 
@@ -134,7 +138,18 @@ def _whole(text: str, where: str, seen: tuple[str, ...]) -> Table:
         raise DataError(
             f"{where}: like = {like!r} must name a shipped instrument; {nearest(str(like), shipped())}"
         )
-    return merged(_whole(_shipped_text(known[like.upper()]), like, (*seen, like)), table)
+    base = dict(_whole(_shipped_text(known[like.upper()]), like, (*seen, like)))
+    base.pop("default", None)  # of one instrument alone
+    field = table.get("field")
+    if (
+        isinstance(field, Mapping)
+        and {"limit", "edge"} & set(field)
+        and isinstance(base.get("field"), Mapping)
+    ):
+        # A field of another size has another scale.
+        kept = {"raster"} | ({"limit"} if "edge" in field else set())
+        base["field"] = {key: value for key, value in base["field"].items() if key in kept}
+    return merged(base, table)
 
 
 def merged(old: Table, new: Table) -> Table:
@@ -255,13 +270,15 @@ def _description(read: Reader, table: Table, text: str) -> Description:
     return Description(
         name=read.text(table["name"], "name", ""),
         about=read.text(table["about"], "about", "") if "about" in table else "",
-        source=read.text(table.get("source", "description file"), "source", ""),
+        source=read.text(table.get("source", NO_SOURCE), "source", ""),
         path=read.words(table["path"], "path", "") if table["path"] else (),
         elements=elements,
         arms=arms,
         cameras=read.words(cameras.get("names"), "names", "cameras"),
         field_limit=read.positive(field.get("limit", 90.0), "limit", "field"),
-        field_scale=read.positive(field.get("scale", 0.3), "scale", "field"),
+        field_scale=read.positive(
+            field.get("scale", field.get("edge", field.get("limit", 0.3))), "scale", "field"
+        ),
         degree=degree,
         level=read.positive(series.get("level", 0.5), "level", "throughput"),
         scale=read.positive(series.get("scale", 0.02), "scale", "throughput"),
@@ -272,6 +289,7 @@ def _description(read: Reader, table: Table, text: str) -> Description:
         edge=read.number(field.get("edge", field.get("limit", 0.0)), "edge", "field"),
         split=split,
         floor=floor,
-        default=table.get("default") is True and "default" in text,
+        wavelength=read.positive(table["wavelength"], "wavelength", "") if "wavelength" in table else None,
+        default=table.get("default") is True,
         text=text,
     )

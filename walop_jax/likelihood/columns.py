@@ -279,9 +279,8 @@ class Columns:
     @functools.cached_property
     def fringe_plan(self) -> Plan:
         """The exposures with nodes that follow the fringes of air."""
-        template, calset = self.likelihood.model.template, self.likelihood.calset
+        patched, calset = self.patched, self.likelihood.calset
         gap = AirGap(0.0, 1.0, LARGEST_GAP)  # pyright: ignore[reportArgumentType]
-        patched = template.patched()
         for place in patched.places(WavePlate):
             patched = patched.changed(place, air_gaps=lambda gaps: (*gaps, gap))
         return plan_for(patched, calset.exposures, calset.filters, calset.sources)
@@ -376,7 +375,8 @@ class _Block:
             each = []
             for sign in (1.0, -1.0)[: self.sites]:
                 at = _Laid(self.of.likelihood, sign * self.x[:, None], sign * self.y[:, None])
-                value = Sentence("", "", "", tuple(f for f in factors if isinstance(f, str))).factor(at)
+                texts = tuple(f for f in factors if isinstance(f, str))
+                value = Sentence("", "", "", texts, units=self.of.patched.units).factor(at)
                 for other in (f for f in factors if not isinstance(f, str)):
                     value = value * other(at)
                 whole = np.broadcast_to(np.nan_to_num(np.asarray(value)), self.used.shape)

@@ -17,7 +17,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.data.merge import without_frames
-from walop_jax.data.records import Block, CalibrationSet, Exposures, Intensities, Points, Site
+from walop_jax.data.records import (
+    Block,
+    CalibrationSet,
+    Exposures,
+    FilterCurve,
+    Intensities,
+    Points,
+    Site,
+)
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.engine import PointData
 from walop_jax.model import light
@@ -26,8 +34,9 @@ from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects.base import Effect
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan, with_median
-from walop_jax.model.planning import plan_for
+from walop_jax.model.planning import outgrown, plan_for
 from walop_jax.model.specification import Model
 from walop_jax.sky.moon import body_direction, rayleigh_sky
 
@@ -74,7 +83,8 @@ class Layout:
         `memory` (bytes) is what point data may take, None for the usual 2 GB; `threads` is the number of slabs in use
         at a time. `points_per_chunk` and `interpolate` are decided by the size of the set where they are None.
         """
-        whole = dataclasses.replace(model.template, effects=(*model.template.effects, *probes))
+        planned = planned_instrument(calset, model)
+        whole = dataclasses.replace(planned, effects=(*planned.effects, *probes))
         plan = plan_for(whole, calset.exposures, calset.filters, calset.sources)
         if needs(whole).median:
             plan = with_median(plan, median_counts(calset))
@@ -115,6 +125,22 @@ class Layout:
     def slabs(self) -> int:
         """Number of slabs."""
         return -(-self.points // self.slab)
+
+
+def planned_instrument(calset: CalibrationSet, model: Model) -> Instrument:
+    """The instrument whose retarders the wavelength nodes follow: at the start, or as thick as those of the template.
+
+    A fit that has made them thicker than the start has put them there.
+    """
+    start = model.instrument()
+    return model.template if outgrown(start, model.template, curves_of(calset)) else start
+
+
+def curves_of(calset: CalibrationSet) -> list[FilterCurve]:
+    """The curves of the filters in use."""
+    return [
+        calset.filters[name] for name in np.unique(calset.exposures.filter).tolist() if name in calset.filters
+    ]
 
 
 def bytes_per_point(exposures: int, cameras: int = 4, *, mirrored: bool = False) -> int:

@@ -14,13 +14,14 @@ from jaxtyping import Array, Bool, Float, Int
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
-from walop_jax.likelihood.layout import Layout, MeasuredPoints, PointReader
+from walop_jax.likelihood.layout import Layout, MeasuredPoints, PointReader, curves_of, planned_instrument
 from walop_jax.likelihood.optics import directions
 from walop_jax.likelihood.runner import Runner, SlabSums
 from walop_jax.model.compiled import require_double_precision
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
+from walop_jax.model.planning import outgrown
 from walop_jax.model.specification import Model
 
 Vector = Float[np.ndarray, " n"]
@@ -77,7 +78,8 @@ class Posterior:
     `gradient` is half the gradient of the total and `matrix` half its Gauss–Newton Hessian, both with the
     errors of the data times `noise_scale`; `data` and `chi2` are with the errors as given. `loose` is the
     share of the weak pulls that are no prior knowledge; it is in the gradient and the matrix, not in
-    `chi2`. `dof` counts three per used row (four when the flux is known), one per prior, minus the free parameters.
+    `chi2`. `dof` counts the independent data of every used row (`Likelihood.data_per_row`), one per prior, less the
+    free parameters.
     """
 
     data: float
@@ -203,6 +205,20 @@ class Likelihood:
         once &= layout.points * len(calset.exposures) <= limits.DERIVATIVES_ONCE
         return cls(
             layout, MeasuredPoints(reader, layout), runner if layout.large else runner.alone(), model, once
+        )
+
+    def following(self, values: Vector) -> Likelihood:
+        """The same with wavelength nodes that follow the retarders at a full vector of values; itself if they do."""
+        there = self.model.instrument(values)
+        if not outgrown(planned_instrument(self.calset, self.model), there, curves_of(self.calset)):
+            return self
+        return Likelihood.of(
+            self.calset,
+            dataclasses.replace(self.model, template=there),
+            memory=self.layout.allowed,
+            runner=self.runner,
+            interpolate=self.layout.interpolated,
+            once=self.once,
         )
 
     @property
@@ -359,7 +375,7 @@ class Likelihood:
 
         The flux is the mean over the arms where each has its own.
 
-        All of them at once: for whole frames take a sample (`thinning.thinned`).
+        All of them at once: for whole frames take a sample (`layout.thinned`).
         """
         instrument = self.model.instrument(values)
         nodes, _ = self.nodes(instrument)

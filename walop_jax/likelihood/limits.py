@@ -107,8 +107,6 @@ COMPILED_ONCE = 6000
 """(Exposure, point) pairs up to which columns of effects, counts and residuals are compiled without optimisation."""
 DERIVATIVES_ONCE = 1500
 """The same for derivatives of residuals, which a fit asks for some ten times: they run three times as long then."""
-FORGOTTEN_ABOVE = 6000
-"""(Exposure, point) pairs of a set above which programs of earlier models of a diagnosis go: half a gigabyte each."""
 FITTED_FROM_ROWS = 20_000
 """(Exposure, point) pairs of a set up to which the matrix of a fit is made from its rows, by a program that errors and
 trust need anyway: to compile or to load another one takes longer. The rows take 100 MB at most."""

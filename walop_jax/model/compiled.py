@@ -18,9 +18,7 @@ there where XLA has the option (that of jax 0.12 has not: a fit takes twice the 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import functools
-import gc
 import hashlib
 import importlib.metadata
 import io
@@ -180,7 +178,6 @@ def _write(path: Path, found: Any) -> None:
 # ---------------------------------------------------------------------------------------------------------- compilation
 
 Result = TypeVar("Result")
-_kept: list[dict[Any, Any]] = []  # programs that came from disk, of every compiled function
 
 
 EMITTERS = "xla_cpu_use_fusion_emitters"
@@ -218,7 +215,6 @@ def compiled(
         return jax.jit(function, compiler_options=options(once))
 
     programs: dict[Any, Any] = {}
-    _kept.append(programs)
 
     def kept(args: tuple[Any, ...], once: bool) -> Any:
         """The program for arguments like these, from disk where it is there; None where none is kept."""
@@ -242,20 +238,6 @@ def compiled(
 def array(values: Any, kind: Any = None) -> jax.Array:
     """Known numbers as an array of JAX, for use outside of programs: `jnp.asarray` compiles one for each shape."""
     return values if isinstance(values, jax.Array) else jax.device_put(np.asarray(values, kind))
-
-
-def forget_programs() -> None:
-    """Give back the memory of all programs that JAX holds; what is called again is loaded or compiled anew.
-
-    For a work that goes on with another model, whose programs are others: those of a large set take gigabytes.
-    """
-    for programs in _kept:
-        programs.clear()
-    jax.clear_caches()
-    gc.collect()
-    # What is given back in small pieces the GNU library keeps, gigabytes of it; others have no such function.
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def require_double_precision() -> None:

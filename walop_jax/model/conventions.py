@@ -10,11 +10,23 @@ Matrix      one row for each arm, the normalised difference of its two cameras, 
             q_m = (N0 − N1)/(N0 + N1) = m21 + m22 q + m23 u and u_m = (N2 − N3)/(N2 + N3) = m31 + m32 q + m33 u,
             m being ratios of band-integrated linear coefficients.
 Oblique     The Stokes parameters of a ray of direction k refer to the ICS axes carried from (0, 0, 1) to k by
-            the smallest rotation (`optics.transport_rotation`).
+            the smallest rotation (`geometry.transport_rotation`).
 """
+
+from typing import NamedTuple
 
 REFERENCE_WAVELENGTH = 0.62  # µm: where dispersions, colours and fringes are counted from
 FIELD_SCALE = 0.3  # degrees: the unit of the field polynomials of WALOP
+
+
+class Units(NamedTuple):
+    """Scales of an instrument that changes over its field (deg) and its bands (µm) are counted in."""
+
+    field: float = FIELD_SCALE
+    wavelength: float = REFERENCE_WAVELENGTH
+
+
+OF_WALOP = Units()
 
 
 def matrix_elements(arms: int) -> tuple[str, ...]:

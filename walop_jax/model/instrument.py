@@ -22,6 +22,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from walop_jax.instruments.description import (
+    NO_SOURCE,
     Description,
     Reader,
     default_name,
@@ -34,6 +35,7 @@ from walop_jax.model import fold, legendre
 from walop_jax.model.build import parts
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.compiled import array
+from walop_jax.model.conventions import REFERENCE_WAVELENGTH, Units
 from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate
 from walop_jax.model.elements.wave_plate import MODELS
 from walop_jax.model.parameters import Component, check_names, leaves, number, unknown_name
@@ -82,7 +84,8 @@ class Instrument(Component):
     `rotator_zero` (deg) is added to ROTATOR, `filter_shift` (µm) displaces broad bands; None: there is none. Field
     coordinates reach to ±`field_limit` (deg); `site` is telescope, latitude and longitude (deg, east positive),
     elevation (m) and MJD of a full Moon, `raster` how the points of a simulated run lie, and how far out (deg).
-    `description` is the text it was described in, empty for an instrument that comes with the package.
+    `description` is the text it was described in, empty for an instrument that comes with the package, `source` where
+    its numbers are from; colours and fringes are counted from `wavelength` (µm).
 
     >>> walop.Instrument.read("WALOP-NORTH").cameras.names
     ('O1', 'E1', 'O2', 'E2')
@@ -102,6 +105,8 @@ class Instrument(Component):
     site: tuple[str, float, float, float, float] = eqx.field(static=True, default=NO_SITE)
     raster: tuple[str, float] = eqx.field(static=True, default=("square", 0.0))
     description: str = eqx.field(static=True, default="", repr=False)
+    source: str = eqx.field(static=True, default="", repr=False)
+    wavelength: float = eqx.field(static=True, default=REFERENCE_WAVELENGTH)
 
     def __repr__(self) -> str:
         arms = "; ".join(f"{arm.name}: {' > '.join(arm.path)}" for arm in self.arms)
@@ -184,6 +189,11 @@ class Instrument(Component):
         parts = [*self.train(), *(element for arm in self.arms for element in arm.train())]
         found = [element.moves for element in parts if element.moves and not isinstance(element, Polariser)]
         return tuple(dict.fromkeys(found))
+
+    @property
+    def units(self) -> Units:
+        """Scales that changes over its field and its bands are counted in."""
+        return Units(self.throughput.scale, self.wavelength)
 
     @property
     def plates(self) -> str | None:
@@ -366,6 +376,8 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
         site=description.place,
         raster=(description.raster, description.edge),
         description="" if description.name in shipped() else description.text,
+        wavelength=description.wavelength or REFERENCE_WAVELENGTH,
+        source=description.source if description.source != NO_SOURCE else "",
     )
     _check(instrument, description.read)
     return adapted(instrument, **options)

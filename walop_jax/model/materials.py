@@ -4,17 +4,21 @@ Equations   Sellmeier formula 1, n² = 1 + Σ B λ²/(λ² − C²) (Dodge, Radh
             n² = A + Σ B λ²/(λ² − C) (Schott, Ghosh). Mixing the two up is the classic mistake; `_formula_1` says which
             is which.
 Symbols     λ vacuum wavelength [µm]; n refractive index; A, B dimensionless; C [µm] in formula 1, [µm²] in 2.
-Sources     beside the numbers; the curves as transcribed in the refractiveindex.info database. They hold at 0.3–2.5 µm
-            and 20 °C (N-BK7), 0.198–2.05 µm (quartz), 0.2–7 µm and 19 °C (MgF2); the others at 0.18–3 µm and 18 °C
-            (quartz), 0.14–7.5 µm and 20 °C (MgF2).
+Sources     beside the numbers; the curves as transcribed in the refractiveindex.info database. They were measured at
+            20 °C (N-BK7), 19 °C (MgF2), 18 °C (quartz_1951) and 20 °C (mgf2_1980), over the `measured` wavelengths.
+Limits      up to `EXTRAPOLATED` times beyond the measured wavelengths a fit remarks on it; farther away, toward the
+            poles of the formulae, no light path is computed.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
 
 class Sellmeier(NamedTuple):
@@ -24,11 +28,11 @@ class Sellmeier(NamedTuple):
     strength: tuple[float, ...]
     pole: tuple[float, ...]
 
-    def refractive_index(self, wavelength: Float[Array, ...]) -> Float[Array, ...]:
-        """Refractive index at `wavelength` (µm)."""
+    def refractive_index(self, wavelength: Float[Any, ...]) -> Float[Any, ...]:
+        """Refractive index at `wavelength` (µm); an array of numpy stays so."""
         square = wavelength**2
         terms = sum(b * square / (square - c) for b, c in zip(self.strength, self.pole, strict=True))
-        return jnp.sqrt(self.constant + terms)
+        return (jnp if isinstance(wavelength, jax.Array) else np).sqrt(self.constant + terms)
 
 
 def _formula_1(strength: tuple[float, ...], root_of_pole: tuple[float, ...]) -> Sellmeier:
@@ -57,26 +61,40 @@ MGF2_THERMAL = 5.37e-5
 REFERENCE_TEMPERATURE = 10.0  # Celsius
 
 
+EXTRAPOLATED = 1.25
+
+
 class Crystal(NamedTuple):
-    """A uniaxial crystal: both dispersion curves, and the relative change of its birefringence per kelvin."""
+    """A uniaxial crystal: both dispersion curves, and the relative change of its birefringence per kelvin.
+
+    `measured` is the range of wavelengths (µm) to which the curves were fitted.
+    """
 
     ordinary: Sellmeier
     extraordinary: Sellmeier
     thermal: float
+    measured: tuple[float, float]
     source: str
+
+    def birefringence(self, wavelength: Float[Any, ...]) -> Float[Any, ...]:
+        """n_e − n_o at `wavelength` (µm)."""
+        return self.extraordinary.refractive_index(wavelength) - self.ordinary.refractive_index(wavelength)
 
 
 class Glass(NamedTuple):
-    """An isotropic material."""
+    """An isotropic material; `measured` as of a crystal."""
 
     dispersion: Sellmeier
+    measured: tuple[float, float]
     source: str
 
 
 _ETZEL = "Etzel, Rose & Wang 2000, Appl. Opt. 39, 5796 (temperature)"
 CRYSTALS = {
-    "quartz": Crystal(QUARTZ_O, QUARTZ_E, QUARTZ_THERMAL, f"Ghosh 1999, Opt. Commun. 163, 95; {_ETZEL}"),
-    "mgf2": Crystal(MGF2_O, MGF2_E, MGF2_THERMAL, f"Dodge 1984, Appl. Opt. 23, 1980; {_ETZEL}"),
+    "quartz": Crystal(
+        QUARTZ_O, QUARTZ_E, QUARTZ_THERMAL, (0.198, 2.05), f"Ghosh 1999, Opt. Commun. 163, 95; {_ETZEL}"
+    ),
+    "mgf2": Crystal(MGF2_O, MGF2_E, MGF2_THERMAL, (0.2, 7.0), f"Dodge 1984, Appl. Opt. 23, 1980; {_ETZEL}"),
 }
 OTHER_CURVES = {
     "quartz": {"quartz_1951": "Radhakrishnan 1951"},
@@ -88,11 +106,17 @@ CRYSTALS |= {
         QUARTZ_O_1951,
         QUARTZ_E_1951,
         QUARTZ_THERMAL,
+        (0.18, 3.0),
         f"Radhakrishnan 1951, Proc. Indian Acad. Sci. 31, 22; {_ETZEL}",
     ),
     "mgf2_1980": Crystal(
-        MGF2_O_1980, MGF2_E_1980, MGF2_THERMAL, f"Li 1980, J. Phys. Chem. Ref. Data 9, 161; {_ETZEL}"
+        MGF2_O_1980,
+        MGF2_E_1980,
+        MGF2_THERMAL,
+        (0.14, 7.5),
+        f"Li 1980, J. Phys. Chem. Ref. Data 9, 161; {_ETZEL}",
     ),
 }
-GLASSES = {"BK7": Glass(BK7, "Schott 2017, data sheet of N-BK7")}
+GLASSES = {"BK7": Glass(BK7, (0.3, 2.5), "Schott 2017, data sheet of N-BK7")}
+MATERIALS: Mapping[str, Crystal | Glass] = CRYSTALS | GLASSES
 """Materials that a description file may name."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import jax
 import numpy as np
@@ -12,13 +12,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.records import Exposures, FilterCurve, Sources
 from walop_jax.data.settings import Settings
+from walop_jax.io.errors import fail
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.materials import EXTRAPOLATED, MATERIALS
 from walop_jax.model.plan import Plan, blank_exposures, exposure_arrays, hours_of
-from walop_jax.model.quadrature import Rule, band_rule
+from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, rounded_up, waves_over
 from walop_jax.model.ray import CONDITIONS, Conditions
 from walop_jax.model.sources import ExposureArrays
+
+SAMPLES = 9  # wavelengths of a band between which a retardance goes one way
+ROOM = 1.03  # by which a thickness may grow in a fit, and a path when the ray is oblique, before nodes are too few
 
 
 def plan_for(
@@ -91,9 +96,65 @@ def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mappi
 
 
 @functools.lru_cache(maxsize=256)
-def _rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], path_difference: float) -> Rule:
+def _rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], *fringes: float) -> Rule:
     """Nodes of a band and their weights; plans of one set are made for many models, most of which ask for the same."""
-    return band_rule(np.array(wavelength), np.array(throughput), path_difference=path_difference)
+    path_difference, waves, faint = fringes
+    return band_rule(
+        np.array(wavelength), np.array(throughput), path_difference=path_difference, waves=waves, faint=faint
+    )
+
+
+def outgrown(planned: Instrument, instrument: Instrument, curves: Iterable[FilterCurve]) -> bool:
+    """True where retarders have become thicker than the nodes of a plan for `planned` follow in any of the bands."""
+    old, new = planned.patched(), instrument.patched()
+    return any(
+        now > followed
+        for curve in curves
+        for now, followed in zip(_fringes(new, curve, 1.0), _fringes(old, curve), strict=True)
+    )
+
+
+def extrapolations(instrument: Instrument, curves: Iterable[FilterCurve]) -> tuple[str, ...]:
+    """Sentences on materials (patched instrument) that bands use beyond the wavelengths at which they were measured.
+
+    Raises `DataError` where that is too far for the formulae.
+    """
+    behind = (element for arm in instrument.arms for element in arm.train())
+    names = dict.fromkeys(name for element in (*instrument.train(), *behind) for name in element.materials)
+    sentences = []
+    for curve in curves:
+        seen = curve.wavelength[curve.throughput > 0]
+        for name in names if seen.size else ():
+            (low, high), source = (one := MATERIALS[name]).measured, one.source.split(";")[0]
+            first, last = float(seen.min()), float(seen.max())
+            if low <= first and last <= high:
+                continue
+            what = f"filter {curve.name}, {first:g} to {last:g} µm: the refractive index of {name} was measured at "
+            what += f"{low:g} to {high:g} µm ({source})"
+            if first < low / EXTRAPOLATED or last > high * EXTRAPOLATED:
+                raise fail(
+                    what, advice="give a filter within them, or another material (walop-jax docs model)"
+                )
+            sentences.append(f"{what}; its formula is used beyond")
+    return tuple(sentences)
+
+
+def _fringes(instrument: Instrument, curve: FilterCurve, room: float = ROOM) -> tuple[float, float]:
+    """Waves of the fringes of an instrument (patched) in a band: at full strength, and of all layers of a plate.
+
+    Behind one another retarders interfere at the sum of their retardances. Nodes are made for `room` times as many.
+    """
+    seen = curve.wavelength[curve.throughput > 0]
+    at = np.linspace(seen.min(), seen.max(), SAMPLES) if seen.size else curve.wavelength
+    common, bright, faint = list(instrument.train()), 0.0, 0.0
+    for arm in instrument.arms:
+        each = [found for element in (*common, *arm.train()) if (found := element.retardances(at))]
+        whole = sum(waves_over(at, together) for together, _ in each)
+        layers = max(
+            (waves_over(at, sums) - waves_over(at, together) for together, sums in each), default=0.0
+        )
+        bright, faint = max(bright, whole), max(faint, whole + layers)
+    return rounded_up(room * bright, WAVES), rounded_up(room * faint, FAINT)
 
 
 def _plan(
@@ -104,7 +165,8 @@ def _plan(
     exposures: ExposureArrays,
     band_of: Callable[[Int[np.ndarray, " n"]], Int[np.ndarray, "e s"]],
 ) -> Plan:
-    asked, moving = needs(instrument), instrument.patched().moving()
+    asked, patched = needs(instrument), instrument.patched()
+    moving = patched.moving()
     names = sorted(asked.conditions)
     values = {"temperature": settings.temperature, "hour_angle": settings.hour_angle, "hours": hours}
     assert set(values) == set(CONDITIONS)
@@ -121,8 +183,14 @@ def _plan(
 
     groups = sorted({(name, moment) for _, name, moment, _ in bands})
     curves = {name: filters[name] for name, _ in groups}
+    extrapolations(patched, curves.values())
     rules = {
-        name: _rule(tuple(c.wavelength.tolist()), tuple(c.throughput.tolist()), asked.path_difference)
+        name: _rule(
+            tuple(c.wavelength.tolist()),
+            tuple(c.throughput.tolist()),
+            asked.path_difference,
+            *_fringes(patched, c),
+        )
         for name, c in curves.items()
     }
     # Equivalent widths: 0 for a monochromatic band.

@@ -3,8 +3,12 @@
 The band integral ∫ THROUGHPUT f dλ over the tabulated curve is a sum with positive weights (trapezium rule
 on the table, refined to 0.5 nm by linear interpolation where it is coarser). The Gauss rule of that
 discrete measure integrates polynomials of degree 2n − 1 exactly, so n nodes follow an oscillation of the
-plates as well as any n nodes can. n is the smallest that integrates the fringes of the plates (35 waves
-thick, so periods near 17 nm, half of that at second order, in all phases) to `tolerance`.
+plates as well as any n nodes can. n is the smallest that integrates the fringes of plates of 35 waves
+(periods near 17 nm, half of that at second order, in all phases) to `tolerance`, and those of the plates that
+an instrument has, where these are thicker.
+
+Fringes of full strength that turn faster than those of 35 waves are told from the tabulated curve by what it
+does between its rows: their measure is that of straight lines, by Gauss–Legendre rules on pieces of it.
 
 Source      `SOURCE`; the discrete measure by the Lanczos process.
 """
@@ -20,26 +24,56 @@ from jaxtyping import Float
 SOURCE = "Golub & Welsch 1969, Math. Comp. 23, 221; Gautschi 2004, Orthogonal Polynomials, 2.2.3"
 FINEST = 0.0005  # µm
 WAVES = 36.0  # of one plate at 0.62 µm: (n_e − n_o) d / λ
-MAXIMUM_NODES = 200
+FAINT = (
+    80.0  # waves of all layers of a plate together, a thousand times fainter, that a rule for `WAVES` follows
+)
+FAINTER = 1e4  # tolerance of those, in units of that of full strength
+STEP = 1.05  # between numbers of waves that rules are made for, so that plates of nearly one thickness share a rule
+PER_WAVE = 8.0  # pieces of a straight line for each turn of the fastest fringe, at least
+MAXIMUM_NODES = 600
 
 Vector = Float[np.ndarray, " n"]
 Rule = tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]
 
 
-def tabulated_measure(wavelength: Vector, throughput: Vector) -> Rule:
-    """Nodes and weights of the trapezium rule over a tabulated curve, refined to 0.5 nm; weights sum to 1."""
+def tabulated_measure(wavelength: Vector, throughput: Vector, waves: float = WAVES) -> Rule:
+    """Nodes and weights of a measure over a tabulated curve, on pieces of 0.5 nm; weights sum to 1.
+
+    Up to `WAVES` the trapezium rule, beyond them straight lines between the rows.
+    """
     if len(wavelength) == 1:
         return wavelength, np.ones(1)
+    turns = 0.62 * waves * np.abs(np.diff(1.0 / wavelength)) if waves > WAVES else np.zeros(1)
+    counts = np.ceil(np.maximum(np.diff(wavelength) / FINEST, PER_WAVE * turns) - 1e-6)
     pieces = [
-        np.linspace(a, b, max(1, int(np.ceil((b - a) / FINEST - 1e-6))), endpoint=False)
-        for a, b in itertools.pairwise(wavelength)
+        np.linspace(a, b, max(1, int(count)), endpoint=False)
+        for (a, b), count in zip(itertools.pairwise(wavelength), counts, strict=True)
     ]
     fine = np.concatenate([*pieces, wavelength[-1:]])
     gap = np.diff(fine)
-    weight = np.interp(fine, wavelength, throughput)
-    weight *= 0.5 * (np.append(gap, 0.0) + np.append(0.0, gap))
+    if waves > WAVES:
+        place, share = np.polynomial.legendre.leggauss(3)
+        fine = (fine[:-1, None] + gap[:, None] * 0.5 * (1.0 + place)).ravel()
+        weight = np.interp(fine, wavelength, throughput) * np.outer(gap, share).ravel()
+    else:
+        weight = np.interp(fine, wavelength, throughput)
+        weight *= 0.5 * (np.append(gap, 0.0) + np.append(0.0, gap))
     inside = weight > 0
     return fine[inside], weight[inside] / weight[inside].sum()
+
+
+def waves_over(wavelength: Vector, retardance: Vector) -> float:
+    """Waves at 0.62 µm of a fixed birefringence, which turns as 1/λ, that turn as often over a band as a retardance.
+
+    The wavelengths (µm) span the band; the retardance is in waves.
+    """
+    turns = 0.62 * abs(1.0 / wavelength[0] - 1.0 / wavelength[-1])
+    return float(np.abs(np.diff(retardance)).sum() / turns) if turns > 0 else 0.0
+
+
+def rounded_up(waves: float, known: float) -> float:
+    """The next number of waves that rules are made for, above `known`, which the smallest rule follows."""
+    return known if waves <= known else known * STEP ** float(np.ceil(np.log(waves / known) / np.log(STEP)))
 
 
 def _recurrence(node: Vector, weight: Vector) -> Iterator[tuple[float, float]]:
@@ -85,23 +119,29 @@ def _fringe_error(
 
 
 def band_rule(
-    wavelength: Vector, throughput: Vector, tolerance: float = 1e-7, path_difference: float = 0.0
+    wavelength: Vector,
+    throughput: Vector,
+    tolerance: float = 1e-7,
+    path_difference: float = 0.0,
+    waves: float = WAVES,
+    faint: float = FAINT,
 ) -> Rule:
     """Fewest wavelength nodes (µm) and weights (sum 1) that integrate plate fringes to `tolerance`.
 
-    Fringes at twice the plates' frequency carry a hundred times less light and are held to a hundred times
-    the tolerance; so are those of a `path_difference` (µm), if there is an air gap.
+    `waves` are those of the fringes of full strength (`waves_over`). Fringes at twice the frequency of usual plates
+    carry a hundred times less light and are held to a hundred times the tolerance; so are those of a `path_difference`
+    (µm), if there is an air gap. Those of all layers of thicker plates, `faint`, carry a thousand times less.
     """
     fringes = path_difference / 0.62
     weak = max(2 * WAVES, fringes)
-    fine, fine_weight = tabulated_measure(wavelength, throughput)
+    followed = [(WAVES, tolerance), (weak, 100 * tolerance)]
+    followed += [(waves, tolerance)] if waves > WAVES else []
+    followed += [(faint, FAINTER * tolerance)] if faint > FAINT else []
+    fine, fine_weight = tabulated_measure(wavelength, throughput, waves)
     # No rule follows a fringe with fewer than two nodes a cycle: there is no need to try those.
-    cycles = 0.62 * fringes * (1.0 / fine[0] - 1.0 / fine[-1])
+    cycles = 0.62 * max(fringes, waves if waves > WAVES else 0.0) * (1.0 / fine[0] - 1.0 / fine[-1])
     counts = range(max(1, int(2.0 * cycles)), min(MAXIMUM_NODES, len(fine)))
     for node, weight in gauss_rules(fine, fine_weight, counts) if counts else ():
-        if (
-            _fringe_error(node, weight, fine, fine_weight, WAVES) < tolerance
-            and _fringe_error(node, weight, fine, fine_weight, weak) < 100 * tolerance
-        ):
+        if all(_fringe_error(node, weight, fine, fine_weight, n) < limit for n, limit in followed):
             return node, weight
     return fine, fine_weight

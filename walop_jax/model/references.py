@@ -6,19 +6,16 @@ import dataclasses
 import functools
 import re
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib.resources import files
 
+from walop_jax.data.settings import DEFAULT_FILTER
 from walop_jax.model import legendre, quadrature
 from walop_jax.model.elements import WavePlate, Wedge
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import CRYSTALS, GLASSES
 from walop_jax.model.specification import Model
 
-PAPER_II = (
-    "Maharana et al. 2022, WALOP-South: A Four-Camera One-Shot Imaging Polarimeter for PASIPHAE Survey. "
-    "Paper II - Polarimetric Modelling and Calibration"
-)
 _OWN = "physics of this package; no outside source"
 
 
@@ -43,12 +40,17 @@ def _optics(instrument: Instrument) -> Iterator[Reference]:
             yield Reference(layer.material, CRYSTALS[layer.material].source)
 
 
-def references(model: Model) -> tuple[Reference, ...]:
-    """The sources of the physics in a model, each once: the base in the order light meets it, then its effects."""
+def references(model: Model, filters: Iterable[str] = ()) -> tuple[Reference, ...]:
+    """The sources of the physics in a model, each once: the base in the order light meets it, then its effects.
+
+    `filters` are the names of those that are used: built-in curves have a source.
+    """
     instrument = model.template
-    found = [Reference("the instrument and its calibration", PAPER_II), *_optics(instrument)]
+    found = [Reference("the instrument and its calibration", instrument.source)] if instrument.source else []
+    found += _optics(instrument)
     found.append(Reference("band integral", quadrature.SOURCE))
-    found.append(Reference("SDSS-r filter curve", "Doi et al. 2010, AJ 139, 1628, Table 4"))
+    if DEFAULT_FILTER in set(filters):
+        found.append(Reference(f"{DEFAULT_FILTER} filter curve", "Doi et al. 2010, AJ 139, 1628, Table 4"))
     found.append(Reference("throughput over the field", legendre.SOURCE))
     for source in instrument.sources:
         used = any(model.parameters[i].free for i in model.positions(source.name))

@@ -8,7 +8,7 @@ see, of light behind the polariser, by
 F the train ahead of p, B the rows folded back to p: the fold has both. What an element does with a number θ of its own
 is the same with ∂M/∂θ in the place of G, M its Mueller matrix. So one program gives the responses to
 
-    inserted    every generator of `GENERATORS`, at every place between two elements, with φ = 1 and φ = λ/0.62 µm − 1
+    inserted    every generator of `GENERATORS`, at every place between two elements, with φ = 1 and φ = λ/λ₀ − 1
     numbers     axis and thermal change of every wave plate; thickness, axis and cut of each of its layers
     globally    displacement of what the optics behind a mapping to the pupil see; wavelength of the bands
     throughput  that of each camera, relative to itself
@@ -36,7 +36,6 @@ from jaxtyping import Array, Float
 
 from walop_jax.model import fold, light
 from walop_jax.model.compiled import array
-from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument, Scalar
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
@@ -252,7 +251,7 @@ def _banded(
         whole = jnp.zeros((*change.shape[:-2], width, 4))
         return whole.at[..., segment.rows, :].set(change)
 
-    phi = jnp.stack([jnp.ones_like(wavelength), wavelength / REFERENCE_WAVELENGTH - 1.0])
+    phi = jnp.stack([jnp.ones_like(wavelength), wavelength / instrument.units.wavelength - 1.0])
     moments = phi[:, None] * weights
     generators = jnp.asarray(np.stack(list(GENERATORS.values())))
     inserted, numbers = [], []

@@ -16,8 +16,10 @@ from jaxtyping import Float, Int
 
 from walop_jax.data.records import Exposures
 from walop_jax.model.conventions import EXTINCTION
-from walop_jax.model.effects import EFFECTS, effect_by_name, in_order
+from walop_jax.model.effects import EFFECTS, Described, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
+from walop_jax.model.elements import WavePlate
+from walop_jax.model.elements.wave_plate import Layer
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Parameter, check_names, leaves, unknown_name, values_of, with_values
 
@@ -101,10 +103,15 @@ class Model:
     # ------------------------------------------------------------------------------ vectors and the tree
 
     @property
+    def masters(self) -> Int[np.ndarray, " n"]:
+        """Position of the parameter that gives each one its value: its master's where it is tied, its own elsewhere."""
+        place = {p.name: i for i, p in enumerate(self.parameters)}
+        return np.array([place[p.tie or p.name] for p in self.parameters], int)
+
+    @property
     def start(self) -> Vector:
         """Start values of all parameters; a tied one starts where its master does."""
-        values = {p.name: p.start for p in self.parameters}
-        return np.array([values[p.tie] if p.tie else p.start for p in self.parameters])
+        return np.array([p.start for p in self.parameters], float)[self.masters]
 
     @property
     def free(self) -> Int[np.ndarray, " f"]:
@@ -113,19 +120,49 @@ class Model:
 
     def selection(self) -> Float[np.ndarray, "n f"]:
         """Derivative of all parameters with respect to the free ones: ones, ties included."""
-        free = self.free
-        column = {self.parameters[i].name: k for k, i in enumerate(free)}
-        matrix = np.zeros((len(self.parameters), len(free)))
-        for i, p in enumerate(self.parameters):
-            name = p.tie or p.name
-            if name in column:
-                matrix[i, column[name]] = 1.0
-        return matrix
+        return (self.masters[:, None] == self.free).astype(float)
 
-    def full(self, free_values: Float[np.ndarray, " f"]) -> Vector:
-        """All parameters from the values of the free ones."""
-        start = self.start
-        return start + self.selection() @ (np.asarray(free_values) - start[self.free])
+    def full(self, free_values: Float[np.ndarray, " f"], others: Vector | None = None) -> Vector:
+        """All parameters from the values of the free ones: those that do not vary from `others` (default: the start).
+
+        A tied parameter has the value of its master, whatever `others` holds for it.
+        """
+        values = self.start if others is None else np.array(others, float)
+        values[self.free] = free_values
+        return values[self.masters]
+
+    def thicknesses(self) -> dict[int, Layer]:
+        """The free parameters that are thicknesses of crystal layers, by position, each with its layer.
+
+        The layers next to the air behind each plate come first; a thickness that several layers share is there once.
+        """
+        behind: dict[int, Layer] = {}
+        inside: dict[int, Layer] = {}
+        masters, free, marked = self.masters, set(self.free.tolist()), float("nan")
+        for place in self.template.places(WavePlate):
+            layers = self.template.element(place).layers
+            for i, layer in enumerate(layers):
+                new = (*layers[:i], dataclasses.replace(layer, thickness=marked), *layers[i + 1 :])
+                at = np.flatnonzero(np.isnan(values_of(self.template.changed(place, layers=new))))
+                for master in free.intersection(masters[at].tolist()):
+                    (behind if i == len(layers) - 1 else inside).setdefault(master, layer)
+        return behind | {master: layer for master, layer in inside.items() if master not in behind}
+
+    def gaps(self) -> tuple[int, ...]:
+        """Positions of the free thicknesses of air gaps ahead of plates, which effects alone have."""
+        instrument = self.template.patched()
+        if not any(instrument.element(place).air_gaps for place in instrument.places(WavePlate)):
+            return ()
+
+        def moves_one(position: int) -> bool:
+            marked = self.start
+            marked[position] = np.nan
+            there = self.instrument(marked[self.masters]).patched()
+            plates = (there.element(place) for place in there.places(WavePlate))
+            return any(bool(np.isnan(gap.gap)) for plate in plates for gap in plate.air_gaps)
+
+        of_effects = np.concatenate([self.positions(name) for name in self.effect_names])
+        return tuple(i for i in self.free.tolist() if i in of_effects and moves_one(i))
 
     def named(self, values: Float[Any, " n"]) -> dict[str, Any]:
         """A full vector of values by the names of the parameters."""
@@ -177,6 +214,7 @@ def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
         sources=instrument.standard.names,
         cameras=instrument.cameras.names,
         extinction=float(polariser.extinction) if (polariser := instrument.polariser) else EXTINCTION,
+        units=instrument.units,
     )
 
 
@@ -185,7 +223,7 @@ def with_effects(model: Model, effects: Sequence[str | type[Effect] | Effect], c
 
     A name or a class adds the effect at its neutral value, at the shape of its first probe; an instance starts where it
     stands. Priors are centred on neutral, with the widths of the declarations. Raises ValueError for a name
-    that does not exist and for an effect that is there already.
+    that does not exist, for an effect that is there already, and for two that state one number.
 
     >>> context = walop.ObservingPlan(grid=3).context()
     >>> walop.with_effects(walop.base_model(calset), ["hwp1_axis"], context).effect_names
@@ -204,6 +242,12 @@ def with_effects(model: Model, effects: Sequence[str | type[Effect] | Effect], c
         names = [f"{effect.name}.{leaf.name}" for leaf in leaves(effect)]
         values = zip(np.asarray(values_of(effect)), np.asarray(values_of(neutral)), strict=True)
         starts |= dict(zip(names, values, strict=True))
+    told = {text for effect in active if isinstance(effect, Described) for text in effect.sentences}
+    for effect in active:
+        for text in told.intersection(effect.stated):
+            raise ValueError(
+                f"effect {effect.name!r} is the number that {text!r} adds to: leave one of them out"
+            )
     instrument = dataclasses.replace(model.template, effects=in_order(active))
     jax.eval_shape(lambda i: i.patched(), instrument)  # whatever does not fit the instrument is an error here
     known = {p.name: p for p in model.parameters}

@@ -240,9 +240,7 @@ class Survey(Displayed):
         there = [k for k, name in enumerate(names) if name in model.names and self.laws[k] is not None]
         select = np.zeros((len(model.names), len(there)))
         select[[model.index(names[k]) for k in there], np.arange(len(there))] = 1.0
-        for i, p in enumerate(model.parameters):
-            if p.tie is not None:
-                select[i] = select[model.index(p.tie)]
+        select = select[model.masters]
         inside = select.any(axis=1)
         return dataclasses.replace(
             full,

@@ -49,7 +49,7 @@ class Target:
             np.ix_(self.free, self.free)
         ]
         self.noise_scale = result.noise_scale
-        self._base, self._select = np.asarray(result.values), result.model.selection()
+        self._fitted = np.asarray(result.values)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -63,7 +63,7 @@ class Target:
 
     @property
     def measured(self) -> int:
-        """Independent data: three per used row of four intensities, four where the flux is known."""
+        """Independent data of all used rows: an intensity for each camera, less its part of the unknown fluxes."""
         return round(float(self.likelihood.used.sum(axis=0) @ self.likelihood.data_per_row))
 
     @property
@@ -79,7 +79,7 @@ class Target:
 
     def values(self, x: Vector) -> Float[np.ndarray, " n"]:
         """All parameters, frozen and tied ones included."""
-        return self._base + self._select @ (x - self.centre)
+        return self.model.full(x, self._fitted)
 
     def residuals(self, x: Vector, chunk: engine.PointData) -> Float[np.ndarray, " d"]:
         """Normalised residuals of one chunk of the data, errors times `noise_scale`."""

@@ -385,6 +385,7 @@ class ObservingPlan:
             moon_ids=tuple(int(i) for i in exposures.exposure[moon]),
             sources=self.star_names,
             cameras=self.design.cameras.names,
+            units=self.design.units,
         )
 
 

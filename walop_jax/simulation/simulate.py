@@ -70,11 +70,10 @@ def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
     for i, p in enumerate(model.parameters):
         if p.prior is not None:
             values[i] = rng.normal(*p.prior)
-    for i, p in enumerate(model.parameters):
-        if p.tie is not None:
-            values[i] = values[model.index(p.tie)]
     values[series_indices(model.template)] = _throughput(model.template, rng).ravel()
-    return jax.tree.map(_possible, model.instrument(values), is_leaf=lambda node: isinstance(node, Analyser))
+    return jax.tree.map(
+        _possible, model.instrument(values[model.masters]), is_leaf=lambda node: isinstance(node, Analyser)
+    )
 
 
 def _possible(node: Any) -> Any:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from walop_jax.model.conventions import CAMERAS, EXTINCTION
+from walop_jax.model.conventions import CAMERAS, EXTINCTION, OF_WALOP, Units
 from walop_jax.model.effects.change import Change
 from walop_jax.model.instrument import Instrument, NoSuchPlaceError
 from walop_jax.model.parameters import Component, field_declarations, unknown_name
@@ -32,7 +32,7 @@ class Context(NamedTuple):
 
     `moon` holds the positions of the Moon exposures and `moon_ids` their EXPOSURE numbers; `sources` the
     names of the standards, `exposures` the number of exposures, `cameras` the names of the cameras; `extinction` is
-    that of the polariser without the effect.
+    that of the polariser without the effect, `units` the scales of field and wavelength.
     """
 
     exposures: int = 0
@@ -41,6 +41,7 @@ class Context(NamedTuple):
     sources: tuple[str, ...] = ()
     cameras: tuple[str, ...] = CAMERAS
     extinction: float = EXTINCTION
+    units: Units = OF_WALOP
 
 
 class Effect(Component):
@@ -144,6 +145,11 @@ class Effect(Component):
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
         """For each amplitude the changes whose sum, with their coefficients, it is to first order; none: not known."""
+        return ()
+
+    @property
+    def stated(self) -> tuple[str, ...]:
+        """Changes of numbers that a parameter of it is itself: beside such a change it would be another number."""
         return ()
 
     def at_neutral(self, context: Context) -> Self:

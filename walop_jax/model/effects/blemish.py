@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model.cameras import Transmission
+from walop_jax.model.conventions import FIELD_SCALE
 from walop_jax.model.effects.base import Context, Effect, Scalar, numbered_camera
 from walop_jax.model.effects.change import Change
 from walop_jax.model.instrument import Instrument
@@ -26,7 +27,7 @@ from walop_jax.model.parameters import param
 
 SOURCE = "dust near a focal plane, or a damaged coating: expected size"
 
-GRID = (-0.25, -0.15, -0.05, 0.05, 0.15, 0.25)  # degrees
+GRID, SIZE = (-0.25, -0.15, -0.05, 0.05, 0.15, 0.25), 0.06  # degrees, in the field of WALOP
 
 
 def _distance(spot: Any, x: Any, y: Any) -> Any:
@@ -91,8 +92,14 @@ class Blemish(Effect):
     @classmethod
     def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
         """Spots on a grid over the field, in any of the cameras."""
-        places = itertools.product(range(len(context.cameras)), GRID, GRID)
-        return tuple((cls.of(context, camera=camera, x=x, y=y, size=0.06),) for camera, x, y in places)
+        places, scale = (
+            itertools.product(range(len(context.cameras)), GRID, GRID),
+            context.units.field / FIELD_SCALE,
+        )
+        return tuple(
+            (cls.of(context, camera=camera, x=scale * x, y=scale * y, size=scale * SIZE),)
+            for camera, x, y in places
+        )
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
         """A gain of the camera that goes as the spot."""

@@ -16,7 +16,7 @@ Parameters are the keys that hold a table:
     said        the same, to first order, as the grammar of a diagnosis writes it, where that differs
     each        "camera": one value for each of `every camera`; "moon exposure": for each exposure of the Moon
     polar       name of the parameter that is its angle: `does` has two changes, for cos and sin of `turns` × the angle
-    absolute    true: the number itself instead of what is added to it; `neutral` is its value without the effect
+    absolute    true: the extinction itself instead of what is added to it; `neutral` is its value without the effect
     unit, about, width, scale, loose    as for `parameters.param`
 
 Keys of an entry: about, equation, note, source, revealed_by, separated_by; one_sided (parameters that physics keeps
@@ -228,6 +228,11 @@ class Entry(Effect):
             for text in each
         )
 
+    @property
+    def stated(self) -> tuple[str, ...]:
+        """The changes of the numbers that its parameters are themselves."""
+        return tuple(text for member in self.members if member.absolute for text in member.does)
+
     def _values(self, member: Member, instrument: Instrument) -> list[Scalar]:
         value = getattr(self, member.name)
         if member.absolute:
@@ -421,6 +426,10 @@ def _member(
     if each and each not in EACH:
         raise unknown_name("each", each, EACH)
     turns, absolute = float(own.get("turns", 1.0)), bool(own.get("absolute", False))
+    if absolute and any(Change.parsed(text).kind != "extinction" for text in does):
+        raise ValueError(
+            f"{name}: absolute is for the extinction of the polariser alone; say what is added instead"
+        )
     return Member(name, does, sizes, texts("said", does), each, polar, turns, absolute)
 
 

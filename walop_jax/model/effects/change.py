@@ -25,6 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.data.records import POLARISER
+from walop_jax.model.conventions import OF_WALOP, Units
 from walop_jax.model.effects.factors import Factor, factor
 from walop_jax.model.instrument import Instrument, Scalar
 from walop_jax.model.parameters import check_names
@@ -88,13 +89,17 @@ KINDS: dict[str, Kind] = {}
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """A kind at a place with its factors; `origin` is where light comes from: another camera, or `OPPOSITE`."""
+    """A kind at a place with its factors; `origin` is where light comes from: another camera, or `OPPOSITE`.
+
+    Factors are counted in the `units` of an instrument: those of WALOP until it is `counted_in` those of another.
+    """
 
     kind: str
     where: str
     place: str
     factors: tuple[Any, ...] = ()  # texts; a column may be taken with a function of the exposures instead
     origin: str = ""
+    units: Units = OF_WALOP
 
     @classmethod
     def parsed(cls, text: str) -> Self:
@@ -122,6 +127,10 @@ class Change:
         """Its factors."""
         return tuple(map(factor, self.factors))
 
+    def counted_in(self, units: Units) -> Change:
+        """The change of an instrument with its scales."""
+        return dataclasses.replace(self, units=units)
+
     def times(self, *factors: str) -> Change:
         """The change with further factors."""
         return dataclasses.replace(self, factors=(*self.factors, *factors))
@@ -147,7 +156,7 @@ class Change:
         """Product of its factors (`Factor.value`), 1 without any."""
         product: Any = 1.0
         for each in self.grows_with:
-            product = product * each.value(at)
+            product = product * each.value(at, self.units)
         return product
 
     def in_train(self, ray: Ray, angle: Any) -> Any:
@@ -172,7 +181,9 @@ class Change:
         """Kind, place and dependence, to be read by people."""
         origin = "the opposite field point" if self.origin == OPPOSITE else self.origin
         of = f" of {origin}" if origin else ""
-        return ", ".join((f"{self.kind}{of} {self.where} {self.place}", *(f.words for f in self.grows_with)))
+        return ", ".join(
+            (f"{self.kind}{of} {self.where} {self.place}", *(f.in_words(self.units) for f in self.grows_with))
+        )
 
     @property
     def tested_by(self) -> str:
@@ -220,8 +231,8 @@ def patched(instrument: Instrument, terms: Iterable[Term]) -> Instrument:
     together: dict[tuple[Any, Hashable], list[Term]] = {}
     for change, size in terms:
         change.check_factors(instrument)
-        kind = KINDS[change.kind]
-        together.setdefault((kind.patch, kind.together(change)), []).append((change, size))
+        kind, own = KINDS[change.kind], change.counted_in(instrument.units)
+        together.setdefault((kind.patch, kind.together(own)), []).append((own, size))
     for (patch, _), some in together.items():
         instrument = patch(instrument, some)
     return instrument

@@ -3,7 +3,7 @@
 Not in the catalogue: `diagnose` tries all changes that an instrument and its exposures allow
 (`diagnosis/candidates.py`) beside the names, and adds one where it explains the data better than any name.
 
-Equation    that of each change: `optics`, `numbers`, `cameras`, `sources`
+Equation    that of each change: `optics`, `numbers`, `cameras`
 Source      Lu & Chipman 1996, JOSA A 13, 1106: every Mueller matrix near the identity is a product of these
 Neutral     all zero
 Revealed by data that no name explains as well

@@ -9,21 +9,22 @@ Neutral     contrast = 0, whatever the gap
 Revealed by zero offsets that oscillate with wavelength (period λ²/2 gap) and in rings over the field; a
             broad band averages gaps beyond some tens of µm away.
 
-Near a gap the fringe is a cosine and a sine: the probes come in pairs λ₀/8 apart, a quarter of a fringe, on
-a grid that no fringe of the r band escapes. The wavelength nodes follow gaps up to `LARGEST_GAP`.
+Near a gap the fringe is a cosine and a sine: the probes come in pairs λ₀/8 apart, a quarter of a fringe at the
+wavelength that an instrument counts from, on a grid that no fringe of its bands escapes. The wavelength nodes follow
+gaps up to `LARGEST_GAP`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.model.conventions import REFERENCE_WAVELENGTH
-from walop_jax.model.effects.base import Effect, Scalar
+from walop_jax.model.conventions import REFERENCE_WAVELENGTH, Units
+from walop_jax.model.effects.base import Context, Effect, Scalar
 from walop_jax.model.effects.change import Change
 from walop_jax.model.effects.optics import LARGEST_GAP, with_air_gap
 from walop_jax.model.elements import WavePlate
@@ -32,8 +33,13 @@ from walop_jax.model.parameters import param
 
 SOURCE = "Clarke 2005, A&A 434, 377; Semel 2003, A&A 401, 1"
 
-GAPS = tuple(np.arange(1.0, LARGEST_GAP, 0.75).tolist())
-QUARTER = REFERENCE_WAVELENGTH / 8.0
+STEP = 0.75  # between gaps, at the reference wavelength of WALOP
+
+
+def probed_gaps(units: Units) -> tuple[tuple[float, float], ...]:
+    """Pairs of gaps (µm) from which to look for fringes: a quarter of a fringe apart at the wavelength of the units."""
+    step, quarter = STEP * (units.wavelength / REFERENCE_WAVELENGTH), units.wavelength / 8.0
+    return tuple((gap, gap + quarter) for gap in np.arange(1.0, LARGEST_GAP, step).tolist())
 
 
 class Etalon(Effect):
@@ -54,9 +60,6 @@ class Etalon(Effect):
     name: ClassVar[str] = "etalon"
     reference: ClassVar[str] = SOURCE
     shape: ClassVar[tuple[str, ...]] = ("gap",)
-    starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = tuple(
-        ({"gap": gap}, {"gap": gap + QUARTER}) for gap in GAPS
-    )
     revealed_by: ClassVar[str] = "unpolarised light or polariser exposures in narrow bands"
     separated_by: ClassVar[str] = (
         "narrow bands of different wavelength, or a change of temperature: throughput and lens polarisation "
@@ -64,15 +67,21 @@ class Etalon(Effect):
     )
 
     @classmethod
+    def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
+        """Pairs of gaps a quarter of a fringe apart."""
+        return tuple(tuple(cls.of(context, gap=gap) for gap in pair) for pair in probed_gaps(context.units))
+
+    @classmethod
     def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
         """Contrast and gap from cosine and sine at the pair's gap."""
         cosine, sine = amplitudes
-        shift = np.arctan2(sine, cosine) * REFERENCE_WAVELENGTH / (4.0 * np.pi)
+        quarter = float(group[1].gap) - float(group[0].gap)
+        shift = np.arctan2(sine, cosine) * quarter / (0.5 * np.pi)
         return dataclasses.replace(group[0], contrast=np.hypot(cosine, sine), gap=float(group[0].gap) + shift)
 
     def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
         """Fringes of every plate, of the gap itself and of one a quarter of a fringe wider."""
-        gaps = (float(self.gap), float(self.gap) + QUARTER)
+        gaps = (float(self.gap), float(self.gap) + instrument.units.wavelength / 8.0)
         return tuple(f"fringes of {p} * gap {gap:g}" for p in instrument.places(WavePlate) for gap in gaps)
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:

@@ -7,7 +7,7 @@ one reader of their texts.
 A value is asked for with something that has x, y (deg), wavelength (µm), hours since the first exposure, hour_angle
 (h), temperature (Celsius), the number of the exposure in its list, `of_kind(name)`, true for exposures of a KIND, and
 `angle(prefix)` (rad) of the polariser or another moving element, NaN where that is out of the beam; all are scalars, or
-arrays that broadcast.
+arrays that broadcast. With it come the scales of field and wavelength of the instrument.
 """
 
 from __future__ import annotations
@@ -22,14 +22,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from walop_jax.model import legendre
-from walop_jax.model.conventions import FIELD_SCALE, REFERENCE_WAVELENGTH
+from walop_jax.model.conventions import Units
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
 from walop_jax.model.parameters import unknown_name
 
-LARGEST_SQUARE = 2.0  # of the field radius, in units of FIELD_SCALE: the corners
+LARGEST_SQUARE = 2.0  # of the field radius, in units of the scale of the field: the corners
 FIELD, WAVELENGTH, EXPOSURE, COUNTS, SHAPE = "field", "wavelength", "exposure", "counts", "shape"
 MORE_POINTS = "more field points along that direction; dither: what is of the optics stays where it is"
 ONCE_MORE = "the same exposures once more"
+FIELD_UNIT, WAVE = "{field}", "{wavelength}"  # scales of an instrument in words
+AT = f"(amplitude at {FIELD_UNIT}°)"
 NUMBER = r"(-?\d*\.?\d+|-?\d+\.)"
 
 
@@ -41,19 +43,23 @@ class Factor:
     depends_on: str
     words: str
     test: str
-    value: Callable[[Any], Any]
+    value: Callable[[Any, Units], Any]
     form: str = ""
     given: tuple[str, ...] = ()
+
+    def in_words(self, units: Units) -> str:
+        """Its words, with the scales of an instrument."""
+        return self.words.replace(FIELD_UNIT, f"{units.field:g}").replace(WAVE, f"{units.wavelength:g}")
 
 
 # ------------------------------------------------------------------------------- with numbers or names in them
 
 
 def _ring(degree: str) -> Factor:
-    """Legendre polynomial of some degree in (X² + Y²)/(0.3°)² − 1."""
+    """Legendre polynomial of some degree in (X² + Y²)/h² − 1, h the scale of the field."""
 
-    def value(at: Any) -> Any:
-        square = (at.x**2 + at.y**2) / FIELD_SCALE**2
+    def value(at: Any, units: Units) -> Any:
+        square = (at.x**2 + at.y**2) / units.field**2
         return legendre.polynomial(int(degree), 2.0 * square / LARGEST_SQUARE - 1.0)
 
     words = f"in rings over the field (Legendre polynomial {degree} of the radius squared)"
@@ -63,7 +69,7 @@ def _ring(degree: str) -> Factor:
 def _harmonic(wave: str, order: str, prefix: str) -> Factor:
     """Cosine or sine of a multiple of the angle of a moving element, by the prefix of its columns."""
 
-    def value(at: Any) -> Any:
+    def value(at: Any, _: Units) -> Any:
         angle = at.angle(prefix)
         return getattr(np if isinstance(angle, np.ndarray) else jnp, wave)(int(order) * angle)
 
@@ -76,7 +82,7 @@ def _span(start: str, stop: str) -> Factor:
     """1 from one time to another (hours since the first exposure), 0 elsewhere."""
     words = f"from {start} to {stop} h after the first exposure"
 
-    def value(at: Any) -> Any:
+    def value(at: Any, _: Units) -> Any:
         return ((at.hours >= float(start)) & (at.hours < float(stop))) * 1.0
 
     return Factor(f"hours {start} to {stop}", EXPOSURE, words, ONCE_MORE, value, "hours", (start, stop))
@@ -86,7 +92,7 @@ def _exposure(number: str) -> Factor:
     """1 in one exposure of the list, counted from 0; 0 in all others."""
     words = f"in exposure {number} of the list (the first is 0)"
 
-    def value(at: Any) -> Any:
+    def value(at: Any, _: Units) -> Any:
         return (at.number == int(number)) * 1.0
 
     return Factor(f"exposure {number}", EXPOSURE, words, ONCE_MORE, value, "exposure", (number,))
@@ -96,13 +102,15 @@ def _kind(name: str) -> Factor:
     """1 in exposures of a KIND, 0 in all others."""
     test = "the same field points in exposures of another KIND"
     words = f"in exposures of KIND {name}"
-    return Factor(f"kind {name}", EXPOSURE, words, test, lambda at: at.of_kind(name) * 1.0, "kind", (name,))
+    return Factor(
+        f"kind {name}", EXPOSURE, words, test, lambda at, _: at.of_kind(name) * 1.0, "kind", (name,)
+    )
 
 
 def _gap(thickness: str) -> Factor:
     """Thickness (µm) of the air whose fringes a change is: 1, the fringes themselves know it."""
     words = f"of {thickness} µm of air (amplitude at a maximum)"
-    return Factor(f"gap {thickness}", SHAPE, words, "", lambda at: 1.0, "gap", (thickness,))
+    return Factor(f"gap {thickness}", SHAPE, words, "", lambda at, _: 1.0, "gap", (thickness,))
 
 
 FORMS: Mapping[str, tuple[str, Callable[..., Factor]]] = {
@@ -121,40 +129,40 @@ FORMS: Mapping[str, tuple[str, Callable[..., Factor]]] = {
 
 def _plain() -> Mapping[str, Factor]:
     made = (
-        Factor("x", FIELD, "growing with X (amplitude at 0.3°)", MORE_POINTS, lambda at: at.x / FIELD_SCALE),
-        Factor("y", FIELD, "growing with Y (amplitude at 0.3°)", MORE_POINTS, lambda at: at.y / FIELD_SCALE),
+        Factor("x", FIELD, f"growing with X {AT}", MORE_POINTS, lambda at, units: at.x / units.field),
+        Factor("y", FIELD, f"growing with Y {AT}", MORE_POINTS, lambda at, units: at.y / units.field),
         Factor(
-            "r2", FIELD, "growing with the field radius squared (amplitude at 0.3°)", MORE_POINTS,
-            lambda at: (at.x**2 + at.y**2) / FIELD_SCALE**2,
+            "r2", FIELD, f"growing with the field radius squared {AT}", MORE_POINTS,
+            lambda at, units: (at.x**2 + at.y**2) / units.field**2,
         ),
         Factor(
-            "x2-y2", FIELD, "as X² − Y² over the field (amplitude at 0.3°)", MORE_POINTS,
-            lambda at: (at.x**2 - at.y**2) / FIELD_SCALE**2,
+            "x2-y2", FIELD, f"as X² − Y² over the field {AT}", MORE_POINTS,
+            lambda at, units: (at.x**2 - at.y**2) / units.field**2,
         ),
         Factor(
-            "xy", FIELD, "as 2XY over the field (amplitude at 0.3°)", MORE_POINTS,
-            lambda at: 2.0 * at.x * at.y / FIELD_SCALE**2,
+            "xy", FIELD, f"as 2XY over the field {AT}", MORE_POINTS,
+            lambda at, units: 2.0 * at.x * at.y / units.field**2,
         ),
         Factor(
-            "colour", WAVELENGTH, "growing with wavelength (per unit of λ/0.62 µm − 1)",
-            "narrow bands, or another filter", lambda at: at.wavelength / REFERENCE_WAVELENGTH - 1.0,
+            "colour", WAVELENGTH, f"growing with wavelength (per unit of λ/{WAVE} µm − 1)",
+            "narrow bands, or another filter", lambda at, units: at.wavelength / units.wavelength - 1.0,
         ),
         Factor(
             "hours", EXPOSURE, "growing with time (per hour since the first exposure)",
-            "the same exposures in another order, or once more hours later", lambda at: at.hours,
+            "the same exposures in another order, or once more hours later", lambda at, _: at.hours,
         ),
         Factor(
             "hour angle", EXPOSURE, "growing with the hour angle (per hour)",
-            "the same exposures at other hour angles, in another order", lambda at: at.hour_angle,
+            "the same exposures at other hour angles, in another order", lambda at, _: at.hour_angle,
         ),
         Factor(
             "kelvin", EXPOSURE, "growing with temperature (per kelvin above 10 °C)",
-            "the same exposures at another temperature", lambda at: at.temperature - REFERENCE_TEMPERATURE,
+            "the same exposures at another temperature", lambda at, _: at.temperature - REFERENCE_TEMPERATURE,
         ),
         Factor(
             # The detector multiplies with its own counts.
             "counts", COUNTS, "growing with the counts (at 10⁶ electrons)", "the same exposures at another flux",
-            lambda at: 1.0,
+            lambda at, _: 1.0,
         ),
     )  # fmt: skip
     return {one.text: one for one in made}

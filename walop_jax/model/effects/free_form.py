@@ -8,8 +8,9 @@ Equation    vectors     a_k → a_k + a_k0 · Σ_t v_kst P_t(x, y) e_s, s = q, u
             fine        N_k → N_k + N⁰_k · Σ_t f_kt P_t(x, y), P_t of higher degree than the throughput
             exposures   N_k → N_k + N⁰_k · g_ek
 Symbols     a_k analysis vector of camera k, a_k0 its response to unpolarised light; N_k counts and N⁰_k those that
-            unpolarised light of the same flux would give; P_t products of Legendre polynomials
-Source      the strata of the free-form score test (`diagnose.freeform`), with the same plausible size
+            unpolarised light of the same flux would give; P_t products of Legendre polynomials, in the scale
+            of the field of the instrument
+Source      the strata of the free-form score test (`diagnosis.design`), with the same plausible size
 Neutral     all zero
 Revealed by any data that no model explains
 """
@@ -52,8 +53,8 @@ def _cameras(count: int) -> list[str]:
     return [f"n{k}" for k in range(count)]
 
 
-def _fine(coefficients: Float[Array, "k f"], x: Scalar, y: Scalar) -> Float[Array, " k"]:
-    return coefficients @ legendre.basis(x, y, FINE)[len(_SMOOTH_TERMS) :]
+def _fine(coefficients: Float[Array, "k f"], x: Scalar, y: Scalar, scale: float) -> Float[Array, " k"]:
+    return coefficients @ legendre.basis(x, y, FINE, scale)[len(_SMOOTH_TERMS) :]
 
 
 class Pattern(Mixing):
@@ -61,15 +62,16 @@ class Pattern(Mixing):
 
     smooth: Float[Array, "k 2 s"]
     fine: Float[Array, "c f"]  # one of the two may be empty
+    scale: float = eqx.field(static=True)  # of the field, degrees
 
     def vectors(self, vectors: Float[Array, "b k 4"], x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
         """Add the patterns, relative to the response to unpolarised light."""
         plain = vectors[:, :, 0]
         if self.smooth.size:
-            change = self.smooth @ legendre.basis(x, y, SMOOTH)
+            change = self.smooth @ legendre.basis(x, y, SMOOTH, self.scale)
             vectors = vectors.at[:, :, 1:3].add(plain[..., None] * change)
         if self.fine.size:
-            vectors = vectors.at[:, :, 0].add(plain * _fine(self.fine, x, y))
+            vectors = vectors.at[:, :, 0].add(plain * _fine(self.fine, x, y, self.scale))
         return vectors
 
 
@@ -79,6 +81,7 @@ class FreeShares(ExposurePart):
     harmonics: Float[Array, "c h 2 g"]
     exposures: Float[Array, "e k"]  # one of the two may be empty
     fine: Float[Array, "d f"]  # structure that the response is told without; may be empty
+    scale: float = eqx.field(static=True)  # of the field, degrees
 
     @property
     def exposures_known(self) -> int | None:
@@ -91,11 +94,11 @@ class FreeShares(ExposurePart):
         if self.harmonics.size:
             angle = exposures.clp_angle[:, None] * jnp.asarray(HARMONICS)
             waves = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-            size = self.harmonics @ legendre.basis(x, y, GRADIENT)
+            size = self.harmonics @ legendre.basis(x, y, GRADIENT, self.scale)
             found += jnp.where(exposures.clp_in[:, None], jnp.einsum("ehw,khw->ek", waves, size), 0.0)
         if self.exposures.size:
             found += self.exposures
-        return found / (1.0 + _fine(self.fine, x, y)) if self.fine.size else found
+        return found / (1.0 + _fine(self.fine, x, y, self.scale)) if self.fine.size else found
 
 
 class FreeForm(Effect):
@@ -162,10 +165,11 @@ class FreeForm(Effect):
 
     def patch(self, instrument: Instrument) -> Instrument:
         """Add the blocks: smooth and fine patterns to the cameras, harmonics and single exposures to the exposures."""
+        scale = instrument.units.field
         if self.vectors.size or self.fine.size:
-            instrument = instrument.with_part("mixing", Pattern(self.vectors, self.fine))
+            instrument = instrument.with_part("mixing", Pattern(self.vectors, self.fine, scale))
         if self.harmonics.size or self.exposures.size:
             instrument = instrument.with_part(
-                "exposures", FreeShares(self.harmonics, self.exposures, self.fine)
+                "exposures", FreeShares(self.harmonics, self.exposures, self.fine, scale)
             )
         return instrument

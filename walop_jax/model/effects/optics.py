@@ -2,7 +2,7 @@
 
 Equation    M → M_Δ M_R M_D M at one place of the train, with
             M_R = exp Σ r_i G_i (a retarder), M_D the diattenuator of vector d, M_Δ = diag(1, k, k, k)
-Symbols     r, d sums of amplitude × factor along q, u, v; radial: x² − y² along q and 2xy along u (in units of 0.3°);
+Symbols     r, d sums of amplitude × factor along q, u, v; radial: x² − y² along q, 2xy along u (in units of the field);
             diagonal: −2xy and x² − y²; k = 1 − the share that is lost; a turn by α is r_v = −2α
 Source      Lu & Chipman 1996, JOSA A 13, 1106: every Mueller matrix near the identity is such a product
 Limits      exact for one kind at a place; which of several acts first is a matter of second order
@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from walop_jax.model import mueller
+from walop_jax.model.conventions import Units
 from walop_jax.model.effects.change import KINDS, AtPoint, Change, Grows, Kind, Scalar, Term, in_exposures
 from walop_jax.model.effects.factors import EXPOSURE, FIELD, PLAIN, SHAPE, WAVELENGTH
 from walop_jax.model.elements import AddedPolarisation, AirGap
@@ -36,12 +37,12 @@ AXES = ("q", "u", "v", "radial", "diagonal")
 DISPLACEMENTS = ("displacement x", "displacement y")
 
 
-def _along(axis: str, size: Any, x: Any, y: Any) -> tuple[Any, ...]:
+def _along(axis: str, size: Any, x: Any, y: Any, units: Units) -> tuple[Any, ...]:
     """The components along q, u and v of something with one of the `AXES`."""
     if axis in ("q", "u", "v"):
         return tuple(size if axis == one else 0.0 for one in "quv")
     point = AtPoint(x, y)
-    straight, across = PLAIN["x2-y2"].value(point), PLAIN["xy"].value(point)
+    straight, across = (PLAIN[name].value(point, units) for name in ("x2-y2", "xy"))
     if axis == "diagonal":
         straight, across = -across, straight
     return size * straight, size * across, 0.0
@@ -57,7 +58,7 @@ def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
         if what == "turn":  # a circular retarder
             what, own = "retardance", (0.0, 0.0, -2.0 * jnp.deg2rad(size))
         else:
-            own = (size,) if what == "depolarisation" else _along(axis, size, x, y)
+            own = (size,) if what == "depolarisation" else _along(axis, size, x, y, change.units)
         sums[what] = tuple(map(operator.add, sums.get(what, (0.0,) * len(own)), own))
     acting = (("diattenuation", mueller.diattenuator), ("retardance", mueller.general_retarder))
     matrix = mueller.product(make(*map(jnp.asarray, sums[what])) for what, make in acting if what in sums)

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model.parameters import Component, Parameter
@@ -78,6 +79,19 @@ class Element(Component):
     def path_difference(self) -> float:
         """See the class."""
         return 0.0
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Names of the materials whose refractive indices it asks for."""
+        return ()
+
+    def retardances(self, wavelength: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], ...]:
+        """Retardance along the axis at wavelengths (µm), in waves, and the sum of those of all layers; none: no waves.
+
+        What crossed layers leave of each other interferes at full strength. The layers by themselves do where rays
+        are oblique, hundreds of times more weakly.
+        """
+        return ()
 
 
 def _at_axis(element: Any, axis: Float[Array, ""], ray: Ray) -> Mueller | None:

@@ -125,6 +125,11 @@ class Wedge(Element):
         """The angle has the name of the wedge."""
         return ("",) if field == "angle" else (field,)
 
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """The glass."""
+        return (self.material,)
+
     def ray(self, ray: Ray) -> Ray:
         """The ray behind the wedge."""
         behind = behind_wedge(self.direction(ray), self.turn, self.index(ray))

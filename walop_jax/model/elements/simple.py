@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model import mueller
@@ -39,6 +40,13 @@ class Retarder(Element):
         """The retarder."""
         delta = self.delta if self.wavelength is None else self.delta * self.wavelength / ray.wavelength
         return mueller.retarder(delta, jnp.deg2rad(self.axis))
+
+    def retardances(self, wavelength: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], ...]:
+        """One retardance."""
+        if self.wavelength is None:
+            return ()
+        waves = float(self.delta) / (2.0 * np.pi) * float(self.wavelength) / wavelength
+        return waves, waves
 
 
 class Rotator(Element):
@@ -217,16 +225,19 @@ class Collimator(Element):
 class RadialRetarder(Element):
     """Retardance with a radial fast axis, growing with the square of the field radius.
 
-    Equation    Δ = 2π (delta + slope u + bend u²) (r/0.3°)², fast axis radial, u = λ − 0.62 µm (coatings)
-    Symbols     r, φ polar coordinates of the field point [deg]; delta in waves at 0.3°
+    Equation    Δ = 2π (delta + slope u + bend u²) (r/h)², fast axis radial, u = λ − 0.62 µm (coatings)
+    Symbols     r, φ polar coordinates of the field point [deg]; delta in waves at h, 0.3° unless `scale` says
     Source      stress of mounted lenses, ∝ r²: Selbing 2010, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146.
     Limits      written with (1 − cos Δ)/Δ² and sin Δ/Δ, both smooth at the centre of the field, Δ(cos 2φ, sin 2φ) being
                 k (x² − y², 2xy)
     """
 
-    delta: Scalar = number(unit="wave", about="retardance at 0.3° (and 0.62 µm)")
+    delta: Scalar = number(
+        unit="wave", about="retardance at the radius `scale`, 0.3° unless given (and 0.62 µm)"
+    )
     slope: Scalar | None = number(unit="wave/um", about="change of it with wavelength", default=None)
     bend: Scalar | None = number(unit="wave/um2", about="the same, per square of λ − 0.62 µm", default=None)
+    scale: float = eqx.field(static=True, default=FIELD_SCALE)  # h, degrees
 
     kind: ClassVar[str] = "radial_retarder"
     reference: ClassVar[str] = "Selbing 2010, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146"
@@ -238,7 +249,7 @@ class RadialRetarder(Element):
             delta = delta + self.slope * (ray.wavelength - REFERENCE_WAVELENGTH)
         if self.bend is not None:
             delta = delta + self.bend * (ray.wavelength - REFERENCE_WAVELENGTH) ** 2
-        k = 2.0 * jnp.pi * delta / FIELD_SCALE**2
+        k = 2.0 * jnp.pi * delta / self.scale**2
         return mueller.general_retarder(k * (x**2 - y**2), k * 2.0 * x * y)
 
 

@@ -128,6 +128,13 @@ class SpectralElement(WithCurves):
         """The element at every wavelength."""
         return mueller.product(self._parts(ray))
 
+    def retardances(self, wavelength: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], ...]:
+        """One retardance, between its knots as straight lines."""
+        if self.delta is None:
+            return ()
+        waves = np.interp(wavelength, self.delta_at, np.asarray(self.delta)) / (2.0 * np.pi)
+        return waves, waves
+
     def _parts(self, ray: Ray) -> Iterator[Mueller]:
         axis = jnp.deg2rad(self.axis)
         if self.delta is not None:

@@ -19,6 +19,7 @@ from typing import Any, ClassVar, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -32,6 +33,8 @@ from walop_jax.model.ray import Conditions, Ray, Real
 Scalar = Float[Array, ""]
 Known = dict[tuple[str, int], tuple[Real, Real]]
 """Ordinary and extraordinary indices by crystal and array of wavelengths (its `id`, while the rays live)."""
+CROSSED = 1.5
+"""Degrees off 0° or 90° between axes up to which layers by themselves interfere weakly: sin² of twice that is 0.003."""
 MODELS = {"waves": plates.stack_mueller, "fixed_axis": plates.fixed_axis_mueller}
 
 
@@ -65,6 +68,14 @@ class Layer(Component):
             raise ValueError(
                 f"there is no crystal {self.material!r}; {nearest(self.material, materials.CRYSTALS)}"
             )
+
+    def waves(self, wavelength: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Retardance along the normal, in waves, at wavelengths (µm); an axis out of the surface makes it less."""
+        birefringence = materials.CRYSTALS[self.material].birefringence(wavelength)
+        u = wavelength - REFERENCE_WAVELENGTH
+        changes = enumerate((self.slope, self.bend, self.twist), start=1)
+        factor = 1.0 + sum((float(c) * u**k for k, c in changes if c is not None), np.zeros_like(u))
+        return np.abs(birefringence * factor) * abs(float(self.thickness)) / wavelength
 
     def labels(self, field: str) -> tuple[str, ...]:
         """The thickness has the name of the layer."""
@@ -111,6 +122,22 @@ class WavePlate(Element):
     def path_difference(self) -> float:
         """Of the air gaps: there and back."""
         return 2.0 * max((gap.longest for gap in self.air_gaps), default=0.0)
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """The crystals."""
+        return tuple(layer.material for layer in self.layers)
+
+    def retardances(self, wavelength: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], ...]:
+        """Of the whole, with the sign that an axis along that of the first layer or across it gives; and the sum."""
+        waves = [layer.waves(wavelength) for layer in self.layers]
+        if not waves:
+            return ()
+        turned = np.array([float(layer.axis) - float(self.layers[0].axis) for layer in self.layers])
+        away = np.abs((turned + 45.0) % 90.0 - 45.0)
+        sign = np.where(np.abs((turned + 90.0) % 180.0 - 90.0) < 45.0, 1.0, -1.0)
+        sum_of_all = np.sum(waves, axis=0)
+        return np.abs(sign @ np.array(waves)) if (away < CROSSED).all() else sum_of_all, sum_of_all
 
     def crystals(self, ray: Ray, known: Known | None = None) -> tuple[plates.Plate, ...]:
         """The layers at the wavelengths of a ray; `known` keeps indices of refraction from plate to plate."""
