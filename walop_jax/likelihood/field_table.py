@@ -36,7 +36,7 @@ from jaxtyping import Array, Float, Int
 from walop_jax.likelihood import limits
 from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle
-from walop_jax.model.compiled import compiled
+from walop_jax.model.compiled import array, compiled
 from walop_jax.model.dependence import optical_indices
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import values_of, with_values
@@ -277,4 +277,4 @@ def accurate_nodes(
         TOLERANCE,
         error,
     )
-    return jax.tree.map(jnp.asarray, table), off
+    return jax.tree.map(array, table), off
