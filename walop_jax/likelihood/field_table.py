@@ -242,7 +242,7 @@ _solve = compiled(jax.vmap(rows_and_slopes, in_axes=(None, None, 0, 0)), kept_as
 
 def solved_optics(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Optics:
     """Band rows and their derivatives at field positions (deg): exact."""
-    return in_batches(lambda x, y: _solve(instrument, plan, jnp.asarray(x), jnp.asarray(y)), x, y)
+    return in_batches(lambda x, y: _solve(instrument, plan, array(x), array(y)), x, y)
 
 
 def in_batches(solve: Callable[[Vector, Vector], Any], x: Vector, y: Vector) -> Any:
