@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.calibration import UNCHECKED, Calibration
 from walop_jax.data.settings import BUILTIN_FILTERS, Settings
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import rounded
@@ -54,13 +54,24 @@ def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
 
 def certify(product: Calibration) -> list[Check]:
     """All checks of a product that could be read, in a fixed order; those behind a failed one may be missing."""
-    checks = [*_verdict(product), _covariance(product), _validity(product), _parents(product)]
+    checks = [
+        *_content(product),
+        *_verdict(product),
+        _covariance(product),
+        _validity(product),
+        _parents(product),
+    ]
     try:
         calibration = product.rebuilt()
     except ValueError as error:
         return [*checks, Check("model", False, f"cannot be rebuilt: {error}")]
     checks.append(Check("model", True, f"{len(calibration.model.names)} parameters rebuilt by name"))
     return [*checks, _maps(product, calibration), _physics(calibration), _protection(calibration)]
+
+
+def _content(product: Calibration) -> list[Check]:
+    """What is read is what was written (`read_calibration`), but for products of an earlier rule."""
+    return [Check("content", False, UNCHECKED)] if UNCHECKED in product.verdict.warnings else []
 
 
 def _verdict(product: Calibration) -> list[Check]:
