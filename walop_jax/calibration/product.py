@@ -117,9 +117,9 @@ def content_of(hdus: Iterable[Any]) -> str:
             if _WORDS.fullmatch(card.keyword):
                 value = fits.Card.fromstring(card.image).value  # a header may not hold all digits of a number
                 digest.update(f"{card.keyword} {value!r}\n".encode())
-        columns = [] if hdu.data is None else hdu.data.dtype.names or [""]
-        for column in columns:
-            values = np.asarray(hdu.data[column] if column else hdu.data)
+        data: Any = hdu.data
+        for column in () if data is None else data.dtype.names or ("",):
+            values = np.asarray(data[column] if column else data)
             digest.update(f"{column} {values.shape}\n".encode())
             if (name, column) == ("INPUTS", "PATH"):
                 continue
