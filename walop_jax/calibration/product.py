@@ -115,11 +115,12 @@ def content_of(hdus: Iterable[Any]) -> str:
         digest.update(f"{name}\n".encode())
         for card in hdu.header.cards:
             if _WORDS.fullmatch(card.keyword):
-                value = fits.Card.fromstring(card.image).value  # a header may not hold all digits of a number
-                digest.update(f"{card.keyword} {value!r}\n".encode())
-        data: Any = hdu.data
-        for column in () if data is None else data.dtype.names or ("",):
-            values = np.asarray(data[column] if column else data)
+                held: Any = fits.Card.fromstring(card.image)  # a header may not hold all digits of a number
+                digest.update(f"{card.keyword} {held.value!r}\n".encode())
+        if hdu.data is None:
+            continue
+        for column in hdu.data.dtype.names or ("",):
+            values = np.asarray(hdu.data[column] if column else hdu.data)
             digest.update(f"{column} {values.shape}\n".encode())
             if (name, column) == ("INPUTS", "PATH"):
                 continue
