@@ -75,7 +75,7 @@ def atomic_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Ite
         raise fail(
             f"writing failed: {error.strerror or error}",
             file=path,
-            advice="free some space, or choose another folder; what stood there before is untouched",
+            advice="free some space; what stood there before is untouched",
         ) from error
     finally:
         temporary.unlink(missing_ok=True)

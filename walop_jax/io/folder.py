@@ -82,7 +82,7 @@ class OutputFolder:
         """
         names = tuple(names) or self.names
         check_folder(self.path, names, overwrite=self.overwrite)
-        new = not self.target.is_dir()
+        new, untouched = not self.target.is_dir(), True
         temporary = (self.target.parent if new else self.target) / f"{own_prefix(self.target)}new"
         try:
             temporary.mkdir()
@@ -96,13 +96,14 @@ class OutputFolder:
             if new:
                 os.rename(temporary, self.target)
             else:
+                untouched = False
                 for name in (*names[1:], *missing, *drop):
                     remove(self.target / name)
                 for name in names:
                     os.replace(temporary / name, self.target / name)
             flush_folder(self.target.parent if new else self.target)
         except OSError as error:
-            advice = "free some space, or choose another folder"
+            advice = "free some space; what was there is untouched" if untouched else "write it again"
             raise fail(f"writing failed: {error.strerror or error}", file=self.path, advice=advice) from error
         finally:
             remove(temporary)
