@@ -5,11 +5,8 @@ and so on. `read` reads whatever the program has written; `from_arrays` makes a 
 names are those of `__init__.pyi`; everything else lives in the rooms of the package and may move.
 
 Nothing is loaded before it is used, so that importing the package is free of charge. It computes in float64: the first
-name that is asked for switches JAX to it, unless arrays have been made in float32 already. Then switch it on yourself,
-before anything else:
-
-    import jax
-    jax.config.update("jax_enable_x64", True)
+name that is asked for switches JAX to it. Where arrays have been made in float32 already, or float64 was switched off
+later, the session stays as it is, and the package computes in float64 all the same.
 """
 
 from __future__ import annotations
@@ -52,8 +49,7 @@ def __getattr__(name: str) -> Any:
 
 
 def _switch_on_float64() -> None:
-    """Let JAX compute in float64 if nothing has been computed yet; otherwise leave it, and a computation will
-    object."""
+    """Let JAX compute in float64 if nothing has been computed yet; otherwise leave the session as it is."""
     fresh = "jax" not in sys.modules
     jax = importlib.import_module("jax")
     if not jax.config.jax_enable_x64 and (fresh or not jax.live_arrays()):

@@ -27,13 +27,13 @@ CARDS = {
     "huge heap": ("PCOUNT", HUGE, f"[EXPOSURES] PCOUNT: is {HUGE}"),
     "huge fields": ("TFIELDS", HUGE, f"[EXPOSURES] TFIELDS: is {HUGE}, not in 0 … 999"),
     "negative fields": ("TFIELDS", -1, "[EXPOSURES] TFIELDS: is -1"),
-    "more fields": ("TFIELDS", 16, "[EXPOSURES] TFORM16: is no format"),
+    "more fields": ("TFIELDS", 16, "[EXPOSURES]: the columns cannot be read"),
     "many axes": ("NAXIS", HUGE, f"[EXPOSURES] NAXIS: is {HUGE}, not in 0 … 999"),
     "three axes": ("NAXIS", 3, "[EXPOSURES] NAXIS3: is missing"),
     "text for rows": ("NAXIS2", "'eight'", "[EXPOSURES] NAXIS2: is 'eight', no whole number"),
     "odd bits": ("BITPIX", 7, "[EXPOSURES] BITPIX: is 7"),
-    "wide column": ("TFORM1", "'99999999999999999J'", "[EXPOSURES] NAXIS1"),
-    "nonsense format": ("TFORM1", "'no'", "[EXPOSURES] TFORM1: is no format of a column"),
+    "wide column": ("TFORM1", "'99999999999999999J'", "[EXPOSURES]: the columns cannot be read"),
+    "nonsense format": ("TFORM1", "'no'", "[EXPOSURES]: the columns cannot be read: Format 'no'"),
 }
 
 
@@ -87,7 +87,7 @@ def test_header_without_end_is_not_followed_for_ever(tmp_path):
     path = tmp_path / "endless.fits"
     head = b"SIMPLE  =                    T".ljust(80) + b"COMMENT".ljust(80) * 35
     path.write_bytes(head + (b"COMMENT".ljust(80) * 36) * 1100)
-    with pytest.raises(DataError, match="the header has more than 36000 cards"):
+    with pytest.raises(DataError, match="the header does not end"):
         read_calibration_set(path)
     path.write_bytes(head)
     with pytest.raises(DataError, match="the header does not end"):
@@ -139,6 +139,6 @@ def test_missing_checksums_are_remarked_on(handmade):
 def test_messages_stay_on_one_line_whatever_a_header_holds(handmade):
     path = handmade.write(checksum=False)
     path.write_bytes(overwrite(path.read_bytes(), "NAXIS2", "\x1b[2J\n\x85 8"))
-    with pytest.raises(DataError, match=r"NAXIS2: is \\x1b\[2J\\n\\x85 8, no whole number") as caught:
+    with pytest.raises(DataError, match="NAXIS2: Unparsable card") as caught:
         read_calibration_set(path)
     assert str(caught.value).isprintable()

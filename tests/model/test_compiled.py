@@ -12,7 +12,7 @@ import pytest
 import walop_jax
 from walop_jax.data import builtin_filter
 from walop_jax.model import light
-from walop_jax.model.compiled import compiled, knows, require_double_precision
+from walop_jax.model.compiled import compiled, knows
 from walop_jax.model.dependence import optical_indices
 from walop_jax.model.parameters import values_of, with_values
 
@@ -65,16 +65,6 @@ def test_compiled_is_the_function_itself():
     quick = compiled(area)
     assert float(quick(jnp.asarray(3.0), jnp.asarray(2.0))) == 6.0
     assert (quick.__name__, quick.__doc__) == ("area", "What a rectangle covers.")
-
-
-def test_single_precision_is_refused():
-    require_double_precision()
-    jax.config.update("jax_enable_x64", False)
-    try:
-        with pytest.raises(RuntimeError, match="jax_enable_x64"):
-            require_double_precision()
-    finally:
-        jax.config.update("jax_enable_x64", True)
 
 
 def test_an_option_that_xla_does_not_have_is_noticed():

@@ -3,9 +3,10 @@
     python tests/studies/kills.py [--commands refit sample …] [--states 200] [--full 60] [--kills 0] [--races 0]
 
 states   A command runs once, and at every operation on files (audit hooks of Python) what lies on the disk is copied.
-         Each different state is what a kill at that moment leaves behind: its results must all be of the run before
-         or all of the new one, and the next run must succeed on it with the result of an undisturbed run and leave
-         nothing else behind. (`diagnose` is run again on the states whose results differ; its next run is a fit.)
+         Each different state is what a kill at that moment leaves behind: its results must be of the run before or
+         of the new one, all of them or a part, and the next run must succeed on it with the result of an undisturbed
+         run and leave nothing else behind. (`diagnose` is run again on the states whose results differ; its next run is
+         a fit.)
 full     The same with a limit on the size of files (RLIMIT_FSIZE), which writing meets at every possible place.
 kills    Commands in processes of their own, killed (SIGKILL) after a random time.
 races    Two processes with the same output at the same time.
@@ -120,12 +121,11 @@ class Study:
         shutil.copytree(state, self.here, symlinks=True)
 
     def mixed(self) -> str:
-        """What is wrong with the results that lie there: they must be all of one run, or all absent."""
+        """What is wrong with the results that lie there: they must be of one run, those that are there."""
         of = set()
         for name in self.outputs:
             path = self.run / name
             if not path.exists():
-                of.add("nothing")
                 continue
             try:
                 found = content(path)

@@ -43,7 +43,7 @@ _REPEATS, _CHAINS = "data/test_repeats.py", "posterior/test_chains.py"
 ERRORS = (
     # io
     planted("io/text.py", "places = 1 - math.floor", "places = 2 - math.floor", "io/test_rounding.py"),
-    planted("io/fits_reading.py", "_MOST_BLOCKS = 1000", "_MOST_BLOCKS = 10000", "data/test_hostile_headers.py"),
+    planted("io/fits_reading.py", "_MOST = 999", "_MOST = 9999", "data/test_hostile_headers.py"),
     # data
     planted("data/merge.py", "/ math.sqrt(math.pi)", "* math.sqrt(math.pi)", _REPEATS),
     planted("data/merge.py", "return smallest > _NOISE", "return smallest < _NOISE", _REPEATS),

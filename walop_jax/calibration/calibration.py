@@ -8,9 +8,8 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import functools
-import hashlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,7 +43,7 @@ from walop_jax.data.settings import (
 from walop_jax.fit.model_file import model_without_data, render, standard_names
 from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
 from walop_jax.fit.refit import FitResult, Matrix, Vector
-from walop_jax.fit.verdict import STATED, Hidden, Quality, Verdict
+from walop_jax.fit.verdict import Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
 from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display
@@ -63,6 +62,10 @@ MAP_SIZE = 31  # pixels along each axis of the maps: 0.02° over ±0.3°
 MAP_NODES = (18, 24, 30)  # per side, for the standard errors in the maps
 MAP_ERRORS = 1e-6  # of those, relative
 HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
+UNCHECKED = (
+    "made by an earlier version, whose content hash does not cover all words of the headers: fit again"
+)
+"""Remark of the verdict on a product whose content is not checked."""
 TEMPERATURE_MARGIN = 2.0  # K beyond the temperatures of the exposures
 
 
@@ -102,8 +105,8 @@ class Calibration(Fitted):
     instead of the linear propagation of `covariance`.
 
     `fitted` is the model, a `ListedModel` where it was not rebuilt from its file (`rebuilt`). `listed` is how the file
-    held a model that was rebuilt; `dataclasses.replace` forgets it, and maps and texts are made anew. Raises ValueError
-    for shapes that do not belong together.
+    held a model that was rebuilt, `content` its content hash; `dataclasses.replace` forgets both, and maps, texts and
+    hash are made anew. Raises ValueError for shapes that do not belong together.
 
     >>> m, covariance = walop.Calibration.from_fit(result).matrix(0.1, -0.05)
     >>> m.shape, covariance.shape
@@ -128,8 +131,10 @@ class Calibration(Fitted):
     draws: Float[np.ndarray, "d n"] | None = None
     path: Path | None = None
     listed: dataclasses.InitVar[ListedModel | None] = None
+    content: dataclasses.InitVar[str] = ""
 
-    def __post_init__(self, listed: ListedModel | None) -> None:
+    def __post_init__(self, listed: ListedModel | None, content: str) -> None:
+        vars(self)["_content"] = content
         n = len(self.fitted.parameters)
         if self.covariance.shape != (n, n):
             raise ValueError(f"covariance has shape {self.covariance.shape}, there are {n} parameters")
@@ -194,6 +199,7 @@ class Calibration(Fitted):
             if hidden is None
             else dataclasses.replace(hidden, changes=hidden.changes[:, order]),
             listed=self.fitted,
+            content=self.content_hash(),
         )
 
     def with_covariance(self, covariance: Matrix, errors_from: str) -> Calibration:
@@ -247,10 +253,10 @@ class Calibration(Fitted):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A sentence if the calibration is not to be trusted."""
-        if self.verdict.trusted:
-            return ()
+        """A sentence if the calibration is not to be trusted, or its file not checked."""
         where = "" if self.path is None else f"{self.path}: "
+        if self.verdict.trusted:
+            return (f"{where}{UNCHECKED}",) if UNCHECKED in self.verdict.warnings else ()
         why = "; ".join(self.verdict.warnings) or "see WARNINGS"
         return (f"{where}this calibration is not trusted: {why}",)
 
@@ -524,52 +530,14 @@ class Calibration(Fitted):
             "FREE": np.array([p.free and p.tie is None for p in parameters]),
         }
 
-    def content_hash(self, *, every_column: bool = True) -> str:
-        """SHA-256 of all that a calibration says of the instrument: not of dates, paths and versions.
+    def content_hash(self) -> str:
+        """The content hash of the file that it was read from, or of the one that it would be written as.
 
-        Nor of structure and hidden mistakes, which versions that do not know them leave aside (the checksums of the
-        file hold them).
-
-        Without `every_column` only those columns of the exposures that the hashes of first products covered.
+        SHA-256 of all that a calibration says of the instrument: not of dates, paths and versions.
         """
-        digest = hashlib.sha256()
-        verdict, maps = self.verdict, [self.maps, *((self.residuals,) if self.residuals is not None else ())]
-        # Twelve digits: a number in a FITS header may lose its last bit.
-        numbers = (verdict.chi2, verdict.noise_scale, *self.field)
-        texts = [
-            *(self.instrument, *self.model_lines, *self.description),
-            *(in_ascii(text) for text in verdict.warnings),
-            verdict.covariance_from,
-            *(str(value) for value in (verdict.dof, verdict.n_data, verdict.converged, verdict.trusted)),
-            *(str(int(verdict.quality)), *(f"{value:.11e}" for value in numbers)),
-            *(entry.sha256 for entry in self.inputs),
-            *((verdict.errors_from,) if verdict.errors_from != STATED else ()),
-            *(f"{prefix} {angle:.11e}" for one in maps for prefix, angle in one.positions.items()),
-        ]
-        for text in texts:
-            digest.update(text.encode() + b"\n")
-        for values in self._arrays(every_column):
-            if values.dtype.kind in "US":
-                digest.update("\n".join(values.astype(str).ravel().tolist()).encode() + b"\n")
-            else:
-                digest.update(np.asarray(values, "<f8").tobytes())
-        return digest.hexdigest()
+        from walop_jax.calibration.product import content_hash
 
-    def _arrays(self, every_column: bool) -> Iterable[np.ndarray]:
-        yield from self.parameter_columns().values()
-        yield from (getattr(self.sources, entry.name) for entry in dataclasses.fields(self.sources))
-        if every_column:
-            for name, values in self.exposures.columns().items():
-                yield from (np.array([name]), values)
-        else:
-            yield from (getattr(self.exposures, name) for name in ("exposure", "kind", "mjd", "filter"))
-            for prefix, position in self.exposures.moving.items():
-                yield from (np.array([prefix]), position.inside, position.angle)
-        yield from (self.covariance, self.maps.values, self.maps.errors)
-        if self.residuals is not None:
-            yield from (self.residuals.values, self.residuals.errors, self.residuals.chi2)
-        for name, curve in self.filters.items():
-            yield from (np.array([name]), curve.wavelength, curve.throughput)
+        return vars(self).get("_content") or content_hash(self)
 
 
 def _lines(text: str) -> tuple[str, ...]:

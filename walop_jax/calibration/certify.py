@@ -13,13 +13,14 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.calibration import UNCHECKED, Calibration
 from walop_jax.data.settings import BUILTIN_FILTERS, Settings
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import rounded
 
 MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine
 DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
+SINGULAR = 1e-12  # eigenvalue of a correlation that is 0 but for rounding
 _POINTS = 64
 
 Vector = Float[np.ndarray, " p"]
@@ -54,13 +55,24 @@ def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
 
 def certify(product: Calibration) -> list[Check]:
     """All checks of a product that could be read, in a fixed order; those behind a failed one may be missing."""
-    checks = [*_verdict(product), _covariance(product), _validity(product), _parents(product)]
+    checks = [
+        *_content(product),
+        *_verdict(product),
+        _covariance(product),
+        _validity(product),
+        _parents(product),
+    ]
     try:
         calibration = product.rebuilt()
     except ValueError as error:
         return [*checks, Check("model", False, f"cannot be rebuilt: {error}")]
     checks.append(Check("model", True, f"{len(calibration.model.names)} parameters rebuilt by name"))
     return [*checks, _maps(product, calibration), _physics(calibration), _protection(calibration)]
+
+
+def _content(product: Calibration) -> list[Check]:
+    """What is read is what was written (`read_calibration`), but for products of an earlier rule."""
+    return [Check("content", False, UNCHECKED)] if UNCHECKED in product.verdict.warnings else []
 
 
 def _verdict(product: Calibration) -> list[Check]:
@@ -76,15 +88,20 @@ def _verdict(product: Calibration) -> list[Check]:
 
 
 def _covariance(product: Calibration) -> Check:
-    c = product.covariance
-    scale = np.where(product.sigma > 0, product.sigma, 1.0)
-    correlation = c / np.outer(scale, scale)
-    lowest = float(np.linalg.eigvalsh(0.5 * (correlation + correlation.T))[0])
-    lopsided = float(np.abs(correlation - correlation.T).max())
-    good = lowest > -1e-8 and lopsided < 1e-10
-    shown = rounded(round(lowest, 12) + 0.0, ".2g")  # rounding errors are 0
-    found = f"smallest eigenvalue of the correlation {shown}; made from {product.verdict.errors_from}"
-    return Check("covariance", good, found)
+    """Of the free parameters: those that are held, or tied to others, have no errors of their own."""
+    free = [i for i, p in enumerate(product.fitted.parameters) if p.free and p.tie is None]
+    c, sigma = product.covariance[np.ix_(free, free)], product.sigma[free]
+    from_what = f"made from {product.verdict.errors_from}"
+    if not np.all(sigma > 0):
+        name = product.fitted.names[free[int(np.argmin(sigma))]]
+        return Check("covariance", False, f"the error of the free parameter {name} is 0; {from_what}")
+    correlation = c / np.outer(sigma, sigma)
+    lowest = float(np.linalg.eigvalsh(0.5 * (correlation + correlation.T)).min(initial=1.0))
+    lopsided = float(np.abs(correlation - correlation.T).max(initial=0.0))
+    good = lowest > SINGULAR and lopsided < 1e-10
+    shown = rounded(lowest if abs(lowest) > SINGULAR else 0.0, ".2g")
+    what = f"smallest eigenvalue of the correlation of {len(free)} free parameters {shown}"
+    return Check("covariance", good, f"{what}{' (singular)' if lowest <= SINGULAR else ''}; {from_what}")
 
 
 def _validity(product: Calibration) -> Check:

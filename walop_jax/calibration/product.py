@@ -7,6 +7,7 @@ otherwise 1. FITS headers and tables hold ASCII only: Greek letters and signs ar
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import tomllib
@@ -17,7 +18,7 @@ from typing import Any, NoReturn
 import numpy as np
 from astropy.io import fits
 
-from walop_jax.calibration.calibration import Calibration, ListedModel
+from walop_jax.calibration.calibration import UNCHECKED, Calibration, ListedModel
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap, matrix_names, residual_names
 from walop_jax.data import schema
 from walop_jax.data.calset import empty_sources
@@ -35,6 +36,8 @@ from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.parameters import NAME, Parameter
 
 PRODUCT = "calibration.fits"
+HASHRULE = 2
+"""Rule of CONTHASH; that of earlier products, without this word, left words of the headers aside."""
 PRODVERS = 2
 """Newest version of the format; a product is written in the oldest version that can hold it."""
 
@@ -61,6 +64,15 @@ _RESIDUALS = {"RESIDUAL": "values", "RESIDUAL_ERR": "errors", "RESIDUAL_CHI2": "
 _FIELD = ("FIELDXMI", "FIELDXMA", "FIELDYMI", "FIELDYMA")
 _MATRIX_IMAGE = re.compile(r"M([1-9][0-9]{0,2})[123](_ERR)?")
 _LONGEST_SOFTWARE_LIST = 30
+_EXTENSIONS = re.compile(
+    f"PRIMARY|EXPOSURES|COVARIANCE|HIDDEN|{_MATRIX_IMAGE.pattern}|{'|'.join((*TABLES, *_RESIDUALS))}"
+)
+_WORDS = re.compile(
+    "TELESCOP|INSTRUME|(PROD|CAL)VERS|ORIGIN|SITE(LAT|LONG|ELEV)|TRUSTED|CONVERGD|CHI2|DOF|NDATA|NOISESCL|QUALITY|"
+    r"COVFROM|ERRFROM|STRUCT[GR]|MAPFILT|FIELD[XY]M[AI]|MJD-(BEG|END)|TEMPM(IN|AX)|FILTER\d*|HASHRULE|"
+    r"(CTYPE|CUNIT|CRPIX|CRVAL|CDELT|CROTA|ELEM|ANGLE|PLANE|HIDE|SIZE|UNIT|TUNIT|TNULL)\d+|(CD|PC)\d_\d|CHWPANG"
+)
+"""Words of headers that CONTHASH covers: all that are read, but for structure (FITS), date and software."""
 _AGAIN = "make the product again"
 
 Cards = dict[str, tuple[Any, str]]
@@ -80,8 +92,43 @@ def write_calibration(
     for name in calibration.fitted.names:
         if not NAME.fullmatch(name):
             raise Place(path, "PARAMETERS").fail(f"{name!r} is not a parameter name", "NAME")
+    hdus = _hdus(calibration, path)
+    hdus[0].header["CONTHASH"] = content_of(hdus)
     with atomic_path(path, overwrite=overwrite) as temporary:
-        sign_and_write(_hdus(calibration, path), temporary)
+        sign_and_write(hdus, temporary)
+
+
+def content_hash(calibration: Calibration) -> str:
+    """CONTHASH of the product that a calibration is written as."""
+    return content_of(_hdus(calibration, calibration.path or PRODUCT))
+
+
+def content_of(hdus: Iterable[Any]) -> str:
+    """SHA-256 of words, columns and images, as they stand in a file; the order of extensions does not matter.
+
+    Not of dates, software, paths, and of what others have added.
+    """
+    digest = hashlib.sha256()
+    for name, hdu in sorted(((hdu.name.strip().upper(), hdu) for hdu in hdus), key=lambda pair: pair[0]):
+        if not _EXTENSIONS.fullmatch(name):
+            continue
+        digest.update(f"{name}\n".encode())
+        for card in hdu.header.cards:
+            if _WORDS.fullmatch(card.keyword):
+                held: Any = fits.Card.fromstring(card.image)  # a header may not hold all digits of a number
+                digest.update(f"{card.keyword} {held.value!r}\n".encode())
+        if hdu.data is None:
+            continue
+        for column in hdu.data.dtype.names or ("",):
+            values = np.asarray(hdu.data[column] if column else hdu.data)
+            digest.update(f"{column} {values.shape}\n".encode())
+            if (name, column) == ("INPUTS", "PATH"):
+                continue
+            if values.dtype.kind in "SU":
+                digest.update("\n".join(values.astype(str).ravel().tolist()).encode())
+            else:
+                digest.update(values.astype("<f8" if values.dtype.kind == "f" else "<i8").tobytes())
+    return digest.hexdigest()
 
 
 def _hdus(c: Calibration, path: object) -> list[Any]:
@@ -163,7 +210,8 @@ def _primary(c: Calibration, version: int) -> fits.PrimaryHDU:
             for name, edge in zip(_FIELD, c.field, strict=True)
         },
         **_validity_cards(c),
-        "CONTHASH": (c.content_hash(), ""),
+        "HASHRULE": (HASHRULE, "what CONTHASH covers"),
+        "CONTHASH": ("", ""),  # when all is there
     }
     primary = fits.PrimaryHDU()
     for name, (value, comment) in cards.items():
@@ -254,7 +302,7 @@ class _Reader:
     """The parts of an open file by name; every method raises `DataError` for what is amiss."""
 
     def __init__(self, opened: OpenFile) -> None:
-        self.path, self.header = opened.path, opened.hdus[0].header
+        self.path, self.header, self.opened = opened.path, opened.hdus[0].header, opened.hdus
         self.primary = Place(self.path, "PRIMARY")
         self.version = self._version()
         self.hdus: dict[str, Any] = {}
@@ -278,7 +326,7 @@ class _Reader:
         sources, inputs = self.table("SOURCES", optional=True), self.table("INPUTS", optional=True)
         warnings, description = self.table("WARNINGS", optional=True), self.table("INSTRUMENT", optional=True)
         exposures, place = self.table("EXPOSURES"), Place(self.path, "EXPOSURES")
-        found = Calibration(
+        return Calibration(
             fitted=ListedModel(
                 name=instrument_name(self.header.get("INSTRUME", ""), self.version, self.primary),
                 parameters=_listed(table, model_lines),
@@ -297,7 +345,10 @@ class _Reader:
                 converged=self.flag("CONVERGD"),
                 trusted=self.flag("TRUSTED"),
                 quality=int(self.number("QUALITY")),
-                warnings=tuple(warnings["TEXT"].tolist()) if warnings else (),
+                warnings=(
+                    *(warnings["TEXT"].tolist() if warnings else ()),
+                    *(() if "HASHRULE" in self.header else (UNCHECKED,)),
+                ),
                 covariance_from=self.text("COVFROM") or "fit",
                 errors_from=self.text("ERRFROM") or STATED,
                 structure=Structure(self.number("STRUCTG", 0.0), self.number("STRUCTR", 0.0)),
@@ -321,13 +372,21 @@ class _Reader:
             date=self.text("DATE"),
             versions=self.versions(),
             path=self.path,
+            content=self.content(),
         )
-        if self.text("CONTHASH") not in (found.content_hash(), found.content_hash(every_column=False)):
-            advice = "a product is not edited by hand: fit again, with a model file for what should differ"
-            raise self.primary.fail("the content is not what was written", "CONTHASH", advice)
-        return found
 
     # ------------------------------------------------------------------------------------ the header
+
+    def content(self) -> str:
+        """The content hash; `DataError` where it is not that of the content. That of an earlier rule is not checked."""
+        held, rule = self.text("CONTHASH"), self.header.get("HASHRULE")
+        if rule == HASHRULE and held != content_of(self.opened):
+            advice = "a product is not edited by hand: fit again, with a model file for what should differ"
+            raise self.primary.fail("the content is not what was written", "CONTHASH", advice)
+        if rule not in (None, HASHRULE):
+            advice = "use a newer walop-jax, or make the product again with this one"
+            raise self.primary.fail(f"is {rule!r}, this program knows {HASHRULE}", "HASHRULE", advice)
+        return held
 
     def _version(self) -> int:
         version = self.header.get("PRODVERS")

@@ -224,6 +224,8 @@ class Command(Generic[T]):
         """The Python function: it takes `overwrite`, `progress` and `seed` as well, and returns the value."""
 
         def call(*args: Any, **kwargs: Any) -> T:
+            from walop_jax.model.compiled import float64
+
             if self.given is not None:
                 args, kwargs = self.given(args, kwargs)
             names = self.signature.parameters
@@ -240,7 +242,8 @@ class Command(Generic[T]):
                 tell(text)
 
             shared["progress"] = logged
-            found = self.run(Job(**shared), arguments)
+            with float64():
+                found = self.run(Job(**shared), arguments)
             for sentence in found.warnings:
                 LOG.warning("%s", sentence)
             return found.value

@@ -117,13 +117,16 @@ def bound(
 
 
 def checked(function: Callable[..., Any], name: str) -> Callable[..., Any]:
-    """The function with its arguments looked at before the call."""
+    """The function with its arguments looked at before the call, which computes in float64."""
+    from walop_jax.model.compiled import float64
+
     signature = inspect.signature(function)
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
         bound(name, signature, function, args, kwargs)
-        return function(*args, **kwargs)
+        with float64():
+            return function(*args, **kwargs)
 
     run.__module__, run.__qualname__ = "walop_jax", name  # where it is found again, by pickle as well
     return run

@@ -126,7 +126,7 @@ def _sampled_run(
         posterior = sample_fit(result, options, folder=folder / CHAINS, resume=resume, report=tell)
         fitted = digest_of_fit(product.inputs, product.fitted.names, product.values)
         posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)
-        with out.filled(OUTPUTS + ((PRODUCT,) if posterior.trusted else ())) as temporary:
+        with out.filled(((PRODUCT,) if posterior.trusted else ()) + OUTPUTS) as temporary:
             for name, write in _writers(product, posterior).items():
                 write(temporary / name)
     return posterior

@@ -9,9 +9,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import secrets
 import shutil
 import socket
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -61,19 +61,16 @@ def atomic_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Ite
     """
     target = check_output(path, overwrite=overwrite)
     remove_leftovers(target)
-    try:
-        descriptor, name = tempfile.mkstemp(
-            prefix=own_prefix(target), suffix=target.suffix, dir=target.parent
-        )
-    except OSError as error:
-        what = f"cannot be written: {error.strerror}"
-        raise fail(what, file=path, advice="choose another folder") from error
-    os.close(descriptor)
-    temporary = Path(name)
+    temporary = target.with_name(f"{own_prefix(target)}{secrets.token_hex(4)}{target.suffix}")
     try:
         with errors_of(path, temporary):
+            temporary.touch(exist_ok=False)
             yield temporary
-        _publish(temporary, target, overwrite=overwrite)
+        flush(temporary, target)
+        if target.exists() and not overwrite:
+            raise fail("has been written by another program meanwhile", file=target)
+        os.replace(temporary, target)
+        flush_folder(target.parent)
     except OSError as error:
         raise fail(
             f"writing failed: {error.strerror or error}",
@@ -84,36 +81,12 @@ def atomic_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Ite
         temporary.unlink(missing_ok=True)
 
 
-def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
-    """Flush `temporary` to disk and move it to `target`, with the permissions of an ordinary new file."""
-    flush(temporary)
+def flush(temporary: Path, target: Path) -> None:
+    """Flush a file to disk; one that it will replace hands on its permissions."""
+    with temporary.open("rb+") as stream:
+        os.fsync(stream.fileno())
     if target.exists():
         temporary.chmod(target.stat().st_mode & 0o777)
-    if overwrite:
-        os.replace(temporary, target)
-    else:
-        try:
-            # A link, unlike a rename, refuses a file that another program has put there meanwhile.
-            os.link(temporary, target)
-        except FileExistsError:
-            raise fail("has been written by another program meanwhile", file=target) from None
-        except OSError:
-            os.replace(temporary, target)  # a file system without hard links
-    flush_folder(target.parent)
-
-
-def make_ordinary(path: Path, most: int) -> None:
-    """Give a temporary file or folder the permissions of a new one: `most`, as far as the user's mask allows."""
-    umask = os.umask(0)
-    os.umask(umask)
-    path.chmod(most & ~umask)
-
-
-def flush(path: Path) -> None:
-    """Flush a file to disk, and give it the permissions of an ordinary new one."""
-    make_ordinary(path, 0o666)
-    with path.open("rb+") as stream:
-        os.fsync(stream.fileno())
 
 
 def flush_folder(folder: Path) -> None:

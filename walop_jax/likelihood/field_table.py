@@ -29,7 +29,7 @@ from walop_jax.likelihood import limits
 from walop_jax.likelihood.optics import rows_and_slopes
 from walop_jax.model import chebyshev
 from walop_jax.model.chebyshev import Rectangle
-from walop_jax.model.compiled import compiled
+from walop_jax.model.compiled import array, compiled
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 
@@ -147,7 +147,7 @@ _solve = compiled(jax.vmap(rows_and_slopes, in_axes=(None, None, 0, 0)), kept_as
 
 def solved_optics(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Optics:
     """Band rows and their derivatives at field positions (deg): exact."""
-    return in_batches(lambda x, y: _solve(instrument, plan, jnp.asarray(x), jnp.asarray(y)), x, y)
+    return in_batches(lambda x, y: _solve(instrument, plan, array(x), array(y)), x, y)
 
 
 def in_batches(solve: Callable[[Vector, Vector], Any], x: Vector, y: Vector) -> Any:
@@ -182,4 +182,4 @@ def accurate_nodes(
         TOLERANCE,
         error,
     )
-    return jax.tree.map(jnp.asarray, table), off
+    return jax.tree.map(array, table), off

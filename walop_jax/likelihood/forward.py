@@ -28,7 +28,7 @@ from walop_jax.likelihood import engine, limits, optics
 from walop_jax.likelihood.engine import PointData
 from walop_jax.likelihood.layout import Layout, PointReader
 from walop_jax.likelihood.likelihood import PriorRows, prior_rows
-from walop_jax.model.compiled import array, require_double_precision
+from walop_jax.model.compiled import array
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import check_names, values_of, with_values
 from walop_jax.model.plan import Plan
@@ -63,9 +63,13 @@ class Forward(eqx.Module):
     def of(cls, calset: CalibrationSet, model: Model, chunk: int | None = None) -> Forward:
         """The forward model of a set that fits into memory, `chunk` points at a time (None: by the kind of machine).
 
-        Raises RuntimeError when float64 is switched off.
+        Raises RuntimeError when float64 is switched off: what a session compiles has its precision.
         """
-        require_double_precision()
+        if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+            raise RuntimeError(
+                "the forward model is computed in float64, which is switched off: call "
+                'jax.config.update("jax_enable_x64", True) before anything else, or set JAX_ENABLE_X64=1'
+            )
         if chunk is None:
             on_cpu = jax.default_backend() == "cpu"
             chunk = limits.FORWARD_CHUNK if on_cpu else limits.FORWARD_CHUNK_OF_ACCELERATORS
@@ -74,13 +78,12 @@ class Forward(eqx.Module):
         chunks = reader.chunks(0, layout.points, layout.chunk)
         data = jax.tree.map(lambda *parts: array(np.stack(parts)), *chunks)
         rows: PriorRows = prior_rows(model)
-        place = {name: i for i, name in enumerate(model.names)}
         return cls(
             template=model.template,
             plan=layout.plan,
             data=data,
             used=array(np.flatnonzero(np.asarray(data.weight))),
-            master=array([place[p.tie or p.name] for p in model.parameters], int),
+            master=array(model.masters),
             free=array(model.free),
             start=array(model.start),
             prior=(array(rows.index), array(rows.mean), array(rows.width)),

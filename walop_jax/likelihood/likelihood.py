@@ -17,7 +17,6 @@ from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
 from walop_jax.likelihood.layout import Layout, MeasuredPoints, PointReader, curves_of, planned_instrument
 from walop_jax.likelihood.optics import directions
 from walop_jax.likelihood.runner import Runner, SlabSums
-from walop_jax.model.compiled import require_double_precision
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
@@ -187,10 +186,8 @@ class Likelihood:
         `memory` (bytes) is what the data of the points may take, None for the usual 2 GB. A large set is shared with
         the processes of `runner`, and finished slabs are kept in its journal; smaller ones are not worth it.
         `points_per_chunk` and `interpolate` are decided by the size of the set where they are None. Derivatives of a
-        small set are compiled without optimisation, unless many such sets come (`once` False). Raises RuntimeError
-        when float64 is switched off.
+        small set are compiled without optimisation, unless many such sets come (`once` False).
         """
-        require_double_precision()
         runner = runner or Runner()
         layout = Layout.of(
             calset,

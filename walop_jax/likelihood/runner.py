@@ -37,6 +37,7 @@ from jaxtyping import Float
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import Layout, Vector, thinned
+from walop_jax.model.compiled import float64
 
 # ------------------------------------------------------------------------------------------------------------ journal
 
@@ -327,11 +328,10 @@ class Runner:
 
         def on_device(entry: tuple[int, int]) -> SlabSums:
             place, number = entry
-            if (
-                len(devices) == 1
-            ):  # programs belong to the device that was asked for: without asking they are shared
-                return work(number)
-            with jax.default_device(devices[place % len(devices)]):
+            # Programs belong to the device that was asked for: without asking they are shared.
+            alone = len(devices) == 1
+            chosen = contextlib.nullcontext() if alone else jax.default_device(devices[place % len(devices)])
+            with float64(), chosen:  # both are settings of a thread
                 return work(number)
 
         entries = list(enumerate(numbers))

@@ -229,21 +229,39 @@ def compiled(
 
     @functools.wraps(function)
     def call(*args: Any, once: bool = False) -> Result:
-        run = (kept(args, once) if kept_as else None) or jitted(once)
-        return run(*args)
+        _refuse_float32(args)
+        with float64():
+            run = (kept(args, once) if kept_as else None) or jitted(once)
+            return run(*args)
 
     return call
 
 
 def array(values: Any, kind: Any = None) -> jax.Array:
     """Known numbers as an array of JAX, for use outside of programs: `jnp.asarray` compiles one for each shape."""
-    return values if isinstance(values, jax.Array) else jax.device_put(np.asarray(values, kind))
+    if isinstance(values, jax.Array):
+        return values
+    with float64():
+        return jax.device_put(np.asarray(values, kind))
 
 
-def require_double_precision() -> None:
-    """Raise RuntimeError, with the remedy, when float64 is switched off."""
-    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+# ------------------------------------------------------------------------------------------------------------- float64
+
+
+def float64() -> contextlib.AbstractContextManager[Any]:
+    """JAX computes in float64 in the block, by the calling thread alone; the rest of the session stays as it is."""
+    if jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        return contextlib.nullcontext()
+    here = jax if hasattr(jax, "enable_x64") else importlib.import_module("jax.experimental")  # jax < 0.8
+    return here.enable_x64(True)
+
+
+def _refuse_float32(args: tuple[Any, ...]) -> None:
+    """Raise RuntimeError, with the remedy, for numbers that were made in float32: they have lost their digits."""
+    if jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        return
+    if any(getattr(leaf, "dtype", None) == np.float32 for leaf in jax.tree.leaves(args)):
         raise RuntimeError(
-            "walop_jax computes in float64, which is switched off: call "
+            "walop_jax computes in float64, which is switched off, and was given numbers in float32: call "
             'jax.config.update("jax_enable_x64", True) before anything else, or set JAX_ENABLE_X64=1.'
         )

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.io.errors import nearest
-from walop_jax.model.compiled import array
+from walop_jax.model.compiled import array, float64
 
 PARAMETER = "walop_jax.parameter"
 NUMBER = "walop_jax.number"
@@ -126,7 +126,8 @@ def number(*, unit: str, about: str, default: float | None = 0.0, several: bool 
 
 def _array(value: Any) -> Any:
     # With its type said: numbers of weak type would be compiled anew beside arrays.
-    return None if value is None else jnp.asarray(value, float)
+    with float64():
+        return None if value is None else jnp.asarray(value, float)
 
 
 def unknown_name(what: str, name: str, known: Iterable[str]) -> ValueError:

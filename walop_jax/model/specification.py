@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.data.records import Exposures
+from walop_jax.model.compiled import array
 from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects import EFFECTS, Described, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
@@ -201,7 +201,7 @@ def make_model(
         raise unknown_name("parameter to tie to", master, names)
     for missing in [*priors, *(f for f in frozen if f not in names)]:
         raise unknown_name("parameter", missing, names)
-    return Model(name=name, template=jax.tree.map(jnp.asarray, instrument), parameters=tuple(parameters))
+    return Model(name=name, template=jax.tree.map(array, instrument), parameters=tuple(parameters))
 
 
 def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
@@ -258,6 +258,4 @@ def with_effects(model: Model, effects: Sequence[str | type[Effect] | Effect], c
             prior = None if p.prior is None else (neutral, p.prior[1])
             known[p.name] = dataclasses.replace(p, start=start, prior=prior)
         parameters.append(known[p.name])
-    return dataclasses.replace(
-        model, template=jax.tree.map(jnp.asarray, instrument), parameters=tuple(parameters)
-    )
+    return dataclasses.replace(model, template=jax.tree.map(array, instrument), parameters=tuple(parameters))

@@ -20,6 +20,7 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre, light
+from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
@@ -178,7 +179,7 @@ def simulate(
         nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
         instrument = draw_instrument(make_model(plan.name, nominal), build)
     active = in_order((*instrument.effects, *effects))
-    truth = jax.tree.map(jnp.asarray, dataclasses.replace(instrument.with_source(standards), effects=active))
+    truth = jax.tree.map(array, dataclasses.replace(instrument.with_source(standards), effects=active))
     blank = _without_light(plan, sources, seed, len(truth.cameras))
     expected = _expected(blank, truth, fluxes(plan, None if steady else sky))
     detector = PhotonNoise(plan.read_noise)
@@ -252,7 +253,7 @@ def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, 
     for _ in range(_MEDIAN_ROUNDS if needs(truth).median else 1):
         seen = np.where(likelihood.used[:, :, None], counts, np.nan)
         plan = with_median(likelihood.plan, np.nanmedian(seen, axis=0))
-        counts = np.asarray(engine.detected(truth, plan.exposures, jnp.asarray(light_counts)))
+        counts = np.asarray(engine.detected(truth, plan.exposures, array(light_counts)))
     return counts
 
 
