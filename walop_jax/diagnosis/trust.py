@@ -38,9 +38,10 @@ from scipy import special
 from walop_jax.diagnosis.alternatives import refuse_mixups
 from walop_jax.diagnosis.design import Design, pattern_scores
 from walop_jax.diagnosis.examination import ALARM
+from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.repeated_noise import repeated_noise
 from walop_jax.diagnosis.score import Projector, ScoreTable, local_p
-from walop_jax.diagnosis.stated_conditions import Singles, hidden_mistakes, stated_conditions
+from walop_jax.diagnosis.stated_conditions import Singles, stated_conditions
 from walop_jax.diagnosis.variance_components import (
     VarianceComponent,
     found_components,
@@ -52,7 +53,7 @@ from walop_jax.diagnosis.variance_components import (
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixels
-from walop_jax.fit.verdict import Structure
+from walop_jax.fit.verdict import NOT_MEASURED, Structure
 from walop_jax.io.text import some
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.frames import PixelPosterior
@@ -113,6 +114,8 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
         of_points = [one for one in components if not any(one is other for other in pixels)]
         found = with_structure(found, design, of_points, len(whole.calset.points))
     found = found.judged(doubts, structure=_with_summed_pixels(result, structure))
+    if unseen := hidden.not_measured() if hidden is not None else ():
+        found = found.remarked(NOT_MEASURED.format("; ".join(unseen)))
     return dataclasses.replace(found, hidden=hidden)
 
 

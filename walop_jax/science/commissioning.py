@@ -92,6 +92,15 @@ def commissioning(result: FitResult, accuracy: FieldAccuracy | None) -> Commissi
             asked = f"p known to {two_digits(100 * MOST)} % in {100 * share:.0f} % of the field"
             said = f"{two_digits(100 * reached)} %{cause}"
             found.append(Requirement(asked, reached <= MOST, said, advice, needed))
+        for one in accuracy.not_measured:
+            found.append(
+                Requirement(
+                    f"{one.name} is measured, or does less than {two_digits(100 * MOST)} % to stars",
+                    one.error[0] <= MOST,
+                    one.with_error,
+                    one.remedy,
+                )
+            )
         if accuracy.hidden > 0:
             found.append(
                 Requirement(
