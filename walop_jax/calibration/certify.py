@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.could_hide import could_hide
+from walop_jax.calibration.could_hide import could_hide, off_by, unmeasured
 from walop_jax.data.settings import BUILTIN_FILTERS, Settings
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import rounded
@@ -155,9 +155,12 @@ def _protection(calibration: Calibration) -> Iterator[Check]:
         yield Check("protection", True, "nobody asked what could hide")
         return
     mistakes = could_hide(calibration)
-    unseen = [one for one in mistakes if not one.measured]
     stated = "no single mistake would move q and u by more than their errors"
-    yield Check("protection", True, mistakes[0].with_error if mistakes else stated)
-    known = not any(one.error[0] > UNMEASURED for one in unseen)
-    text = "; ".join(one.with_error for one in unseen)
+    if mistakes:
+        stated = f"{off_by(*mistakes[0].error)} from {mistakes[0].in_words}"
+    yield Check("protection", True, stated)
+    unseen = unmeasured(mistakes).items()
+    known = not any(one.error[0] > UNMEASURED for _, one in unseen)
+    text = "; ".join(f"not {name}: {off_by(*one.error)} at the usual size" for name, one in unseen)
+    text = text or "; ".join(f"not {name}" for name in calibration.hidden.not_measured())
     yield Check("measured", known, text or "all that acts on starlight")

@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
@@ -65,12 +65,16 @@ class CouldHide(NamedTuple):
             if self.unit
             else f"{rounded(100 * self.size, '.2g')} %"
         )
-        return f"{self.name} ({'if wrong by' if self.measured else 'not measured, usual size'} {size})"
+        return f"{self.name} ({'if wrong by' if self.measured else 'not measured; usual size'} {size})"
 
-    @property
-    def with_error(self) -> str:
-        """The same with what it does to stars."""
-        return f"{self.in_words}: {off_by(*self.error)}"
+
+def unmeasured(mistakes: Iterable[CouldHide]) -> dict[str, CouldHide]:
+    """What the data do not measure, by its names: what one measurement would show together, with the worst of it."""
+    together: dict[str, list[CouldHide]] = {}
+    for one in mistakes:
+        if not one.measured:
+            together.setdefault(one.remedy, []).append(one)
+    return {", ".join(one.name for one in some): some[0] for some in together.values()}
 
 
 def off_by(median: float, largest: float) -> str:
@@ -161,7 +165,12 @@ def moves_with(effect: Effect, instrument: Instrument) -> frozenset[str]:
 
 
 def acts_in(effect: Effect, instrument: Instrument, settings: Settings) -> bool:
-    """True if what an effect is about is in the beam in a setting (one row)."""
+    """True if an effect does anything to the light of a star in a setting (one row): it is in the beam there."""
+    changes = [
+        one for each in effect.first_order(dataclasses.replace(instrument, effects=())) for _, one in each
+    ]
+    if changes and all(one.kind in responses.LIGHT for one in changes):  # of sources, of the angle of the sky
+        return False
     needed = moves_with(effect, instrument)
     return not needed or any(np.isfinite(settings.position(prefix)).any() for prefix in needed)
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from walop_jax.calibration.could_hide import as_text, change_by_effect, moves_with, turn_of
 from walop_jax.calibration.matrix import LARGEST_P, change_of_qu, first_setting, matrix_slopes
@@ -88,12 +88,12 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
             moves_with(one.effect, instrument)
         )
         if (errors[i] > least or not one.informed) if acts else (strong[i] or elsewhere):
-            best.setdefault(one.name, (i, acts and not one.informed, elsewhere))
-    first = [i for i, unseen, elsewhere in best.values() if unseen or elsewhere]
-    order = sorted(
-        [*[i for i, *_ in best.values() if i not in first][:MOST_HIDDEN], *first], key=lambda i: -errors[i]
-    )
-    flags = {i: (unseen, found[i].acts or unseen or elsewhere) for i, unseen, elsewhere in best.values()}
+            best.setdefault(one.name, (i, acts, elsewhere))
+    unseen = {i for i, acts, _ in best.values() if acts and not found[i].informed}
+    always = unseen | {i for i, _, elsewhere in best.values() if elsewhere}
+    others = [i for i, *_ in best.values() if i not in always][:MOST_HIDDEN]
+    order = sorted([*always, *others], key=lambda i: -errors[i])
+    acting = {i for i, acts, elsewhere in best.values() if acts or elsewhere}
     some = [found[i] for i in order]
     return Hidden(
         names=tuple(one.name for one in some),
@@ -103,10 +103,10 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
         kinds=tuple(one.kind for one in some),
         remedies=tuple(one.shown_by for one in some),
         acts=tuple(
-            as_text(one.effect) if one.effect is not None and flags[i][1] else ""
+            as_text(one.effect) if one.effect is not None and i in acting else ""
             for i, one in zip(order, some, strict=True)
         ),
-        measured=tuple(not flags[i][0] for i in order),
+        measured=tuple(i not in unseen for i in order),
     )
 
 
@@ -162,7 +162,7 @@ class _Starlight:
         probe: Probe,
         sizes: Float[np.ndarray, " a"],
         along: Float[np.ndarray, "q a"],
-        alive: Float[np.ndarray, " a"],
+        alive: Bool[np.ndarray, " a"],
     ) -> Iterator[_Mistake]:
         """The amplitudes of a probe, each by itself."""
         declared, fit = field_declarations(probe.effect), self.fit

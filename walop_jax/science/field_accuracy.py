@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.could_hide import CouldHide, could_hide, off_by
+from walop_jax.calibration.could_hide import CouldHide, could_hide, off_by, unmeasured
 from walop_jax.calibration.matrix import (
     SMALLEST_DETERMINANT,
     p_errors,
@@ -104,7 +104,8 @@ class FieldAccuracy:
         if self.limited_by:
             lines.append(("limited by", self.limited_by))
         if self.not_measured:
-            lines.append(("not measured", "; ".join(one.with_error for one in self.not_measured)))
+            each = unmeasured(self.not_measured).items()
+            lines.append(("not measured", "; ".join(f"{name}: {off_by(*one.error)}" for name, one in each)))
         if self.hidden > 0:
             lines.append(("could hide", f"{off_by(self.hidden, self.hidden_worst)} from {self.hidden_by}"))
         if self.hidden > 0 and self.remedy:
