@@ -36,6 +36,7 @@ from walop_jax.diagnosis.alternatives import with_exposures, with_places
 from walop_jax.diagnosis.candidates import Probe, all_candidates, applicable, probes, showable
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM
+from walop_jax.diagnosis.limits_found import ASKED_BY_CAMERA
 from walop_jax.diagnosis.score import (
     Candidate,
     Score,
@@ -55,7 +56,7 @@ _SHOWN = 4  # alternatives that are told in words
 _ALIKE = 25.0  # in χ², within which conditions are told together
 _PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
 MOST_OF_ELEMENT = 4  # numbers of an element whose priors may be wrong together
-_ASKED_OTHERWISE = ("pedestal", "nonlinearity", "standard_outlier")  # camera by camera, and as priors
+_ASKED_OTHERWISE = (*ASKED_BY_CAMERA, "standard_outlier")  # camera by camera, and as priors
 _LEVELS = "exposures at a second light level"
 _DARK = "bias and dark frames"
 _ONE_STAR = "a bright star in one beam: its light in the other cameras"
