@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.could_hide import acting_effects, acts_in, with_effect
+from walop_jax.calibration.could_hide import acting_effects, acts_in, turn_of, with_effect
 from walop_jax.calibration.matrix import in_chunks, sky_vectors
 from walop_jax.data.settings import Settings
 from walop_jax.likelihood.field_table import (
@@ -115,6 +115,7 @@ class AnalysisVectors:
         self.half_width = min(self.instrument.field_limit, reach)
         self.cameras = len(self.instrument.cameras)
         self._tables: dict[tuple[object, ...], FieldTable] = {}
+        self._acting_in: dict[tuple[object, ...], dict[int, Effect]] = {}
         series, plain = series_indices(self.instrument), plain_positions(self.instrument)
         self._uncertain: Int[np.ndarray, " o"] = np.flatnonzero(np.diag(calibration.covariance)[plain] > 0)
         self.parameters: Int[np.ndarray, " n"] = np.concatenate([plain[self._uncertain], series])
@@ -182,11 +183,21 @@ class AnalysisVectors:
         """Mistakes that could hide and act on starlight, by number: effects at their sizes."""
         return acting_effects(self.calibration)
 
+    @functools.cached_property
+    def turns(self) -> Mapping[int, float]:
+        """Angles (rad) by which those that do so turn the sky."""
+        each = {number: turn_of(self.instrument, one) for number, one in self.acting.items()}
+        return {number: turn for number, turn in each.items() if turn}
+
     def added(
         self, setting: Settings, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
     ) -> dict[int, Float[np.ndarray, "p k 3"]]:
         """Change of the vectors by each effect of `acting` that is in the beam, for a flat spectrum."""
-        acting = {n: one for n, one in self.acting.items() if acts_in(one, self.instrument, setting)}
+        if setting.key not in self._acting_in:
+            self._acting_in[setting.key] = {
+                n: one for n, one in self.acting.items() if acts_in(one, self.instrument, setting)
+            }
+        acting = self._acting_in[setting.key]
         if not acting:
             return {}
         table = self._kept(lambda one: self._acting_table(one, acting), setting, "added")

@@ -19,7 +19,6 @@ from scipy import special
 
 from walop_jax.calibration.analysis_vectors import COLOURS, COOLEST, AnalysisVectors, colour_weights
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.could_hide import turn_of
 from walop_jax.data.catalogue import Catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.fit.verdict import Quality
@@ -245,18 +244,16 @@ class _Application:
 
         `s` are the Stokes parameters of the rows in the instrument frame, `there` the vectors.
         """
-        vectors = self.vectors
-        if not vectors.acting:
-            return {}
-        lit = np.zeros((len(vectors.acting), len(rows), vectors.cameras))
-        place = {number: i for i, number in enumerate(vectors.acting)}
+        vectors, lit = self.vectors, {}
         for k, here in _rows_by_setting(self.setting_of[rows]):
             for number, added in vectors.added(self.settings[k], x[here], y[here]).items():
-                lit[place[number], here] = np.einsum("rs,rks->rk", s[here], added)
-        for number, effect in vectors.acting.items():
-            lit[place[number]] += turn_of(vectors.instrument, effect) * _turned(s, there, sky)
-        moved = np.add.reduceat(-(gain @ lit[..., None])[..., 0], first, axis=1)
-        return {number: moved[i] for number, i in place.items()}
+                whole = lit.setdefault(number, np.zeros((len(rows), vectors.cameras)))
+                whole[here] = np.einsum("rs,rks->rk", s[here], added)
+        for number, turn in vectors.turns.items():
+            lit[number] = lit.get(number, 0.0) + turn * _turned(s, there, sky)
+        return {
+            number: np.add.reduceat(-(gain @ one[..., None])[..., 0], first) for number, one in lit.items()
+        }
 
     def outside(self, rows: Int[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:
         """Rows beyond the field of the instrument, or too far beyond that of the calibration to mean anything."""
