@@ -78,18 +78,18 @@ class Alternative:
         return f"{self.what} (χ²/dof = {self.explained:.3g}): {self.remedy}"
 
 
-def refuse_mixups(result: FitResult) -> None:
+def refuse_mixups(result: FitResult, policy: Policy = POLICY) -> None:
     """Raise `DataError` with the remedy if a fit leaves what another reading of its data explains."""
-    found = mixups_of(result)
+    found = mixups_of(result, policy)
     if found:
         raise refusal(result, found)
 
 
-def mixups_of(result: FitResult) -> tuple[Alternative, ...]:
+def mixups_of(result: FitResult, policy: Policy = POLICY) -> tuple[Alternative, ...]:
     """The readings of the data that explain what a fit leaves, best first."""
     if result.dof <= 0:
         return ()
-    return mixups(result.calset, result.model, result.chi2 / result.dof)
+    return mixups(result.calset, result.model, result.chi2 / result.dof, policy)
 
 
 def refusal(result: FitResult, found: Sequence[Alternative]) -> DataError:
@@ -100,7 +100,9 @@ def refusal(result: FitResult, found: Sequence[Alternative]) -> DataError:
     )
 
 
-def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternative, ...]:
+def mixups(
+    calset: CalibrationSet, model: Model, left: float, policy: Policy = POLICY
+) -> tuple[Alternative, ...]:
     """The readings of the data that explain them, best first, where a fit misses them by a per cent or more.
 
     `left` is the χ²/dof of a fit of `model`.
@@ -113,7 +115,7 @@ def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternati
     seen = block.used[..., None] & (block.counts > 0)
     if (
         not seen.any()
-        or np.median(block.sigma[seen] / block.counts[seen]) * np.sqrt(left) < POLICY.reading_coarse
+        or np.median(block.sigma[seen] / block.counts[seen]) * np.sqrt(left) < policy.reading_coarse
     ):
         return ()
     few = dataclasses.replace(few, intensities=TableIntensities.dense(few.points, block))
@@ -124,10 +126,10 @@ def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternati
     for readings in (_readings(few, model), _instruments(few)):
         tried = [_judged(one, few, model, left, _STEPS[0]) for one in readings]
         best = [_judged(one, few, model, one.explained, _STEPS[1]) for one in _sorted(tried)[:_BEST]]
-        enough = min(1.0 + (left - 1.0) / POLICY.reading_gain, FAR_OFF)
+        enough = min(1.0 + (left - 1.0) / policy.reading_gain, FAR_OFF)
         good = [one for one in _sorted(best) if one.explained < enough]
         if good:
-            return tuple(one for one in good if one.explained < POLICY.reading_alike * good[0].explained)
+            return tuple(one for one in good if one.explained < policy.reading_alike * good[0].explained)
     return ()
 
 

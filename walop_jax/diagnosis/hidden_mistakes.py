@@ -27,8 +27,8 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.diagnosis.candidates import Probe
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.examination import ALARM
 from walop_jax.diagnosis.limits_found import PROBABILITY
+from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import local_p, noncentrality
 from walop_jax.diagnosis.stated_conditions import Singles, asked_effects
 from walop_jax.fit.verdict import DATA, EFFECT, Hidden
@@ -63,7 +63,7 @@ class _Mistake(NamedTuple):
     acts: bool = False
 
 
-def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
+def hidden_mistakes(design: Design, singles: Singles, policy: Policy = POLICY) -> Hidden:
     """Single mistakes as large as the data would just have shown at 99 % probability, and what they do.
 
     Kept are those that move the parameters by more than their standard errors, and effects that act on starlight; first
@@ -73,7 +73,7 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     fit = design.fit
     usual = _usual(fit.calset, fit.model.template)
     instrument = fit.model.instrument(fit.values)
-    found = list(_mistakes(design, singles, usual))
+    found = list(_mistakes(design, singles, usual, policy))
     along = np.array([one.along for one in found]).reshape(len(found), -1).T
     changes = (fit.model.selection() @ design.taken_up(along)).T
     turns = np.array([0.0 if one.effect is None else abs(turn_of(instrument, one.effect)) for one in found])
@@ -110,10 +110,10 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     )
 
 
-def _mistakes(design: Design, singles: Singles, usual: int) -> Iterator[_Mistake]:
+def _mistakes(design: Design, singles: Singles, usual: int, policy: Policy) -> Iterator[_Mistake]:
     """All of them, amplitude by amplitude."""
     of_stars = _Starlight(design, usual)
-    p, first = local_p(ALARM, len(singles.testable)), 0
+    p, first = local_p(policy.alarm, len(singles.testable)), 0
     shown = set()
     for one in singles.rivals:
         count = len(one.candidate.widths)

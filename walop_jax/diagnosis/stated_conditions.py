@@ -35,8 +35,8 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.alternatives import with_exposures, with_places
 from walop_jax.diagnosis.candidates import Probe, all_candidates, applicable, probes, showable
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.examination import ALARM
 from walop_jax.diagnosis.limits_found import ASKED_BY_CAMERA
+from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import (
     Candidate,
     Score,
@@ -160,14 +160,16 @@ def scored(design: Design, rivals: tuple[_Single, ...]) -> Singles:
     return Singles(rivals, table, along, np.diag(space.gram), space.alive)
 
 
-def stated_conditions(design: Design, singles: Singles | None = None) -> Iterator[str]:
+def stated_conditions(
+    design: Design, singles: Singles | None = None, policy: Policy = POLICY
+) -> Iterator[str]:
     """A sentence on the single numbers that the residuals of a fit speak against, the clearest first.
 
     Of a fit that does not explain its data only where one of them alone would.
     """
     singles = singles or Singles.of(design)
     rivals, table, scores = singles.rivals, singles.table, singles.testable
-    found = [score for score in scores if corrected_p(score.log_p, len(scores)) < ALARM]
+    found = [score for score in scores if corrected_p(score.log_p, len(scores)) < policy.alarm]
     if not found:
         return
     found.sort(key=lambda score: score.log_p)
@@ -182,17 +184,17 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     said = {one.candidate.name: one.said for one in rivals}
     told = "; or for ".join(said[score.name](score) for score in likely[:_SHOWN])
     more = f"; or for {len(likely) - _SHOWN} others" if len(likely) > _SHOWN else ""
-    yield f"the residuals ask for {told}{more} (p = {corrected_p(best.log_p, len(scores)):.2g}, limit {ALARM:g})"
+    yield f"the residuals ask for {told}{more} (p = {corrected_p(best.log_p, len(scores)):.2g}, limit {policy.alarm:g})"
 
 
-def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
+def rival_conditions(design: Design, chi2: float, policy: Policy = POLICY) -> Iterator[str]:
     """A sentence on stated conditions, each of which, if wrong, explains the data as well as a model with `chi2` does.
 
     `design` is of the fit before anything was added to its model.
     """
     scored = [item for item in condition_scores(design) if item.score.testable]
     square = float(np.sum(design.projector(design.residual) ** 2))
-    least = special.chdtri(1, local_p(ALARM, len(scored))) if scored else np.inf
+    least = special.chdtri(1, local_p(policy.alarm, len(scored))) if scored else np.inf
     gains = [float(item.score.amplitudes[0]) ** 2 * item.square for item in scored]
     alike = [
         (gain, item)
