@@ -17,7 +17,7 @@ from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model
-from walop_jax.fit.refit import fit
+from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.columns import own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described, FreeForm, effect_by_name
@@ -302,18 +302,17 @@ def test_decided_keeps_every_trial_once(monkeypatch):
     Fitted with errors as stated the second name is better by χ² 8 than the first, and the sentence by 2: the sentence
     at 9.8 − ½ · 6 = 6.8 stays behind the name.
     """
-    objective = {"first": 100.0, "second": 92.0, "said": 98.0}
+    objective = {"first": 100.0, "second": 92.0, "said": 98.0, "third": 90.0}
+
+    def result(name):
+        found = object.__new__(FitResult)
+        vars(found).update(likelihood=name, values=None, posterior=SimpleNamespace(objective=objective[name]))
+        return found
 
     def trial(name, evidence, effect):
-        result = SimpleNamespace(likelihood=name, values=None)
-        return search.Trial(effect, evidence, 0.0, False, fit=result)
+        return search.Trial(effect, evidence, 0.0, False, fit=result(name))
 
-    def fitted(likelihood, **_):
-        return SimpleNamespace(
-            likelihood=likelihood, posterior=SimpleNamespace(objective=objective[likelihood])
-        )
-
-    monkeypatch.setattr(workflow, "fit", fitted)
+    monkeypatch.setattr(workflow, "fit", lambda likelihood, **_: result(likelihood))
     names = [effect_by_name(name) for name in ("blemish", "clp_zero", "hwp1_axis")]
     trials = [
         trial("first", 10.0, names[0]),

@@ -40,11 +40,12 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.findings import Choice
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.search import Trial, model_without, try_model
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.model_file import base_model, model_like
 from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
+from walop_jax.io.text import some
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
@@ -57,6 +58,8 @@ _POINTS, _FEW = 16, 64  # field points that are looked at; sets of so few are lo
 _STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best
 _BEST = 3  # alternatives that are looked at again
 _ALL_ORDERS = 4  # cameras up to which all orders are tried, beyond pairs alone
+_EXCHANGED = 5  # worst exposures, of which two may have been exchanged
+_NO_LIGHT = 1e-3  # of the brightest camera in an exposure, below which a camera sees nothing
 _FIELD = 1.5  # of the designed field: what a field in other units must fit into
 
 Change = Callable[[CalibrationSet], CalibrationSet]
@@ -75,7 +78,8 @@ class Alternative:
     explained: float = np.inf
 
     def __str__(self) -> str:
-        return f"{self.what} (χ²/dof = {self.explained:.3g}): {self.remedy}"
+        found = f" (χ²/dof = {self.explained:.3g})" if self.explained > 0.0 else ""
+        return f"{self.what}{found}: {self.remedy}"
 
 
 def refuse_mixups(result: FitResult, policy: Policy = POLICY) -> None:
@@ -107,23 +111,28 @@ def mixups(
 
     `left` is the χ²/dof of a fit of `model`.
     """
-    if left < FAR_OFF:
+    if left < policy.poor_fit:
         return ()
     # The program that a small set was fitted with is there already.
     few = calset if len(calset.points) <= _FEW else thinned(calset, _POINTS, neighbours=1)
     block = few.intensities.block(0, len(few.points))
     seen = block.used[..., None] & (block.counts > 0)
-    if (
-        not seen.any()
-        or np.median(block.sigma[seen] / block.counts[seen]) * np.sqrt(left) < policy.reading_coarse
-    ):
+    if not seen.any():
         return ()
+    # What has gone wrong with all exposures misses all of the light by so much.
+    coarse = np.median(block.sigma[seen] / block.counts[seen]) * np.sqrt(left) >= policy.reading_coarse
     few = dataclasses.replace(few, intensities=TableIntensities.dense(few.points, block))
-    as_it_stands = Alternative("", "", lambda calset: calset)
-    left = min(left, _judged(as_it_stands, few, model, left, _STEPS[1]).explained)
-    if left < FAR_OFF:  # the fit has lost its way, not the data
+    names = model.template.cameras.names
+    if certain := tuple(one for one in _dead(few, names) if one.explained == 0.0):
+        return certain
+    likelihood = Likelihood.of(few, model)
+    stands, values = _left(likelihood, left, _STEPS[1])
+    left = min(left, stands)
+    if left < policy.poor_fit:  # the fit has lost its way, not the data
         return ()
-    for readings in (_readings(few, model), _instruments(few)):
+    of_all = (_readings(few, model), _instruments(few)) if coarse and left >= FAR_OFF else ()
+    worst = _worst_exposures(likelihood, values)
+    for readings in (_of_some_exposures(few, names, worst), *of_all):
         tried = [_judged(one, few, model, left, _STEPS[0]) for one in readings]
         best = [_judged(one, few, model, one.explained, _STEPS[1]) for one in _sorted(tried)[:_BEST]]
         enough = min(1.0 + (left - 1.0) / policy.reading_gain, FAR_OFF)
@@ -143,26 +152,40 @@ def _judged(one: Alternative, calset: CalibrationSet, model: Model, left: float,
         rewritten = one.change(calset)
         if rewritten.instrument != calset.instrument:
             model = base_model(rewritten)
-        return dataclasses.replace(one, explained=_left(Likelihood.of(rewritten, model), left, steps))
+        elif rewritten.sources is not calset.sources:  # what is known of them beforehand
+            model = model_like(rewritten, model)
+        return dataclasses.replace(one, explained=_left(Likelihood.of(rewritten, model), left, steps)[0])
     except (ValueError, np.linalg.LinAlgError):
         return one
 
 
-def _left(likelihood: Likelihood, before: float, steps: int) -> float:
-    """χ²/dof after some steps, the errors of the data scaled as `before`, then as the step before, asks for."""
+def _left(likelihood: Likelihood, before: float, steps: int) -> tuple[float, Vector]:
+    """χ²/dof after some steps, the errors of the data scaled as `before`, then as the step before, asks for; and where.
+
+    The smallest of all steps, and the values there.
+    """
     select, values, least = likelihood.model.selection(), likelihood.model.start, before
-    here, found = None, np.inf
+    here, found, best = None, np.inf, values
     for number in range(steps + 1):
         here = likelihood.expand(values, np.sqrt(max(least, 1.0)), here)
         if here.dof <= 0 or not np.isfinite(here.chi2):
             break
         least = here.chi2 / here.dof
-        found = min(found, least)
+        if least < found:
+            found, best = least, values
         if number < steps:
             width = np.sqrt(np.diag(here.matrix))
             step = np.linalg.solve(here.matrix / np.outer(width, width), here.gradient / width) / width
             values = values - select @ step
-    return found
+    return found, best
+
+
+def _worst_exposures(likelihood: Likelihood, values: Vector) -> list[int]:
+    """Exposures with the largest mean squared residuals, the worst first."""
+    _, residual = likelihood.residuals(values)
+    square = np.where(likelihood.used[..., None], residual**2, 0.0).sum(axis=(0, 2))
+    mean = square / np.maximum(likelihood.used.sum(axis=0), 1)
+    return np.argsort(-mean, kind="stable")[:_EXCHANGED].tolist()
 
 
 # ------------------------------------------------------------------------------------------- the alternatives
@@ -192,6 +215,109 @@ def _instruments(calset: CalibrationSet) -> Iterator[Alternative]:
                 f"correct INSTRUME, which says {calset.instrument}",
                 lambda calset, name=name: dataclasses.replace(calset, instrument=name),
             )
+
+
+def _of_some_exposures(
+    calset: CalibrationSet, names: Sequence[str], worst: Sequence[int]
+) -> Iterator[Alternative]:
+    """Readings that concern sky and standards, or single exposures; `names` are those of the cameras."""
+    yield from _dead(calset, names)
+    for what, remedy, asked, change in _TABLE:
+        if asked(calset):
+            yield Alternative(what, remedy, change)
+    number = calset.exposures.exposure
+    for pair in itertools.combinations(sorted(worst), 2):
+        one, other = (number[i] for i in pair)
+        yield Alternative(
+            f"the intensities of exposures {one} and {other} were exchanged",
+            "exchange their EXPOSURE numbers in the table of intensities",
+            lambda calset, pair=pair: _exchanged(calset, pair),
+        )
+
+
+def _dead(calset: CalibrationSet, names: Sequence[str]) -> Iterator[Alternative]:
+    """A camera with no light, or with one number everywhere, in some exposures: these are left out.
+
+    `explained` is 0 where it is so in all of them: nothing is left that could be fitted.
+    """
+    block = calset.intensities.block(0, len(calset.points))
+    seen = np.flatnonzero(block.used.sum(axis=0) > 2)
+    counts = np.where(block.used[..., None], block.counts, np.nan)[:, seen]
+    level = np.nanmedian(counts, axis=0)
+    still = np.nanmax(counts, axis=0) == np.nanmin(counts, axis=0)
+    dead = still | (level < _NO_LIGHT * np.nanmax(level, axis=1, keepdims=True))
+    for k in np.flatnonzero(dead.any(axis=0)):
+        off = seen[dead[:, k]]
+        if dead[:, k].all():
+            what = (
+                f"camera {names[k]} held light: it has none, or the same number everywhere, in all exposures"
+            )
+            yield Alternative(what, "check its column of N and the camera", lambda calset: calset, 0.0)
+            continue
+        listed = some([str(one) for one in calset.exposures.exposure[off]], 6)
+        yield Alternative(
+            f"exposures {listed} were left out, in which camera {names[k]} holds no light",
+            "leave them out, or reduce them again",
+            lambda calset, off=off: _without_exposures(calset, off),
+        )
+
+
+def _without_exposures(calset: CalibrationSet, off: np.ndarray) -> CalibrationSet:
+    there = calset.intensities.block(0, len(calset.points))
+    used = there.used.copy()
+    used[:, off] = False
+    block = dataclasses.replace(there, used=used)
+    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+
+
+def _exchanged(calset: CalibrationSet, pair: tuple[int, int]) -> CalibrationSet:
+    """The set with the conditions of two exposures exchanged: angles, time, pointing, all but the number."""
+    order = np.arange(len(calset.exposures))
+    order[list(pair)] = pair[::-1]
+    swapped = dataclasses.replace(calset.exposures[order], exposure=calset.exposures.exposure)
+    return dataclasses.replace(calset, exposures=swapped)
+
+
+def _with_sources(turn: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Change:
+    def change(calset: CalibrationSet) -> CalibrationSet:
+        q, u = turn(calset.sources.q, calset.sources.u)
+        return dataclasses.replace(calset, sources=dataclasses.replace(calset.sources, q=q, u=u))
+
+    return change
+
+
+def _with_column(column: str, turn: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return with_exposures(lambda e: dataclasses.replace(e, **{column: turn(getattr(e, column))}))
+
+
+def _with_site(name: str) -> Change:
+    """The set with a coordinate of the site of the other sign."""
+
+    def change(calset: CalibrationSet) -> CalibrationSet:
+        site = dataclasses.replace(calset.site, **{name: -getattr(calset.site, name)})
+        return dataclasses.replace(calset, site=site)
+
+    return change
+
+
+def _has_stars(calset: CalibrationSet) -> bool:
+    return bool(len(calset.sources.q) and np.hypot(calset.sources.q, calset.sources.u).max() > 0.0)
+
+
+def _has_moon(calset: CalibrationSet) -> bool:
+    e = calset.exposures
+    return bool(((e.kind == "moon") & np.isfinite(e.ra) & np.isfinite(e.dec)).any())
+
+
+def _has_rotator(calset: CalibrationSet) -> bool:
+    return bool(np.isfinite(calset.exposures.rotator).any())
+
+
+def _below(column: str, most: float) -> Callable[[CalibrationSet], bool]:
+    def asked(calset: CalibrationSet) -> bool:
+        return _has_moon(calset) and float(np.nanmax(np.abs(getattr(calset.exposures, column)))) <= most
+
+    return asked
 
 
 def _orders(model: Model) -> Iterator[Alternative]:
@@ -231,17 +357,6 @@ def _angles(calset: CalibrationSet) -> Iterator[Alternative]:
             yield Alternative(
                 f"{column} is in radians", "give degrees, or the unit of the column", _with_angle(prefix, np.rad2deg)
             )  # fmt: skip
-    if np.isfinite(e.rotator).any():
-        for words, change in (
-            ("runs the other way", lambda a: -a),
-            ("is 90° too small", lambda a: a + 90.0),
-            ("is in radians", np.rad2deg),
-        ):
-            yield Alternative(
-                f"ROTATOR {words}",
-                "correct it (docs: conventions)",
-                with_exposures(lambda e, change=change: dataclasses.replace(e, rotator=change(e.rotator))),
-            )
 
 
 def _fields(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
@@ -300,6 +415,36 @@ def _with_angle(prefix: str, turned: Callable[[np.ndarray], np.ndarray]) -> Chan
 def with_exposures(change: Callable[[Exposures], Exposures]) -> Change:
     """A set with other exposures."""
     return lambda calset: dataclasses.replace(calset, exposures=change(calset.exposures))
+
+
+_AT = "give degrees, or the unit of the column"
+_TABLE: tuple[tuple[str, str, Callable[[CalibrationSet], bool], Change], ...] = (
+    ("U of SOURCES had the other sign", "give −U (docs: conventions)", _has_stars, _with_sources(lambda q, u: (q, -u))),
+    ("Q of SOURCES had the other sign", "give −Q (docs: conventions)", _has_stars, _with_sources(lambda q, u: (-q, u))),
+    ("Q and U of SOURCES both had the other sign", "give −Q and −U", _has_stars, _with_sources(lambda q, u: (-q, -u))),
+    ("Q and U of SOURCES were exchanged", "exchange them", _has_stars, _with_sources(lambda q, u: (u, q))),
+    ("Q and U of SOURCES are in per cent", "give fractions", _has_stars,
+     _with_sources(lambda q, u: (q / 100.0, u / 100.0))),
+    ("ROTATOR runs the other way", "correct it (docs: conventions)", _has_rotator,
+     _with_column("rotator", lambda a: -a)),
+    ("ROTATOR is 90° too small", "correct it (docs: conventions)", _has_rotator,
+     _with_column("rotator", lambda a: a + 90.0)),
+    ("ROTATOR is in radians", "correct it (docs: conventions)", _has_rotator, _with_column("rotator", np.rad2deg)),
+    ("RA is in hours", _AT, _below("ra", 24.0), _with_column("ra", lambda a: 15.0 * a)),
+    ("RA is in radians", _AT, _below("ra", 2.0 * np.pi), _with_column("ra", np.rad2deg)),
+    ("DEC is in radians", _AT, _below("dec", 0.5 * np.pi), _with_column("dec", np.rad2deg)),
+    ("RA and DEC are exchanged", "exchange them", _below("ra", 90.0),
+     with_exposures(lambda e: dataclasses.replace(e, ra=np.mod(e.dec, 360.0), dec=e.ra))),
+    ("DEC has the other sign", "give −DEC", _has_moon, _with_column("dec", lambda a: -a)),
+    *(
+        (f"MJD is {abs(days):g} d too {'large' if days > 0 else 'small'}",
+         "give MJD = JD − 2400000.5, UTC at mid-exposure", _has_moon, _with_column("mjd", lambda t, d=days: t - d))
+        for days in (0.5, -0.5, 1.0, -1.0)
+    ),
+    ("SITELONG has the other sign", "east is positive", _has_moon, _with_site("longitude")),
+    ("SITELAT has the other sign", "north is positive", _has_moon, _with_site("latitude")),
+)  # fmt: skip
+"""Readings of sky and standards: what must have happened, what to do, the sets it can have happened to, the cure."""
 
 
 # --------------------------------------------------------------------------------- other descriptions of the instrument

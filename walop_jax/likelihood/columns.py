@@ -338,14 +338,14 @@ class Columns:
         every, first = [piece for each in pieces for piece in each], 0
         for start in range(0, len(used), size):
             rows = cameras * int(used[start : start + size].sum())
-            block = Block(self, start, every)
+            block = ResponseBlock(self, start, every)
             for some, found in parts:
                 block.fill(some, found[:, first : first + rows])
             first += rows
         return parts[0][1].T, parts[1][1].T
 
 
-class Block:
+class ResponseBlock:
     """Some field points: responses brought together with their exposures.
 
     Arrays run over sites (m), cameras (k) and pairs of point and exposure (n): those that are used, or all of them

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.columns import SLOTS, Block, Change, Columns, Laid, generator
+from walop_jax.likelihood.columns import SLOTS, Change, Columns, Laid, ResponseBlock, generator
 from walop_jax.likelihood.pieces import Piece
 from walop_jax.model.effects.factors import FIELD, factor
 
@@ -28,14 +28,14 @@ def added_to_starlight(
     pieces = [columns.pieces_of(change) for change in changes]
     points, size, found = len(columns.likelihood.used), limits.RESPONSES_TOGETHER, []
     for start in range(0, points, size):
-        parts = _at_points(Block(columns, start, ()), pieces, exposure)
+        parts = _at_points(ResponseBlock(columns, start, ()), pieces, exposure)
         found.append(tuple(part[: points - start] for part in parts))
     vectors, added = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return vectors, added
 
 
 def _at_points(
-    block: Block, changes: Sequence[Sequence[Piece]], exposure: int
+    block: ResponseBlock, changes: Sequence[Sequence[Piece]], exposure: int
 ) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
     every, band = np.arange(len(block.x)), block.band[:, exposure]
     vectors = block.found.vectors.vectors[every, 0, band]  # p k 4
