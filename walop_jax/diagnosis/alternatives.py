@@ -59,7 +59,8 @@ _STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best
 _BEST = 3  # alternatives that are looked at again
 _ALL_ORDERS = 4  # cameras up to which all orders are tried, beyond pairs alone
 _EXCHANGED = 5  # worst exposures, of which two may have been exchanged
-_NO_LIGHT = 1e-3  # of the brightest camera in an exposure, below which a camera sees nothing
+_NO_LIGHT = 0.05  # of what is expected, below which a camera sees nothing, …
+_MISSING = 20.0  # … if as many standard errors are missing
 _FIELD = 1.5  # of the designed field: what a field in other units must fit into
 
 Change = Callable[[CalibrationSet], CalibrationSet]
@@ -78,8 +79,7 @@ class Alternative:
     explained: float = np.inf
 
     def __str__(self) -> str:
-        found = f" (χ²/dof = {self.explained:.3g})" if self.explained > 0.0 else ""
-        return f"{self.what}{found}: {self.remedy}"
+        return f"{self.what} (χ²/dof = {self.explained:.3g}): {self.remedy}"
 
 
 def refuse_mixups(result: FitResult, policy: Policy = POLICY) -> None:
@@ -122,17 +122,13 @@ def mixups(
     # What has gone wrong with all exposures misses all of the light by so much.
     coarse = np.median(block.sigma[seen] / block.counts[seen]) * np.sqrt(left) >= policy.reading_coarse
     few = dataclasses.replace(few, intensities=TableIntensities.dense(few.points, block))
-    names = model.template.cameras.names
-    if certain := tuple(one for one in _dead(few, names) if one.explained == 0.0):
-        return certain
     likelihood = Likelihood.of(few, model)
     stands, values = _left(likelihood, left, _STEPS[1])
     left = min(left, stands)
     if left < policy.poor_fit:  # the fit has lost its way, not the data
         return ()
     of_all = (_readings(few, model), _instruments(few)) if coarse and left >= FAR_OFF else ()
-    worst = _worst_exposures(likelihood, values)
-    for readings in (_of_some_exposures(few, names, worst), *of_all):
+    for readings in (_of_some_exposures(likelihood, _worst_exposures(likelihood, values)), *of_all):
         tried = [_judged(one, few, model, left, _STEPS[0]) for one in readings]
         best = [_judged(one, few, model, one.explained, _STEPS[1]) for one in _sorted(tried)[:_BEST]]
         enough = min(1.0 + (left - 1.0) / policy.reading_gain, FAR_OFF)
@@ -217,13 +213,12 @@ def _instruments(calset: CalibrationSet) -> Iterator[Alternative]:
             )
 
 
-def _of_some_exposures(
-    calset: CalibrationSet, names: Sequence[str], worst: Sequence[int]
-) -> Iterator[Alternative]:
-    """Readings that concern sky and standards, or single exposures; `names` are those of the cameras."""
-    yield from _dead(calset, names)
+def _of_some_exposures(likelihood: Likelihood, worst: Sequence[int]) -> Iterator[Alternative]:
+    """Readings that concern sky and standards, or single exposures, where these are among the worst."""
+    yield from _dead(likelihood)
+    calset = likelihood.calset
     for what, remedy, asked, change in _TABLE:
-        if asked(calset):
+        if asked(calset, calset.exposures[np.array(worst)]):
             yield Alternative(what, remedy, change)
     number = calset.exposures.exposure
     for pair in itertools.combinations(sorted(worst), 2):
@@ -235,28 +230,41 @@ def _of_some_exposures(
         )
 
 
-def _dead(calset: CalibrationSet, names: Sequence[str]) -> Iterator[Alternative]:
-    """A camera with no light, or with one number everywhere, in some exposures: these are left out.
+def refuse_dead_cameras(result: FitResult) -> None:
+    """Raise `DataError` for a camera with the same number at all field points of all exposures.
 
-    `explained` is 0 where it is so in all of them: nothing is left that could be fitted.
+    A fit takes that for a camera that sees little light.
     """
-    block = calset.intensities.block(0, len(calset.points))
-    seen = np.flatnonzero(block.used.sum(axis=0) > 2)
+    calset = result.calset
+    block = calset.intensities.block(0, min(len(calset.points), _FEW))
+    seen = block.used.sum(axis=0) > 1
     counts = np.where(block.used[..., None], block.counts, np.nan)[:, seen]
-    level = np.nanmedian(counts, axis=0)
-    still = np.nanmax(counts, axis=0) == np.nanmin(counts, axis=0)
-    dead = still | (level < _NO_LIGHT * np.nanmax(level, axis=1, keepdims=True))
-    for k in np.flatnonzero(dead.any(axis=0)):
+    if not seen.any():
+        return
+    still = np.all(np.nanmax(counts, axis=0) == np.nanmin(counts, axis=0), axis=0)
+    if still.any():
+        names = ", ".join(np.array(result.model.template.cameras.names)[still])
+        raise DataError(
+            f"INTENSITIES, N: camera {names} has the same number at all field points: it was dead, or its column was "
+            "not filled; check it, or describe an instrument without it"
+        )
+
+
+def _dead(likelihood: Likelihood) -> Iterator[Alternative]:
+    """A camera that sees nothing where the instrument as designed expects light, in some exposures: these left out."""
+    calset, model = likelihood.calset, likelihood.model
+    block = calset.intensities.block(0, len(calset.points))
+    _, residual = likelihood.residuals(model.start)
+    lacking = np.where(block.used[..., None], residual, np.nan)
+    seen = np.flatnonzero(block.used.any(axis=0))
+    expected = np.nanmedian((block.counts - lacking * block.sigma)[:, seen], axis=0)
+    level = np.nanmedian(np.where(block.used[..., None], block.counts, np.nan)[:, seen], axis=0)
+    dead = (level < _NO_LIGHT * expected) & (np.nanmedian(lacking[:, seen], axis=0) < -_MISSING)
+    for k in np.flatnonzero(dead.any(axis=0) & ~dead.all(axis=0)):
         off = seen[dead[:, k]]
-        if dead[:, k].all():
-            what = (
-                f"camera {names[k]} held light: it has none, or the same number everywhere, in all exposures"
-            )
-            yield Alternative(what, "check its column of N and the camera", lambda calset: calset, 0.0)
-            continue
         listed = some([str(one) for one in calset.exposures.exposure[off]], 6)
         yield Alternative(
-            f"exposures {listed} were left out, in which camera {names[k]} holds no light",
+            f"exposures {listed} were left out, in which camera {model.template.cameras.names[k]} holds no light",
             "leave them out, or reduce them again",
             lambda calset, off=off: _without_exposures(calset, off),
         )
@@ -300,22 +308,25 @@ def _with_site(name: str) -> Change:
     return change
 
 
-def _has_stars(calset: CalibrationSet) -> bool:
-    return bool(len(calset.sources.q) and np.hypot(calset.sources.q, calset.sources.u).max() > 0.0)
+def _has_stars(calset: CalibrationSet, worst: Exposures) -> bool:
+    known = bool(len(calset.sources) and np.hypot(calset.sources.q, calset.sources.u).max() > 0.0)
+    return known and "standard" in worst.kind
 
 
-def _has_moon(calset: CalibrationSet) -> bool:
-    e = calset.exposures
-    return bool(((e.kind == "moon") & np.isfinite(e.ra) & np.isfinite(e.dec)).any())
+def _has_moon(calset: CalibrationSet, worst: Exposures) -> bool:
+    return bool(((worst.kind == "moon") & np.isfinite(worst.ra) & np.isfinite(worst.dec)).any())
 
 
-def _has_rotator(calset: CalibrationSet) -> bool:
-    return bool(np.isfinite(calset.exposures.rotator).any())
+def _has_rotator(calset: CalibrationSet, worst: Exposures) -> bool:
+    return bool(np.isfinite(worst.rotator).any())
 
 
-def _below(column: str, most: float) -> Callable[[CalibrationSet], bool]:
-    def asked(calset: CalibrationSet) -> bool:
-        return _has_moon(calset) and float(np.nanmax(np.abs(getattr(calset.exposures, column)))) <= most
+def _below(column: str, most: float) -> Callable[[CalibrationSet, Exposures], bool]:
+    """Moon exposures in which a column is nowhere larger."""
+
+    def asked(calset: CalibrationSet, worst: Exposures) -> bool:
+        values = np.abs(getattr(calset.exposures, column))
+        return _has_moon(calset, worst) and float(np.nanmax(values)) <= most
 
     return asked
 
@@ -418,7 +429,7 @@ def with_exposures(change: Callable[[Exposures], Exposures]) -> Change:
 
 
 _AT = "give degrees, or the unit of the column"
-_TABLE: tuple[tuple[str, str, Callable[[CalibrationSet], bool], Change], ...] = (
+_TABLE: tuple[tuple[str, str, Callable[[CalibrationSet, Exposures], bool], Change], ...] = (
     ("U of SOURCES had the other sign", "give −U (docs: conventions)", _has_stars, _with_sources(lambda q, u: (q, -u))),
     ("Q of SOURCES had the other sign", "give −Q (docs: conventions)", _has_stars, _with_sources(lambda q, u: (-q, u))),
     ("Q and U of SOURCES both had the other sign", "give −Q and −U", _has_stars, _with_sources(lambda q, u: (-q, -u))),

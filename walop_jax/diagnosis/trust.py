@@ -35,7 +35,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import special
 
-from walop_jax.diagnosis.alternatives import refuse_mixups
+from walop_jax.diagnosis.alternatives import refuse_dead_cameras, refuse_mixups
 from walop_jax.diagnosis.design import Design, pattern_scores
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.policy import POLICY, Policy
@@ -80,6 +80,7 @@ def examined(
     standard errors are made from the residuals. Raises `DataError` with the remedy for data that another reading
     explains.
     """
+    refuse_dead_cameras(result)
     result = with_pixels(result)
     if not result.converged:
         if not as_written and result.chi2 > FAR_OFF * max(result.dof, 1):
