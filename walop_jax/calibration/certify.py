@@ -147,7 +147,7 @@ def _physics(calibration: Calibration) -> Check:
 
 
 def _protection(calibration: Calibration) -> Iterator[Check]:
-    """What could hide is stated, as large as the data leave it; what they do not measure at all fails.
+    """A statement of what could hide, as large as the data leave it; what they do not measure at all fails.
 
     It may do no more to stars than `UNMEASURED`.
     """

@@ -1,4 +1,4 @@
-"""What could hide: single mistakes that the data of a calibration would not have shown, and what they do to stars.
+"""Mistakes that could hide: single ones that the data of a calibration would not have shown, and what they do to stars.
 
 A mistake moves the parameters of the fit by δθ; of what acts on starlight itself the light of stars changes as well.
 Stars are seen through m + δm and calibrated with m + ∂m/∂θ δθ, so that q and u are wrong by
@@ -69,7 +69,7 @@ class CouldHide(NamedTuple):
 
 
 def unmeasured(mistakes: Iterable[CouldHide]) -> dict[str, CouldHide]:
-    """What the data do not measure, by its names: what one measurement would show together, with the worst of it."""
+    """Mistakes that the data do not measure, by their names: those that one measurement would show together, with the worst."""
     together: dict[str, list[CouldHide]] = {}
     for one in mistakes:
         if not one.measured:

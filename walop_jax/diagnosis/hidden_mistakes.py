@@ -141,7 +141,7 @@ def _mistakes(design: Design, singles: Singles, usual: int, policy: Policy) -> I
 
 
 class _Starlight:
-    """What the effects that are asked do to starlight in the setting of an exposure."""
+    """Change of starlight by the effects that are asked, in the setting of an exposure."""
 
     def __init__(self, design: Design, exposure: int) -> None:
         self.fit, self.asked = design.fit, asked_effects(design)

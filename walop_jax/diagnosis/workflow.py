@@ -54,7 +54,7 @@ from walop_jax.diagnosis.search import (
     try_shapes,
     with_refuted_priors_widened,
 )
-from walop_jax.diagnosis.stated_conditions import rival_conditions
+from walop_jax.diagnosis.stated_conditions import instead_of_names, rival_conditions
 from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
@@ -117,6 +117,11 @@ def diagnose(
     # Another reading that comes near competes with names and with other descriptions of the instrument.
     if nameless and readings and readings[0].explained * judge.fit.dof < judge.fit.chi2:
         raise refusal(before, readings)
+    if judge.steps and (stated := instead_of_names(before, judge.fit, policy)):
+        names = ", ".join(step.effect for step in judge.steps)
+        text = f"one number that the set states explains more than names do ({names}), if it is {stated}"
+        nameless = Unexplained(first.table.p_global, text, ())
+        judge, last = dataclasses.replace(judge, fit=before, steps=[]), first
     steps = tuple(judge.finished(step, last) for step in judge.steps)
     verdict: Outcome = "unexplained" if nameless else "effect_found" if steps else "consistent"
     tell("examining what is left")

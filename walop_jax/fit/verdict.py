@@ -132,7 +132,7 @@ class Hidden:
         return zip(self.names, self.sizes, self.units, strict=True)
 
     def not_measured(self) -> tuple[str, ...]:
-        """What the data hold no information on, with what would measure it."""
+        """Names of all that the data hold no information on, with what would measure it."""
         together: dict[str, list[str]] = {}
         for name, remedy, measured in zip(self.names, self.remedies, self.measured, strict=True):
             if not measured:
