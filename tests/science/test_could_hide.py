@@ -140,7 +140,7 @@ def test_what_an_effect_does_to_starlight_is_that_of_the_light_path(name):
     """From the responses, in the colour of the lamp, against the matrix of an instrument that has the effect."""
     fit = small_fit()
     design = Design.of(fit)
-    of_stars = _Starlight(design, 0)
+    of_stars = _Starlight(design, Singles.of(design).asked, 0)
     (probe,) = [one for one in of_stars.asked if one.effect.name == name]
     count = len(probe.widths)
     none = np.zeros((design.projector.basis.shape[1], count))

@@ -69,7 +69,7 @@ class CouldHide(NamedTuple):
 
 
 def unmeasured(mistakes: Iterable[CouldHide]) -> dict[str, CouldHide]:
-    """Mistakes that the data do not measure, by their names: those that one measurement would show together, with the worst."""
+    """Mistakes that the data do not measure, by their names: what one measurement would show together."""
     together: dict[str, list[CouldHide]] = {}
     for one in mistakes:
         if not one.measured:
@@ -191,6 +191,11 @@ def with_effect(instrument: Instrument, effect: Effect) -> Instrument:
 
 def turn_of(instrument: Instrument, effect: Effect) -> float:
     """Angle (rad) by which an effect turns the sky against the instrument, beyond ROTATOR."""
+    changes = [
+        one for each in effect.first_order(dataclasses.replace(instrument, effects=())) for _, one in each
+    ]
+    if changes and all(one.kind != "rotator" for one in changes):
+        return 0.0
     zeros = (one.patched().rotator_zero for one in (with_effect(instrument, effect), instrument))
     after, before = (0.0 if zero is None else float(zero) for zero in zeros)
     return float(np.deg2rad(after - before))

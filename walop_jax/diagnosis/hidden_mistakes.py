@@ -30,7 +30,7 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.limits_found import PROBABILITY
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import local_p, noncentrality
-from walop_jax.diagnosis.stated_conditions import Singles, asked_effects
+from walop_jax.diagnosis.stated_conditions import Singles
 from walop_jax.fit.verdict import DATA, EFFECT, Hidden
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.starlight import added_to_starlight
@@ -112,7 +112,7 @@ def hidden_mistakes(design: Design, singles: Singles, policy: Policy = POLICY) -
 
 def _mistakes(design: Design, singles: Singles, usual: int, policy: Policy) -> Iterator[_Mistake]:
     """All of them, amplitude by amplitude."""
-    of_stars = _Starlight(design, usual)
+    of_stars = _Starlight(design, singles.asked, usual)
     p, first = local_p(policy.alarm, len(singles.testable)), 0
     shown = set()
     for one in singles.rivals:
@@ -143,8 +143,8 @@ def _mistakes(design: Design, singles: Singles, usual: int, policy: Policy) -> I
 class _Starlight:
     """Change of starlight by the effects that are asked, in the setting of an exposure."""
 
-    def __init__(self, design: Design, exposure: int) -> None:
-        self.fit, self.asked = design.fit, asked_effects(design)
+    def __init__(self, design: Design, asked: Sequence[Probe], exposure: int) -> None:
+        self.fit, self.asked = design.fit, asked
         template, calset = self.fit.model.template, self.fit.calset
         self.instrument = self.fit.model.instrument(self.fit.values)
         self.setting = first_setting(calset, self.instrument, exposure)

@@ -162,7 +162,7 @@ class DetectionLimits(Displayed):
         return tuple(sorted((*self.could_hide, *others), key=lambda one: (-one.error[0], -one.error[1])))
 
     def display(self) -> Display:
-        """The worst that could hide in a sentence; a row for each effect and parameter, and each statement of the set."""
+        """The worst that could hide in a sentence; a row for each effect and parameter, and each number of the set."""
         effects = {f"{entry.effect}.{entry.parameter}": entry for entry in self.limits}
         conditions = {entry.what: entry for entry in self.conditions}
         rows: list[tuple[str, ...]] = []

@@ -123,7 +123,7 @@ class Singles:
     """All single numbers of a fit with their scores.
 
     `along` (q, columns) is what the parameters take up of their columns, Qᵀ C; `left` the square of what they leave,
-    `alive` where that is information on them.
+    `alive` where that is information on them. `asked` are the effects among them, and those that the set cannot show.
     """
 
     rivals: tuple[_Single, ...]
@@ -131,13 +131,14 @@ class Singles:
     along: Float[np.ndarray, "q c"]
     left: Float[np.ndarray, " c"]
     alive: Bool[np.ndarray, " c"]
+    asked: tuple[Probe, ...] = ()
 
     @classmethod
     def of(cls, design: Design) -> Singles:
         """Conditions that the set states, priors, terms of a camera that have one amplitude, effects with a name."""
-        return scored(
-            design, (*_conditions(design), *_priors(design), *_of_cameras(design), *_of_catalogue(design))
-        )
+        asked = _asked_effects(design)
+        rivals = (*_conditions(design), *_priors(design), *_of_cameras(design), *_of_catalogue(design, asked))
+        return dataclasses.replace(scored(design, rivals), asked=asked)
 
     @property
     def testable(self) -> list[Score]:
@@ -318,20 +319,20 @@ def _of_cameras(design: Design) -> Iterator[_Single]:
                 yield single(k, counts[..., other], 0.02, words, "of its counts", _ONE_STAR)
 
 
-def asked_effects(design: Design) -> list[Probe]:
+def _asked_effects(design: Design) -> tuple[Probe, ...]:
     """Probes of effects that the model has not; those with a place or a gap of their own are left to the patterns."""
     fit = design.fit
     template, calset = fit.model.template, fit.calset
     context, known = effect_context(template, calset.exposures), (*fit.model.effect_names, *_ASKED_OTHERWISE)
     kinds = [kind for kind in fit.model.catalogue if kind.name not in known and not set(kind.shape) & _PLACES]
-    return list(probes(applicable(kinds, context, template), context))
+    return tuple(probes(applicable(kinds, context, template), context))
 
 
-def _of_catalogue(design: Design) -> Iterator[_Single]:
+def _of_catalogue(design: Design, asked: Sequence[Probe]) -> Iterator[_Single]:
     """The effects that are asked, as far as the set can show them."""
     fit = design.fit
     template = fit.model.template
-    wanted = showable(fit.calset, template, asked_effects(design))
+    wanted = showable(fit.calset, template, asked)
     named, _ = all_candidates(fit.likelihood, fit.values, wanted, ())
     for probe in (one for one in wanted if one.name in named):
         rows = design.stacked([named[probe.name].columns])
