@@ -10,14 +10,14 @@ from scenes import PLAN
 from scipy import integrate, stats
 
 from walop_jax.calibration.matrix import largest_change
-from walop_jax.diagnosis import search
+from walop_jax.diagnosis import search, workflow
 from walop_jax.diagnosis.design import Design, Measured, strata
 from walop_jax.diagnosis.examination import Evidence, upper_limit
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model
-from walop_jax.fit.refit import fit
+from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.columns import own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described, FreeForm, effect_by_name
@@ -287,10 +287,43 @@ def test_a_name_must_explain_a_quarter_of_what_is_surely_missing(effect, chi2, e
         dof=10_000,
         poor=chi2 > 15_000,
         floor=1.0,
-        least_evidence=POLICY.least_evidence,
+        evidence_needed=0.0,
         policy=POLICY,
         probes=(),
         stands=lambda *_: True,
     )
     worth = Evidence.is_worth_telling(state, effect, 50.0, chi2 - explained, noise=False)
     assert worth is told
+
+
+def test_decided_keeps_every_trial_once(monkeypatch):
+    """Names of evidence 10, 8.9 and 6.9, and a sentence of 9.8, which needs 3 more than a name and so comes last.
+
+    Fitted with errors as stated the second name is better by χ² 8 than the first, and the sentence by 2: the sentence
+    at 9.8 − ½ · 6 = 6.8 stays behind the name.
+    """
+    objective = {"first": 100.0, "second": 92.0, "said": 98.0, "third": 90.0}
+
+    def result(name):
+        found = object.__new__(FitResult)
+        vars(found).update(likelihood=name, values=None, posterior=SimpleNamespace(objective=objective[name]))
+        return found
+
+    def trial(name, evidence, effect):
+        return search.Trial(effect, evidence, 0.0, False, fit=result(name))
+
+    monkeypatch.setattr(workflow, "fit", lambda likelihood, **_: result(likelihood))
+    names = [effect_by_name(name) for name in ("blemish", "clp_zero", "hwp1_axis")]
+    trials = [
+        trial("first", 10.0, names[0]),
+        trial("second", 8.9, names[1]),
+        trial("third", 6.9, names[2]),
+        trial("said", 9.8, Described),
+    ]
+    assert trials == sorted(trials, key=lambda one: search.names_first(one, POLICY))
+    judge = SimpleNamespace(fit=SimpleNamespace(noise_scale=30.0), policy=POLICY)
+    ordered = workflow.Refit.decided(judge, list(trials))
+    assert [one.fit.likelihood for one in ordered] == ["second", "first", "said", "third"]
+    assert [one.evidence for one in ordered] == pytest.approx([8.9, 6.0, 6.8, 6.9], abs=1e-12)
+    judge.fit.noise_scale = 1.0
+    assert workflow.Refit.decided(judge, list(trials)) == trials

@@ -78,6 +78,30 @@ def unpolarised(simulated: Simulated) -> CalibrationSet:
     return dataclasses.replace(calset, intensities=table)
 
 
+def with_standards(calset: CalibrationSet, **columns: np.ndarray) -> CalibrationSet:
+    return dataclasses.replace(calset, sources=dataclasses.replace(calset.sources, **columns))
+
+
+def with_intensities(
+    calset: CalibrationSet, order: dict[int, int] | None = None, dead: tuple[int, slice] | None = None
+) -> CalibrationSet:
+    """Intensities of exposures exchanged; a camera that saw nothing but 700 electrons of bias in some of them."""
+    block, here = calset.intensities.block(0, len(calset.points)), np.arange(len(calset.exposures))
+    for one, other in (order or {}).items():
+        here[one] = other
+    counts, sigma = block.counts[:, here].copy(), block.sigma[:, here].copy()
+    if dead is not None:
+        camera, some = dead
+        counts[:, some, camera] = 700.0 + 30.0 * np.random.default_rng(2).standard_normal(
+            counts[:, some, camera].shape
+        )
+        sigma[:, some, camera] = 30.0
+    block = dataclasses.replace(
+        block, counts=counts, sigma=sigma, used=block.used[:, here], source=block.source[:, here]
+    )
+    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+
+
 Spoil = Callable[[CalibrationSet], CalibrationSet]
 CASES: dict[str, tuple[Spoil, str]] = {
     "the arms exchanged": (lambda c: with_data(c, (2, 3, 0, 1)), "their order is O1, E1, O2, E2"),
@@ -94,10 +118,28 @@ CASES: dict[str, tuple[Spoil, str]] = {
     "Y mirrored": (lambda c: with_data(c, y=-c.points.y), "give −Y"),
     "turned by 90 degrees": (lambda c: with_data(c, x=c.points.y, y=-c.points.x), "give −Y as X, and X as Y"),
     "arcminutes": (lambda c: with_data(c, x=60 * c.points.x, y=60 * c.points.y), "X and Y are in arcmin"),
+    "Q of standards of the other sign": (lambda c: with_standards(c, q=-c.sources.q, u=c.sources.u), "give −Q"),
+    "standards in per cent": (
+        lambda c: with_standards(c, q=100 * c.sources.q, u=100 * c.sources.u), "Q and U of SOURCES are in per cent",
+    ),
+    "RA in hours": (lambda c: with_angle(c, ra=c.exposures.ra / 15), "RA is in hours"),
+    "MJD = JD - 2400000": (lambda c: with_angle(c, mjd=c.exposures.mjd + 0.5), "MJD is 0.5 d too large"),
+    "half a day early": (lambda c: with_angle(c, mjd=c.exposures.mjd - 0.5), "MJD is 0.5 d too small"),
+    "DEC of the other sign": (lambda c: with_angle(c, dec=-c.exposures.dec), "give −DEC"),
+    "two exposures exchanged": (
+        lambda c: with_intensities(c, {1: 4, 4: 1}), "intensities of exposures 1 and 4 were exchanged",
+    ),
+    "two patches exchanged": (
+        lambda c: with_intensities(c, {8: 9, 9: 8}), "intensities of exposures 8 and 9 were exchanged",
+    ),
+    "a camera dead for a while": (
+        lambda c: with_intensities(c, dead=(1, slice(3, 6))), "exposures 3, 4, 5 were left out, in which camera E1",
+    ),
     "South labelled North": (lambda c: dataclasses.replace(c, instrument="WALOP-NORTH"), "they came from WALOP-SOUTH"),
 }  # fmt: skip
 
 OF_THE_PLATE = {"plate backwards"}
+TWO = {*OF_THE_PLATE, "Q of standards of the other sign"}  # the one polarised standard has hardly any u
 
 
 def test_angles_are_rewritten_as_the_remedy_says(calset):
@@ -116,15 +158,36 @@ def test_angles_are_rewritten_as_the_remedy_says(calset):
     assert found == 14
 
 
-@pytest.mark.parametrize("name", quick(CASES, ["the polariser runs backwards"]))
+@pytest.mark.parametrize("name", quick(CASES, ["the polariser runs backwards", "two exposures exchanged"]))
 def test_every_mix_up_is_told_with_its_remedy(request, name):
     spoil, said = CASES[name]
     bad = spoil(request.getfixturevalue("calset" if name in OF_THE_PLATE else "without_plate"))
     found = mixups(bad, base_model(bad), left=1e5)
     # A plate at a single angle does not tell another sense from another zero.
-    assert len(found) == (2 if name in OF_THE_PLATE else 1)
+    assert len(found) == (2 if name in TWO else 1)
     assert any(re.search(said, str(one)) for one in found)
     assert found[0].explained < 1.5
+
+
+def test_the_other_sign_of_u_is_told():
+    """Of standards with as much u as q, in the sky of the truth: the catalogue has the other convention."""
+    made = simulate(PLAN, seed=8)
+    sources = made.calset.sources
+    assert np.abs(sources.u).max() > 0.02
+    bad = with_standards(made.calset, u=-sources.u)
+    found = mixups(bad, base_model(bad), left=1e5)
+    assert any(one.what == "U of SOURCES had the other sign" for one in found)
+    assert found[0].explained < 1.5
+
+
+def test_a_camera_with_one_number_everywhere_is_refused(without_plate):
+    """Its errors as large as those of light, a fit takes it for a camera of low throughput: χ²/dof 1."""
+    block = without_plate.intensities.block(0, len(without_plate.points))
+    counts = block.counts.copy()
+    counts[..., 2] = 500.0
+    table = TableIntensities.dense(without_plate.points, dataclasses.replace(block, counts=counts))
+    with pytest.raises(DataError, match="camera O2 has the same number at all field points"):
+        examined(plain_refit(dataclasses.replace(without_plate, intensities=table)))
 
 
 @pytest.mark.long

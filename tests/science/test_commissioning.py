@@ -52,7 +52,12 @@ def test_what_is_not_trusted_is_no_go():
 
 
 def test_mistakes_that_could_hide_are_told_but_forbid_nothing():
-    found = commissioning(small_fit(), accuracy(hidden=3e-3, hidden_by="the scale of X and Y (wrong by 2 %)"))
+    found = commissioning(
+        small_fit(),
+        accuracy(
+            hidden=3e-3, hidden_by="the scale of X and Y (wrong by 2 %)", remedy="check the field positions"
+        ),
+    )
     assert found.go
     assert any("off by 0.30 %" in text and "field positions" in text for text in found.missing)
 

@@ -66,11 +66,12 @@ def test_what_limits_it_is_what_alone_is_uncertain():
         assert found is not None
         assert found.limited_by == f"{GROUPS[part]} (100 % of the variance)"
     change = np.where(np.array(calibration.model.names) == "collimator.q", 0.002, 0.0)
-    hidden = Hidden(("the scale of X and Y",), (0.02,), ("",), change[None])
+    check = "an independent check of the field positions"
+    hidden = Hidden(("the scale of X and Y",), (0.02,), ("",), change[None], remedies=(check,))
     found = field_accuracy(dataclasses.replace(calibration, hidden=hidden), size=3)
     assert found is not None
     # A diattenuation of the light ahead of everything is an offset of q: 0.002, but for what p does to second order.
     np.testing.assert_allclose(found.hidden, 0.002, rtol=0.1)
     told = dict(found.facts())
     assert told["could hide"].endswith("from the scale of X and Y (if wrong by 2 %)")
-    assert told["to see that"] == "an independent check of the field positions"
+    assert told["to see that"] == check

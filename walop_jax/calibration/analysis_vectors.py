@@ -13,7 +13,8 @@ throughput series only through its local values.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.could_hide import acting_effects, acts_in, turn_of, with_effect
 from walop_jax.calibration.matrix import in_chunks, sky_vectors
 from walop_jax.data.settings import Settings
 from walop_jax.likelihood import optics
@@ -31,6 +33,7 @@ from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import needs
+from walop_jax.model.effects import Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import with_values
 from walop_jax.model.plan import Plan
@@ -43,6 +46,7 @@ NODES = (20, 28, 40, 56, 80)  # per side, tried in turn
 DERIVATIVE_NODES = (14, 20, 28, 40)
 TOLERANCE = 1e-7  # of a vector's largest element
 DERIVATIVE_TOLERANCE = 1e-3  # of a derivative's largest value: errors of errors
+ADDED_TOLERANCE = 1e-2  # of what effects that could hide add to starlight
 BETWEEN = (2300.0, 3500.0, 5772.0, 12000.0, np.nan)  # colour temperatures (K) at which a table is checked
 COOLEST = 2000.0  # K; no Planck curve describes the spectrum of a cooler star in a red filter
 REACH = 1.25  # of the calibrated field: beyond, no polynomial of the throughput means anything
@@ -102,6 +106,7 @@ class AnalysisVectors:
         self.half_width = min(self.instrument.field_limit, reach)
         self.cameras = len(self.instrument.cameras)
         self._tables: dict[tuple[object, ...], FieldTable] = {}
+        self._acting_in: dict[tuple[object, ...], dict[int, Effect]] = {}
         series, plain = series_indices(self.instrument), plain_positions(self.instrument)
         self._uncertain: Int[np.ndarray, " o"] = np.flatnonzero(np.diag(calibration.covariance)[plain] > 0)
         self.parameters: Int[np.ndarray, " n"] = np.concatenate([plain[self._uncertain], series])
@@ -164,6 +169,32 @@ class AnalysisVectors:
         mixed = np.einsum("pc,pcf->pf", weights, values).reshape(len(x), self.cameras, 3, size)
         return Local(mixed[..., :plain], mixed[..., plain:])
 
+    @functools.cached_property
+    def acting(self) -> Mapping[int, Effect]:
+        """Mistakes that could hide and act on starlight, by number: effects at their sizes."""
+        return acting_effects(self.calibration)
+
+    @functools.cached_property
+    def turns(self) -> Mapping[int, float]:
+        """Angles (rad) by which those that do so turn the sky."""
+        each = {number: turn_of(self.instrument, one) for number, one in self.acting.items()}
+        return {number: turn for number, turn in each.items() if turn}
+
+    def added(
+        self, setting: Settings, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
+    ) -> dict[int, Float[np.ndarray, "p k 3"]]:
+        """Change of the vectors by each effect of `acting` that is in the beam, for a flat spectrum."""
+        if setting.key not in self._acting_in:
+            self._acting_in[setting.key] = {
+                n: one for n, one in self.acting.items() if acts_in(one, self.instrument, setting)
+            }
+        acting = self._acting_in[setting.key]
+        if not acting:
+            return {}
+        table = self._kept(lambda one: self._acting_table(one, acting), setting, "added")
+        values = table(x, y).reshape(len(x), len(acting), self.cameras, 3)
+        return dict(zip(acting, np.moveaxis(values, 1, 0), strict=True))
+
     def to_parameters(
         self,
         plain: Float[np.ndarray, "p 2 o"],
@@ -202,9 +233,9 @@ class AnalysisVectors:
         )
         return plan, np.asarray(plan.band_of)[:, 0]
 
-    def _kept(self, make: Callable[[Settings], FieldTable], setting: Settings) -> FieldTable:
+    def _kept(self, make: Callable[[Settings], FieldTable], setting: Settings, name: str = "") -> FieldTable:
         """The interpolated function of one setting, in the order (colour, camera, Stokes, …), made when asked for."""
-        key = (make.__name__, setting.key)
+        key = (name or make.__name__, setting.key)
         if key not in self._tables:
             self._tables[key] = make(setting)
         return self._tables[key]
@@ -245,6 +276,27 @@ class AnalysisVectors:
             return float(np.max(np.abs(found - truth).max(axis=0) / np.where(largest > 0, largest, 1.0)))
 
         return self._accurate(exact, DERIVATIVE_NODES, DERIVATIVE_TOLERANCE, error)
+
+    def _acting_table(self, setting: Settings, acting: Mapping[int, Effect]) -> FieldTable:
+        name = str(setting.filter[0])
+        filters = {name: self.calibration.filter_curve(name)}
+        flat = dataclasses.replace(setting, teff=np.full(1, np.nan))
+
+        def vectors(
+            there: Instrument, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
+        ) -> Float[np.ndarray, "p k 3"]:
+            return sky_vectors(there, plan_for_settings(there, flat, filters), x, y)[:, 0, :, :3]
+
+        def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
+            """Change of the vectors in the order point, (effect, camera, Stokes)."""
+            bare = vectors(self.instrument, x, y)
+            each = [vectors(with_effect(self.instrument, one), x, y) - bare for one in acting.values()]
+            return np.stack(each, axis=1).reshape(len(x), -1)
+
+        def error(found: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p f"]) -> float:
+            return float(np.abs(found - truth).max() / max(np.abs(truth).max(), 1e-300))
+
+        return self._accurate(exact, DERIVATIVE_NODES, ADDED_TOLERANCE, error)
 
     def _accurate(
         self, exact: Any, counts: Sequence[int], tolerance: float, error: Any, truth: Any = None

@@ -16,14 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from walop_jax.calibration.could_hide import hidden_errors
 from walop_jax.calibration.matrix import (
     MatrixMaps,
     ResidualMap,
-    hidden_errors,
     matrices,
     matrix_draws,
     matrix_names,
-    matrix_slopes,
     of_structure,
     p_errors,
     planned_matrices,
@@ -43,7 +42,7 @@ from walop_jax.data.settings import (
 from walop_jax.fit.model_file import model_without_data, render, standard_names
 from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
 from walop_jax.fit.refit import FitResult, Matrix, Vector
-from walop_jax.fit.verdict import Hidden, Quality, Verdict
+from walop_jax.fit.verdict import NOT_MEASURED, STATED, Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
 from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display
@@ -253,10 +252,13 @@ class Calibration(Fitted):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A sentence if the calibration is not to be trusted, or its file not checked."""
+        """A sentence if the calibration is not to be trusted, not checked, or does not hold all that matters to stars."""
         where = "" if self.path is None else f"{self.path}: "
         if self.verdict.trusted:
-            return (f"{where}{UNCHECKED}",) if UNCHECKED in self.verdict.warnings else ()
+            unchecked = (UNCHECKED,) if UNCHECKED in self.verdict.warnings else ()
+            unseen = () if self.hidden is None else self.hidden.not_measured()
+            unmeasured = (NOT_MEASURED.format("; ".join(unseen)),) if unseen else ()
+            return tuple(f"{where}{sentence}" for sentence in (*unchecked, *unmeasured))
         why = "; ".join(self.verdict.warnings) or "see WARNINGS"
         return (f"{where}this calibration is not trusted: {why}",)
 
@@ -332,13 +334,12 @@ class Calibration(Fitted):
         For stars polarised by up to 5 %, in one setting (default: the usual one); NaN where u is hardly measured, and
         where nobody asked.
         """
-        if self.hidden is None:
-            return np.full(len(x), np.nan), ""
-        settings = self.usual_settings() if settings is None else settings
-        filters = {str(settings.filter[0]): self.filter_curve(str(settings.filter[0]))}
-        return hidden_errors(
-            self.hidden, *matrix_slopes(self.model.instrument(self.values), settings, filters, x, y)
-        )
+        if self.hidden is None or not len(self.hidden):
+            return np.full(len(x), np.nan if self.hidden is None else 0.0), ""
+        errors = hidden_errors(self, x, y, self.usual_settings() if settings is None else settings)
+        known = np.nan_to_num(errors)
+        largest = np.where(np.isnan(errors).all(axis=0), np.nan, known.max(axis=0))
+        return largest, self.hidden.names[int(np.argmax(known.max(axis=1)))]
 
     def over_field(
         self,

@@ -7,6 +7,7 @@ model); what is left to find out is whether it says what its own parameters say,
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import UNCHECKED, Calibration
+from walop_jax.calibration.could_hide import could_hide, off_by, unmeasured
 from walop_jax.data.settings import BUILTIN_FILTERS, Settings
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import rounded
@@ -21,6 +23,8 @@ from walop_jax.io.text import rounded
 MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine
 DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
 SINGULAR = 1e-12  # eigenvalue of a correlation that is 0 but for rounding
+UNMEASURED = 5e-4
+"""Error of q and u (median over the field) that something of which the data say nothing may make."""
 _POINTS = 64
 
 Vector = Float[np.ndarray, " p"]
@@ -67,7 +71,7 @@ def certify(product: Calibration) -> list[Check]:
     except ValueError as error:
         return [*checks, Check("model", False, f"cannot be rebuilt: {error}")]
     checks.append(Check("model", True, f"{len(calibration.model.names)} parameters rebuilt by name"))
-    return [*checks, _maps(product, calibration), _physics(calibration), _protection(calibration)]
+    return [*checks, _maps(product, calibration), _physics(calibration), *_protection(calibration)]
 
 
 def _content(product: Calibration) -> list[Check]:
@@ -159,20 +163,21 @@ def _physics(calibration: Calibration) -> Check:
     )
 
 
-def _protection(calibration: Calibration) -> Check:
-    """A statement of the mistakes that could hide; it never fails, as it is as large as the data leave it."""
+def _protection(calibration: Calibration) -> Iterator[Check]:
+    """A statement of what could hide, as large as the data leave it; what they do not measure at all fails.
+
+    It may do no more to stars than `UNMEASURED`.
+    """
     if calibration.hidden is None:
-        return Check("protection", True, "nobody asked what could hide")
-    setting, x, y = _places(calibration)
-    errors, name = calibration.protection(x, y, setting)
-    if not np.isfinite(errors).any() or not name:
-        return Check("protection", True, "no single mistake would move q and u by more than their errors")
-    number = calibration.hidden.names.index(name)
-    size, unit = calibration.hidden.sizes[number], calibration.hidden.units[number]
-    found = f"{name}, off by {size:.2g} {unit}".rstrip()
-    return Check(
-        "protection",
-        True,
-        f"q or u off by {100 * np.nanmedian(errors):.2g} % (median) to {100 * np.nanmax(errors):.2g} % (worst place) "
-        f"by what would not be found ({found})",
-    )
+        yield Check("protection", True, "nobody asked what could hide")
+        return
+    mistakes = could_hide(calibration)
+    stated = "no single mistake would move q and u by more than their errors"
+    if mistakes:
+        stated = f"{off_by(*mistakes[0].error)} from {mistakes[0].in_words}"
+    yield Check("protection", True, stated)
+    unseen = unmeasured(mistakes).items()
+    known = not any(one.error[0] > UNMEASURED for _, one in unseen)
+    text = "; ".join(f"not {name}: {off_by(*one.error)} at the usual size" for name, one in unseen)
+    text = text or "; ".join(f"not {name}" for name in calibration.hidden.not_measured())
+    yield Check("measured", known, text or "all that acts on starlight")

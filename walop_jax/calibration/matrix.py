@@ -25,7 +25,7 @@ from walop_jax.data.frames import Grid
 from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult
-from walop_jax.fit.verdict import Hidden, Structure
+from walop_jax.fit.verdict import Structure
 from walop_jax.likelihood import limits, optics
 from walop_jax.likelihood.field_table import Vector, accurate_table
 from walop_jax.likelihood.optics import linearised, to_all
@@ -351,21 +351,6 @@ def of_structure(structure: Structure, values: Float[np.ndarray, "p m"]) -> Floa
     return added
 
 
-def hidden_errors(
-    hidden: Hidden, matrix: Float[np.ndarray, "p a 3"], slopes: Float[np.ndarray, "p a 3 n"]
-) -> tuple[Float[np.ndarray, " p"], str]:
-    """Largest error of q and u that a mistake which would not have been found makes, and which is the worst.
-
-    NaN where u is hardly measured.
-    """
-    if not len(hidden):
-        return np.zeros(len(matrix)), ""
-    errors = errors_of_changes(matrix, slopes, hidden.changes)
-    known = np.nan_to_num(errors)
-    largest = np.where(np.isnan(errors).all(axis=0), np.nan, known.max(axis=0))
-    return largest, hidden.names[int(np.argmax(known.max(axis=1)))]
-
-
 def errors_of_changes(
     matrix: Float[np.ndarray, "p a 3"],
     slopes: Float[np.ndarray, "p a 3 n"],
@@ -461,9 +446,9 @@ _effect_slopes = compiled(
 # ----------------------------------------------------------------------------------------- at the field points of a fit
 
 
-def first_setting(calset: CalibrationSet, instrument: Instrument) -> Settings:
-    """Filter and positions of the first exposure of a set, all else as by default."""
-    first = Settings.of(calset.exposures[:1], instrument.patched().moving())
+def first_setting(calset: CalibrationSet, instrument: Instrument, exposure: int = 0) -> Settings:
+    """Filter and positions of an exposure of a set, its first, all else as by default."""
+    first = Settings.of(calset.exposures[exposure : exposure + 1], instrument.patched().moving())
     return Settings.default(1, str(first.filter[0])).at(**first.positions)
 
 

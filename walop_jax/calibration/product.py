@@ -27,7 +27,7 @@ from walop_jax.data.frames import Grid, read_grid
 from walop_jax.data.records import PREFIX, InputFile, Site
 from walop_jax.data.schema import Column, Place, column_names, read_table, table_rules
 from walop_jax.data.write import filter_columns, grid_cards, set_table_hdu, sign_and_write, table_hdu
-from walop_jax.fit.verdict import STATED, Hidden, Structure, Verdict
+from walop_jax.fit.verdict import DATA, STATED, Hidden, Structure, Verdict
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.fits_reading import OpenFile, open_fits
@@ -266,10 +266,15 @@ def _residual_hdus(residuals: ResidualMap) -> list[fits.ImageHDU]:
 def _hidden_hdu(hidden: Hidden) -> fits.ImageHDU:
     """An image (mistake, parameter) of what each mistake does to the parameters; no data where there is none."""
     hdu = fits.ImageHDU(hidden.changes if len(hidden) else None, name="HIDDEN")
-    for number, (name, size, unit) in enumerate(hidden.each(), start=1):
-        hdu.header[f"HIDE{number}"] = in_ascii(name)
-        hdu.header[f"SIZE{number}"] = size
-        hdu.header[f"UNIT{number}"] = in_ascii(unit)
+    for number, (name, size, unit) in enumerate(hidden.each()):
+        hdu.header[f"HIDE{number + 1}"] = in_ascii(name)
+        hdu.header[f"SIZE{number + 1}"] = size
+        hdu.header[f"UNIT{number + 1}"] = in_ascii(unit)
+        hdu.header[f"HKIND{number + 1}"] = hidden.kinds[number]
+        hdu.header[f"CURE{number + 1}"] = in_ascii(hidden.remedies[number])
+        if hidden.acts[number]:
+            hdu.header[f"ACTS{number + 1}"] = in_ascii(hidden.acts[number])
+        hdu.header[f"SEEN{number + 1}"] = hidden.measured[number]
     return hdu
 
 
@@ -520,7 +525,7 @@ class _Reader:
         if "HIDDEN" not in self.hdus:
             return None
         header, place = self.hdus["HIDDEN"].header, Place(self.path, "HIDDEN")
-        names, sizes, kept = [], [], []
+        names, sizes, kept, further = [], [], [], []
         while (number := len(names) + 1) and f"HIDE{number}" in header:
             size = header.get(f"SIZE{number}")
             if isinstance(size, bool) or not isinstance(size, int | float):
@@ -528,10 +533,15 @@ class _Reader:
             names.append(str(header[f"HIDE{number}"]))
             sizes.append(float(size))
             kept.append(str(header.get(f"UNIT{number}", "")))
+            kind, cure, acts = (
+                str(header.get(f"{key}{number}", usual))
+                for key, usual in (("HKIND", DATA), ("CURE", ""), ("ACTS", ""))
+            )
+            further.append((kind, cure, acts, header.get(f"SEEN{number}", True) is not False))
         changes = self.image("HIDDEN") if names else np.zeros((0, parameters))
         if changes.shape != (len(names), parameters):
             raise place.fail(f"has shape {changes.shape}, not {(len(names), parameters)}", advice=_AGAIN)
-        return Hidden(tuple(names), tuple(sizes), tuple(kept), changes)
+        return Hidden(tuple(names), tuple(sizes), tuple(kept), changes, *zip(*further, strict=True))
 
     def check_parameters(self, table: Mapping[str, Any], covariance: np.ndarray) -> None:
         """Raise `DataError` for parameters that are none, and a covariance that is not theirs."""

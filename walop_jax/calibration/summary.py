@@ -49,7 +49,12 @@ def summary(
         "structure": dataclasses.asdict(verdict.structure),
         "hidden": None
         if result.hidden is None
-        else [dict(zip(("name", "size", "unit"), one, strict=True)) for one in result.hidden.each()],
+        else [
+            dict(zip(("name", "size", "unit", "kind", "measured"), (*one, kind, measured), strict=True))
+            for one, kind, measured in zip(
+                result.hidden.each(), result.hidden.kinds, result.hidden.measured, strict=True
+            )
+        ],
         "accuracy_of_p": None if known is None else known.document(),
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),

@@ -40,11 +40,12 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.findings import Choice
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.search import Trial, model_without, try_model
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.model_file import base_model, model_like
 from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
+from walop_jax.io.text import some
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
@@ -57,6 +58,9 @@ _POINTS, _FEW = 16, 64  # field points that are looked at; sets of so few are lo
 _STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best
 _BEST = 3  # alternatives that are looked at again
 _ALL_ORDERS = 4  # cameras up to which all orders are tried, beyond pairs alone
+_EXCHANGED = 5  # worst exposures, of which two may have been exchanged
+_NO_LIGHT = 0.05  # of what is expected, below which a camera sees nothing, …
+_MISSING = 20.0  # … if as many standard errors are missing
 _FIELD = 1.5  # of the designed field: what a field in other units must fit into
 
 Change = Callable[[CalibrationSet], CalibrationSet]
@@ -78,18 +82,18 @@ class Alternative:
         return f"{self.what} (χ²/dof = {self.explained:.3g}): {self.remedy}"
 
 
-def refuse_mixups(result: FitResult) -> None:
+def refuse_mixups(result: FitResult, policy: Policy = POLICY) -> None:
     """Raise `DataError` with the remedy if a fit leaves what another reading of its data explains."""
-    found = mixups_of(result)
+    found = mixups_of(result, policy)
     if found:
         raise refusal(result, found)
 
 
-def mixups_of(result: FitResult) -> tuple[Alternative, ...]:
+def mixups_of(result: FitResult, policy: Policy = POLICY) -> tuple[Alternative, ...]:
     """The readings of the data that explain what a fit leaves, best first."""
     if result.dof <= 0:
         return ()
-    return mixups(result.calset, result.model, result.chi2 / result.dof)
+    return mixups(result.calset, result.model, result.chi2 / result.dof, policy)
 
 
 def refusal(result: FitResult, found: Sequence[Alternative]) -> DataError:
@@ -100,34 +104,37 @@ def refusal(result: FitResult, found: Sequence[Alternative]) -> DataError:
     )
 
 
-def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternative, ...]:
+def mixups(
+    calset: CalibrationSet, model: Model, left: float, policy: Policy = POLICY
+) -> tuple[Alternative, ...]:
     """The readings of the data that explain them, best first, where a fit misses them by a per cent or more.
 
     `left` is the χ²/dof of a fit of `model`.
     """
-    if left < FAR_OFF:
+    if left < policy.poor_fit:
         return ()
     # The program that a small set was fitted with is there already.
     few = calset if len(calset.points) <= _FEW else thinned(calset, _POINTS, neighbours=1)
     block = few.intensities.block(0, len(few.points))
     seen = block.used[..., None] & (block.counts > 0)
-    if (
-        not seen.any()
-        or np.median(block.sigma[seen] / block.counts[seen]) * np.sqrt(left) < POLICY.reading_coarse
-    ):
+    if not seen.any():
         return ()
+    # What has gone wrong with all exposures misses all of the light by so much.
+    coarse = np.median(block.sigma[seen] / block.counts[seen]) * np.sqrt(left) >= policy.reading_coarse
     few = dataclasses.replace(few, intensities=TableIntensities.dense(few.points, block))
-    as_it_stands = Alternative("", "", lambda calset: calset)
-    left = min(left, _judged(as_it_stands, few, model, left, _STEPS[1]).explained)
-    if left < FAR_OFF:  # the fit has lost its way, not the data
+    likelihood = Likelihood.of(few, model)
+    stands, values = _left(likelihood, left, _STEPS[1])
+    left = min(left, stands)
+    if left < policy.poor_fit:  # the fit has lost its way, not the data
         return ()
-    for readings in (_readings(few, model), _instruments(few)):
+    of_all = (_readings(few, model), _instruments(few)) if coarse and left >= FAR_OFF else ()
+    for readings in (_of_some_exposures(likelihood, _worst_exposures(likelihood, values)), *of_all):
         tried = [_judged(one, few, model, left, _STEPS[0]) for one in readings]
         best = [_judged(one, few, model, one.explained, _STEPS[1]) for one in _sorted(tried)[:_BEST]]
-        enough = min(1.0 + (left - 1.0) / POLICY.reading_gain, FAR_OFF)
+        enough = min(1.0 + (left - 1.0) / policy.reading_gain, FAR_OFF)
         good = [one for one in _sorted(best) if one.explained < enough]
         if good:
-            return tuple(one for one in good if one.explained < POLICY.reading_alike * good[0].explained)
+            return tuple(one for one in good if one.explained < policy.reading_alike * good[0].explained)
     return ()
 
 
@@ -141,26 +148,41 @@ def _judged(one: Alternative, calset: CalibrationSet, model: Model, left: float,
         rewritten = one.change(calset)
         if rewritten.instrument != calset.instrument:
             model = base_model(rewritten)
-        return dataclasses.replace(one, explained=_left(Likelihood.of(rewritten, model), left, steps))
+        elif rewritten.sources is not calset.sources:  # what is known of them beforehand
+            model = model_like(rewritten, model)
+        return dataclasses.replace(one, explained=_left(Likelihood.of(rewritten, model), left, steps)[0])
     except (ValueError, np.linalg.LinAlgError):
         return one
 
 
-def _left(likelihood: Likelihood, before: float, steps: int) -> float:
-    """χ²/dof after some steps, the errors of the data scaled as `before`, then as the step before, asks for."""
+def _left(likelihood: Likelihood, before: float, steps: int) -> tuple[float, Vector]:
+    """χ²/dof after some steps, the errors of the data scaled as `before`, then as the step before, asks for; and where.
+
+    The smallest of all steps, and the values there.
+    """
     model, least = likelihood.model, before
     x = model.start[model.free]
-    here, found = None, np.inf
+    here, found, best = None, np.inf, model.start
     for number in range(steps + 1):
-        here = likelihood.expand(model.full(x), np.sqrt(max(least, 1.0)), here)
+        values = model.full(x)
+        here = likelihood.expand(values, np.sqrt(max(least, 1.0)), here)
         if here.dof <= 0 or not np.isfinite(here.chi2):
             break
         least = here.chi2 / here.dof
-        found = min(found, least)
+        if least < found:
+            found, best = least, values
         if number < steps:
             width = np.sqrt(np.diag(here.matrix))
             x = x - np.linalg.solve(here.matrix / np.outer(width, width), here.gradient / width) / width
-    return found
+    return found, best
+
+
+def _worst_exposures(likelihood: Likelihood, values: Vector) -> list[int]:
+    """Exposures with the largest mean squared residuals, the worst first."""
+    _, residual = likelihood.residuals(values)
+    square = np.where(likelihood.used[..., None], residual**2, 0.0).sum(axis=(0, 2))
+    mean = square / np.maximum(likelihood.used.sum(axis=0), 1)
+    return np.argsort(-mean, kind="stable")[:_EXCHANGED].tolist()
 
 
 # ------------------------------------------------------------------------------------------- the alternatives
@@ -190,6 +212,124 @@ def _instruments(calset: CalibrationSet) -> Iterator[Alternative]:
                 f"correct INSTRUME, which says {calset.instrument}",
                 lambda calset, name=name: dataclasses.replace(calset, instrument=name),
             )
+
+
+def _of_some_exposures(likelihood: Likelihood, worst: Sequence[int]) -> Iterator[Alternative]:
+    """Readings that concern sky and standards, or single exposures, where these are among the worst."""
+    yield from _dead(likelihood)
+    calset = likelihood.calset
+    for what, remedy, asked, change in _TABLE:
+        if asked(calset, calset.exposures[np.array(worst)]):
+            yield Alternative(what, remedy, change)
+    number = calset.exposures.exposure
+    for pair in itertools.combinations(sorted(worst), 2):
+        one, other = (number[i] for i in pair)
+        yield Alternative(
+            f"the intensities of exposures {one} and {other} were exchanged",
+            "exchange their EXPOSURE numbers in the table of intensities",
+            lambda calset, pair=pair: _exchanged(calset, pair),
+        )
+
+
+def refuse_dead_cameras(result: FitResult) -> None:
+    """Raise `DataError` for a camera with the same number at all field points of all exposures.
+
+    A fit takes that for a camera that sees little light.
+    """
+    calset = result.calset
+    block = calset.intensities.block(0, min(len(calset.points), _FEW))
+    seen = block.used.sum(axis=0) > 1
+    counts = np.where(block.used[..., None], block.counts, np.nan)[:, seen]
+    if not seen.any():
+        return
+    still = np.all(np.nanmax(counts, axis=0) == np.nanmin(counts, axis=0), axis=0)
+    if still.any():
+        names = ", ".join(np.array(result.model.template.cameras.names)[still])
+        raise DataError(
+            f"INTENSITIES, N: camera {names} has the same number at all field points: it was dead, or its column was "
+            "not filled; check it, or describe an instrument without it"
+        )
+
+
+def _dead(likelihood: Likelihood) -> Iterator[Alternative]:
+    """A camera that sees nothing where the instrument as designed expects light, in some exposures: these left out."""
+    calset, model = likelihood.calset, likelihood.model
+    block = calset.intensities.block(0, len(calset.points))
+    _, residual = likelihood.residuals(model.start)
+    lacking = np.where(block.used[..., None], residual, np.nan)
+    seen = np.flatnonzero(block.used.any(axis=0))
+    expected = np.nanmedian((block.counts - lacking * block.sigma)[:, seen], axis=0)
+    level = np.nanmedian(np.where(block.used[..., None], block.counts, np.nan)[:, seen], axis=0)
+    dead = (level < _NO_LIGHT * expected) & (np.nanmedian(lacking[:, seen], axis=0) < -_MISSING)
+    for k in np.flatnonzero(dead.any(axis=0) & ~dead.all(axis=0)):
+        off = seen[dead[:, k]]
+        listed = some([str(one) for one in calset.exposures.exposure[off]], 6)
+        yield Alternative(
+            f"exposures {listed} were left out, in which camera {model.template.cameras.names[k]} holds no light",
+            "leave them out, or reduce them again",
+            lambda calset, off=off: _without_exposures(calset, off),
+        )
+
+
+def _without_exposures(calset: CalibrationSet, off: np.ndarray) -> CalibrationSet:
+    there = calset.intensities.block(0, len(calset.points))
+    used = there.used.copy()
+    used[:, off] = False
+    block = dataclasses.replace(there, used=used)
+    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+
+
+def _exchanged(calset: CalibrationSet, pair: tuple[int, int]) -> CalibrationSet:
+    """The set with the conditions of two exposures exchanged: angles, time, pointing, all but the number."""
+    order = np.arange(len(calset.exposures))
+    order[list(pair)] = pair[::-1]
+    swapped = dataclasses.replace(calset.exposures[order], exposure=calset.exposures.exposure)
+    return dataclasses.replace(calset, exposures=swapped)
+
+
+def _with_sources(turn: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Change:
+    def change(calset: CalibrationSet) -> CalibrationSet:
+        q, u = turn(calset.sources.q, calset.sources.u)
+        return dataclasses.replace(calset, sources=dataclasses.replace(calset.sources, q=q, u=u))
+
+    return change
+
+
+def _with_column(column: str, turn: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return with_exposures(lambda e: dataclasses.replace(e, **{column: turn(getattr(e, column))}))
+
+
+def _with_site(name: str) -> Change:
+    """The set with a coordinate of the site of the other sign."""
+
+    def change(calset: CalibrationSet) -> CalibrationSet:
+        site = dataclasses.replace(calset.site, **{name: -getattr(calset.site, name)})
+        return dataclasses.replace(calset, site=site)
+
+    return change
+
+
+def _has_stars(calset: CalibrationSet, worst: Exposures) -> bool:
+    known = bool(len(calset.sources) and np.hypot(calset.sources.q, calset.sources.u).max() > 0.0)
+    return known and "standard" in worst.kind
+
+
+def _has_moon(calset: CalibrationSet, worst: Exposures) -> bool:
+    return bool(((worst.kind == "moon") & np.isfinite(worst.ra) & np.isfinite(worst.dec)).any())
+
+
+def _has_rotator(calset: CalibrationSet, worst: Exposures) -> bool:
+    return bool(np.isfinite(worst.rotator).any())
+
+
+def _below(column: str, most: float) -> Callable[[CalibrationSet, Exposures], bool]:
+    """Moon exposures in which a column is nowhere larger."""
+
+    def asked(calset: CalibrationSet, worst: Exposures) -> bool:
+        values = np.abs(getattr(calset.exposures, column))
+        return _has_moon(calset, worst) and float(np.nanmax(values)) <= most
+
+    return asked
 
 
 def _orders(model: Model) -> Iterator[Alternative]:
@@ -229,17 +369,6 @@ def _angles(calset: CalibrationSet) -> Iterator[Alternative]:
             yield Alternative(
                 f"{column} is in radians", "give degrees, or the unit of the column", _with_angle(prefix, np.rad2deg)
             )  # fmt: skip
-    if np.isfinite(e.rotator).any():
-        for words, change in (
-            ("runs the other way", lambda a: -a),
-            ("is 90° too small", lambda a: a + 90.0),
-            ("is in radians", np.rad2deg),
-        ):
-            yield Alternative(
-                f"ROTATOR {words}",
-                "correct it (docs: conventions)",
-                with_exposures(lambda e, change=change: dataclasses.replace(e, rotator=change(e.rotator))),
-            )
 
 
 def _fields(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
@@ -298,6 +427,36 @@ def _with_angle(prefix: str, turned: Callable[[np.ndarray], np.ndarray]) -> Chan
 def with_exposures(change: Callable[[Exposures], Exposures]) -> Change:
     """A set with other exposures."""
     return lambda calset: dataclasses.replace(calset, exposures=change(calset.exposures))
+
+
+_AT = "give degrees, or the unit of the column"
+_TABLE: tuple[tuple[str, str, Callable[[CalibrationSet, Exposures], bool], Change], ...] = (
+    ("U of SOURCES had the other sign", "give −U (docs: conventions)", _has_stars, _with_sources(lambda q, u: (q, -u))),
+    ("Q of SOURCES had the other sign", "give −Q (docs: conventions)", _has_stars, _with_sources(lambda q, u: (-q, u))),
+    ("Q and U of SOURCES both had the other sign", "give −Q and −U", _has_stars, _with_sources(lambda q, u: (-q, -u))),
+    ("Q and U of SOURCES were exchanged", "exchange them", _has_stars, _with_sources(lambda q, u: (u, q))),
+    ("Q and U of SOURCES are in per cent", "give fractions", _has_stars,
+     _with_sources(lambda q, u: (q / 100.0, u / 100.0))),
+    ("ROTATOR runs the other way", "correct it (docs: conventions)", _has_rotator,
+     _with_column("rotator", lambda a: -a)),
+    ("ROTATOR is 90° too small", "correct it (docs: conventions)", _has_rotator,
+     _with_column("rotator", lambda a: a + 90.0)),
+    ("ROTATOR is in radians", "correct it (docs: conventions)", _has_rotator, _with_column("rotator", np.rad2deg)),
+    ("RA is in hours", _AT, _below("ra", 24.0), _with_column("ra", lambda a: 15.0 * a)),
+    ("RA is in radians", _AT, _below("ra", 2.0 * np.pi), _with_column("ra", np.rad2deg)),
+    ("DEC is in radians", _AT, _below("dec", 0.5 * np.pi), _with_column("dec", np.rad2deg)),
+    ("RA and DEC are exchanged", "exchange them", _below("ra", 90.0),
+     with_exposures(lambda e: dataclasses.replace(e, ra=np.mod(e.dec, 360.0), dec=e.ra))),
+    ("DEC has the other sign", "give −DEC", _has_moon, _with_column("dec", lambda a: -a)),
+    *(
+        (f"MJD is {abs(days):g} d too {'large' if days > 0 else 'small'}",
+         "give MJD = JD − 2400000.5, UTC at mid-exposure", _has_moon, _with_column("mjd", lambda t, d=days: t - d))
+        for days in (0.5, -0.5, 1.0, -1.0)
+    ),
+    ("SITELONG has the other sign", "east is positive", _has_moon, _with_site("longitude")),
+    ("SITELAT has the other sign", "north is positive", _has_moon, _with_site("latitude")),
+)  # fmt: skip
+"""Readings of sky and standards: what must have happened, what to do, the sets it can have happened to, the cure."""
 
 
 # --------------------------------------------------------------------------------- other descriptions of the instrument

@@ -11,8 +11,9 @@ Named       A rival that does its best to follow the effect stays √S ε from i
             it may be taken.
 Protection  A calibration without the effect takes up a part of it: δθ = (JᵀJ)⁻¹JᵀC ε. Stars are seen through
             m + ε ∂m/∂ε and calibrated with m + δθ ∂m/∂θ; the difference at the amplitude that is just detected is the
-            largest error of q and u that the effect can make without being noticed. The level over all effects has a
-            tenth on top (`SECOND_ORDER`): scattered light that is just detected does up to 8 % more than this.
+            largest error of q and u that the effect can make without being noticed. On the map each effect has a
+            tenth on top (`SECOND_ORDER`): scattered light that is just detected does up to 8 % more than this. What
+            could hide, in a sentence and in the table, is that of `calibration.could_hide`, as for any calibration.
 
 Conditions  A number c that the set states of itself and that is wrong by h is found where h² G reaches the
             noncentrality of the test of `stated_conditions`. Stars are calibrated with a matrix that is off by
@@ -34,11 +35,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special
 
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.could_hide import could_hide, hidden_errors
 from walop_jax.calibration.matrix import change_of_qu, effect_slopes, first_setting, matrix_slopes
 from walop_jax.diagnosis.candidates import Probe, applicable, fringes_of
 from walop_jax.diagnosis.candidates import probes as all_probes
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import ALARM, Examination, examine, most_points
+from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.limits_found import (
     PROBABILITY,
     ConditionLimit,
@@ -48,7 +52,7 @@ from walop_jax.diagnosis.limits_found import (
 )
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import ScoreSpace, local_p, noncentrality, separations
-from walop_jax.diagnosis.stated_conditions import STEP, condition_scores
+from walop_jax.diagnosis.stated_conditions import STEP, Singles, condition_scores
 from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.stand_in import on_field_points
@@ -91,8 +95,14 @@ def detection_limits(
     rivals = examination.bare.subset([probe.name for probe in examination.probes])
     columns = [c for probe in examination.probes for c in _columns(examination, rivals, probe, p)]
     tell(Stage("finding what goes unnoticed", "unnoticed"))
-    found = _collected(examination, columns, _errors(examination, columns), fitting)
-    return dataclasses.replace(found, conditions=condition_limits(examination.design))
+    errors = _errors(examination, columns)
+    design = examination.design
+    if (hidden := result.hidden) is None:
+        hidden = hidden_mistakes(design, Singles.of(design))
+    examined = result if result.verdict is not None else result.judged()
+    calibration = dataclasses.replace(Calibration.from_fit(examined), hidden=hidden)
+    found = _collected(examination, columns, errors, fitting, calibration)
+    return dataclasses.replace(found, conditions=condition_limits(design), could_hide=could_hide(calibration))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,6 +144,7 @@ def _columns(examination: Examination, rivals: ScoreSpace, probe: Probe, p: floa
 def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.ndarray, "c p"]:
     """Error of q and u at every field point from each column, at the amplitude that is just detected.
 
+    That is the width of its prior at most: what is plausible where the data would show only more.
     Of an effect with many shapes that of the median amplitude stands for all; the others are NaN.
     """
     design, result = examination.design, examination.result
@@ -165,7 +176,8 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     for i, taken_up in zip(looked_at, design.taken_up(along).T, strict=True):
         column = columns[i]
         own = change[..., place[column.probe.name] + column.number]
-        found[i] = change_of_qu(matrix, matrix + column.detected * (own - slopes @ taken_up))
+        size = min(column.detected, float(column.probe.widths[column.number]))
+        found[i] = change_of_qu(matrix, matrix + size * (own - slopes @ taken_up))
     return found
 
 
@@ -191,6 +203,7 @@ def _collected(
     columns: Sequence[_Column],
     errors: Float[np.ndarray, "c p"],
     catalogue: Sequence[type[Effect]],
+    calibration: Calibration,
 ) -> DetectionLimits:
     groups: dict[tuple[type[Effect], str], list[int]] = {}
     for i, column in enumerate(columns):
@@ -217,10 +230,15 @@ def _collected(
     for row, name in enumerate(names):
         near = _nearest([c for c in columns if c.probe.effect.name == name])
         separation[row] = [near.get(other, np.nan) for other in names]
-    points = examination.result.calset.points
-    worst = np.where(np.isfinite(errors), errors, -1.0)
-    largest = worst.argmax(axis=0) if len(columns) else np.zeros(len(points), int)
-    protection = worst[largest, np.arange(len(points))] if len(columns) else np.full(len(points), np.nan)
+    points, result = examination.result.calset.points, examination.result
+    setting = first_setting(result.calset, result.model.instrument(result.values))
+    hidden = hidden_errors(calibration, points.x, points.y, setting)
+    assert calibration.hidden is not None
+    every = np.vstack([SECOND_ORDER * errors, hidden, np.full((1, len(points)), np.nan)])
+    names_of = (*(c.probe.effect.name for c in columns), *calibration.hidden.names, "")
+    worst = np.where(np.isfinite(every), every, -1.0)
+    largest = worst.argmax(axis=0)
+    protection = worst[largest, np.arange(len(points))]
     known = protection >= 0
     return DetectionLimits(
         limits=tuple(sorted(entries, key=lambda e: -np.nan_to_num(e.error_of_qu[1], nan=-1.0))),
@@ -228,10 +246,8 @@ def _collected(
         separation=separation,
         x=points.x,
         y=points.y,
-        protection=np.where(known, SECOND_ORDER * protection, np.nan),
-        caused_by=tuple(
-            columns[i].probe.effect.name if k else "" for i, k in zip(largest, known, strict=True)
-        ),
+        protection=np.where(known, protection, np.nan),
+        caused_by=tuple(names_of[i] if k else "" for i, k in zip(largest, known, strict=True)),
         untestable=examination.untestable(catalogue),
     )
 

@@ -221,7 +221,7 @@ class Evidence:
         return [score for score in map(self.table.__getitem__, self.patterns) if score.testable]
 
     @cached_property
-    def least_evidence(self) -> float:
+    def evidence_needed(self) -> float:
         """Evidence that a name needs: where the base is excluded it competes with patterns that have none."""
         return min(0.0, max((s.log_bayes for s in self._pattern_scores), default=0.0))
 
@@ -286,7 +286,7 @@ class Evidence:
         `left` is its χ², `noise` says whether that is what noise alone would leave, `item` is its linear step.
         """
         evidence /= self.floor**2
-        if evidence <= self.least_evidence:
+        if evidence <= self.evidence_needed:
             return False
         missing = self.chi2 - self.dof
         least = self.policy.least_share * missing

@@ -153,6 +153,7 @@ class Step:
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
     told: tuple[tuple[Change, float, float], ...] = ()
     nameless: tuple[str, ...] = ()
+    negligible_below: float = POLICY.negligible
     residual_before: Cube = dataclasses.field(default_factory=_no_cube)
     residual_after: Cube = dataclasses.field(default_factory=_no_cube)
 
@@ -164,7 +165,7 @@ class Step:
     @property
     def negligible(self) -> bool:
         """True if the effect hardly matters for calibrated q and u."""
-        return self.change_of_qu < POLICY.negligible
+        return self.change_of_qu < self.negligible_below
 
 
 @dataclasses.dataclass(frozen=True)

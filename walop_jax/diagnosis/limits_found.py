@@ -9,13 +9,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.calibration.could_hide import CouldHide
 from walop_jax.diagnosis.examination import ALARM, Matrix, Vector
+from walop_jax.fit.verdict import DATA, EFFECT
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.text import two_digits, two_digits_range, with_minus_sign
+from walop_jax.io.text import two_digits, two_digits_range
 
 NO_LEVEL = "q and u cannot both be measured with one exposure"
 PROBABILITY = 0.99
+HEAD = ("amplitude", ">detected", ">named", "unit", ">error of q, u (%)", "can be mistaken for")
+ASKED_BY_CAMERA = ("pedestal", "nonlinearity")
+"""Effects that are asked camera by camera, under the names of what they are there."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +66,7 @@ class DetectionLimits(Displayed):
     detected. `protection` is, by field point (`x`, `y`, degrees), the largest error of q and u that a single effect
     can make without being detected, with a tenth on top for what is not of first order, `caused_by` the effect.
     `untestable` effects leave no trace in these data. `conditions` are what the set states of itself: its field, its
-    filters, the colours of its light.
+    filters, the colours of its light. `could_hide` are the mistakes that could hide, as every command says them.
     """
 
     limits: tuple[DetectionLimit, ...]
@@ -73,6 +78,7 @@ class DetectionLimits(Displayed):
     caused_by: tuple[str, ...]
     untestable: tuple[str, ...]
     conditions: tuple[ConditionLimit, ...] = ()
+    could_hide: tuple[CouldHide, ...] = ()
 
     def to_table(self) -> Any:
         """A row for each effect and parameter, the largest error of q and u first, as an astropy table."""
@@ -113,6 +119,7 @@ class DetectionLimits(Displayed):
             },
             "untestable": list(self.untestable),
             "conditions": [dataclasses.asdict(entry) for entry in self.conditions],
+            "could_hide": [one._asdict() for one in self.mistakes],
         }
 
     @classmethod
@@ -129,56 +136,83 @@ class DetectionLimits(Displayed):
             caused_by=tuple(protection["caused_by"]),
             untestable=tuple(document["untestable"]),
             conditions=_records(ConditionLimit, document.get("conditions", ()), "detected"),
+            could_hide=tuple(
+                CouldHide(**{**one, "error": tuple(one["error"])}) for one in document.get("could_hide", ())
+            ),
         )
 
+    @property
+    def mistakes(self) -> tuple[CouldHide, ...]:
+        """All that is asked, by what it could do without being noticed: the largest error of q and u first.
+
+        Of what is in `could_hide` the error stands there; of anything else that of its own limit.
+        """
+        known = {one.name for one in self.could_hide}
+        effects = (
+            CouldHide(
+                f"{e.effect}.{e.parameter}", EFFECT, e.detected[1], e.unit, "", True, False, e.error_of_qu
+            )
+            for e in self.limits
+            if e.effect not in ASKED_BY_CAMERA
+        )
+        data = (
+            CouldHide(e.what, DATA, e.size, e.unit, "", True, False, e.error_of_qu) for e in self.conditions
+        )
+        others = [one for one in (*effects, *data) if one.name not in known and np.isfinite(one.error[0])]
+        return tuple(sorted((*self.could_hide, *others), key=lambda one: (-one.error[0], -one.error[1])))
+
     def display(self) -> Display:
-        """The protection level in a sentence, and a row for each effect and parameter."""
-        rows = tuple(
-            (
-                f"{entry.effect}.{entry.parameter}",
-                two_digits_range(*entry.detected),
-                two_digits(entry.named) if np.isfinite(entry.named) else "never",
-                entry.unit,
-                two_digits_range(*(100.0 * value for value in entry.error_of_qu)),
-                ", ".join(entry.taken_for),
+        """The worst that could hide in a sentence; a row for each effect and parameter, and each number of the set."""
+        effects = {f"{entry.effect}.{entry.parameter}": entry for entry in self.limits}
+        conditions = {entry.what: entry for entry in self.conditions}
+        rows: list[tuple[str, ...]] = []
+        for kind, title in ((EFFECT, "EFFECTS"), (DATA, "MISTAKES IN THE DATA")):
+            some = [one for one in self.mistakes if one.kind == kind]
+            names = {one.name: one for one in some} | dict.fromkeys(
+                name
+                for name in (effects if kind == EFFECT else conditions)
+                if name not in {o.name for o in some}
             )
-            for entry in self.limits
-        )
-        rows += tuple(
-            (
-                entry.what,
-                two_digits(entry.detected) if np.isfinite(entry.detected) else "never",
-                "",
-                entry.unit,
-                two_digits_range(*(100.0 * value for value in entry.error_of_qu)),
-                ""
-                if np.isfinite(entry.detected)
-                else f"error at {two_digits(entry.size)} {entry.unit}".rstrip(),
-            )
-            for entry in self.conditions
-        )
+            if names:
+                rows.append((title, *("",) * (len(HEAD) - 1)))
+            rows += [
+                self._row(name, one, effects.get(name), conditions.get(name)) for name, one in names.items()
+            ]
         notes = (
             (f"cannot be detected in these data: {', '.join(self.untestable)}",) if self.untestable else ()
         )
         return Display(
             title="What these data can show, with 99 % probability",
-            facts=(("protection level", self.protection_in_words() or NO_LEVEL),),
-            head=("amplitude", ">detected", ">named", "unit", ">error of q, u (%)", "can be mistaken for"),
-            rows=rows,
+            facts=(("could hide", self.protection_in_words() or NO_LEVEL),),
+            head=HEAD,
+            rows=tuple(rows),
             notes=notes,
         )
 
+    def _row(
+        self, name: str, one: CouldHide | None, limit: DetectionLimit | None, condition: ConditionLimit | None
+    ) -> tuple[str, ...]:
+        error = "" if one is None else two_digits_range(*(100.0 * value for value in one.error))
+        remark = "" if one is None or one.measured else f"error at {two_digits(one.size)}, the usual size"
+        if limit is not None:
+            named = two_digits(limit.named) if np.isfinite(limit.named) else "never"
+            taken_for = ", ".join(limit.taken_for)
+            return name, two_digits_range(*limit.detected), named, limit.unit, error, taken_for
+        if condition is not None and not np.isfinite(condition.detected):
+            remark = f"error at {two_digits(condition.size)} {condition.unit}".rstrip()
+        detected = np.inf if remark else one.size if one is not None else np.nan
+        unit = condition.unit if condition is not None else one.unit if one is not None else ""
+        return name, two_digits(detected) if np.isfinite(detected) else "never", "", unit, error, remark
+
     def protection_in_words(self) -> str:
         """The largest error of q and u over the field that goes unnoticed; empty where none is known."""
-        worst = self.worst
-        if worst is None:
+        if not self.mistakes:
             return ""
-        x, y = (with_minus_sign(f"{value:+.2f}°") for value in (self.x[worst], self.y[worst]))
+        worst = self.mistakes[0]
         return (
-            f"an effect too weak to be detected could still bias q or u by "
-            f"{two_digits(100 * float(np.nanmedian(self.protection)))} % (median over the field, stars with p ≤ 5 %; "
-            f"{two_digits(100 * self.protection[worst])} % at worst); the worst case is {self.caused_by[worst]} "
-            f"at ({x}, {y})"
+            f"a mistake too small to be detected could still bias q or u by {two_digits(100 * worst.error[0])} % "
+            f"(median over the field, stars with p ≤ 5 %; {two_digits(100 * worst.error[1])} % at worst): "
+            f"{worst.in_words}"
         )
 
     @property

@@ -21,7 +21,7 @@ import numpy as np
 from scipy import special
 
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.examination import ALARM
+from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import local_p
 from walop_jax.io.text import some
 
@@ -38,9 +38,9 @@ class _Pair(NamedTuple):
     correlation: float
 
 
-def repeated_noise(design: Design) -> Iterator[str]:
+def repeated_noise(design: Design, policy: Policy = POLICY) -> Iterator[str]:
     """Sentences on exposures that hold the same noise, by their number."""
-    pairs = pairs_alike(design)
+    pairs = pairs_alike(design, policy.alarm)
     if pairs:
         number = design.fit.calset.exposures.exposure
         each = [f"{number[p.first]} and {number[p.second]} (correlation {p.correlation:.2f})" for p in pairs]
@@ -51,7 +51,7 @@ def repeated_noise(design: Design) -> Iterator[str]:
         )
 
 
-def pairs_alike(design: Design) -> list[_Pair]:
+def pairs_alike(design: Design, alarm: float = POLICY.alarm) -> list[_Pair]:
     """Pairs of exposures whose residuals hang together as only those of the same measurement do, closest first."""
     measured = design.measured
     if measured.shared.exposures is not None:
@@ -74,7 +74,7 @@ def pairs_alike(design: Design) -> list[_Pair]:
     correlation = product[first, second] / np.sqrt(own * other)
     # The fit takes something of every exposure: the noise is measured by what it leaves.
     deviate = correlation * np.sqrt(expected[first, second])
-    limit = -special.ndtri(local_p(ALARM, len(first)))
+    limit = -special.ndtri(local_p(alarm, len(first)))
     excess = 0.5 * (own / free[first] + other / free[second]) / shared[first, second] - 1.0
     pattern = correlation / np.maximum(1.0 - correlation, 1e-12)
     found = (deviate > limit) & (correlation > LEAST) & (excess < 0.5 * pattern)

@@ -28,16 +28,15 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import special
 
-from walop_jax.calibration.matrix import errors_of_changes, first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.alternatives import with_exposures, with_places
-from walop_jax.diagnosis.candidates import Probe, applicable, probes, showable
+from walop_jax.diagnosis.candidates import Probe, all_candidates, applicable, probes, showable
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.examination import ALARM
-from walop_jax.diagnosis.limits_found import PROBABILITY
+from walop_jax.diagnosis.limits_found import ASKED_BY_CAMERA
+from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import (
     Candidate,
     Score,
@@ -45,25 +44,24 @@ from walop_jax.diagnosis.score import (
     ScoreTable,
     corrected_p,
     local_p,
-    noncentrality,
 )
-from walop_jax.fit.refit import NEARLY
-from walop_jax.fit.verdict import Hidden
+from walop_jax.diagnosis.search import log_evidence_ratio
+from walop_jax.fit.refit import NEARLY, FitResult, fit
 from walop_jax.io.text import with_error
-from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import EFFECTS
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.specification import effect_context
 
-STAR_POINTS = 16  # field points at which stars are asked what a mistake does to them
-MOST_HIDDEN = 12  # mistakes that a product keeps: what a star needs for each is a product of two vectors
 _SHOWN = 4  # alternatives that are told in words
+_FITTED, _ROUNDS = 3, 3  # stated numbers that are fitted exactly, and steps of each
 _ALIKE = 25.0  # in χ², within which conditions are told together
 _PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
 MOST_OF_ELEMENT = 4  # numbers of an element whose priors may be wrong together
-_ASKED_OTHERWISE = ("pedestal", "nonlinearity", "standard_outlier")  # camera by camera, and as priors
+_ASKED_OTHERWISE = (*ASKED_BY_CAMERA, "standard_outlier")  # camera by camera, and as priors
+_LEVELS = "exposures at a second light level"
+_DARK = "bias and dark frames"
+_ONE_STAR = "a bright star in one beam: its light in the other cameras"
 _PLACES = {"x", "gap"}  # shapes of which there are so many that an effect is as good as a pattern
 _PRECESSION = (
     46.124 / 3600.0,
@@ -73,7 +71,7 @@ STEP = 1e-4  # of the width: what is left out of the derivative is its square
 
 
 class _Stated(NamedTuple):
-    """A number that a set states: what it is, its unit, what to check, and the set with it changed.
+    """A number that a set states: what it is, its unit, what to check, what would measure it, the set with it changed.
 
     `width` is by how much it may be wrong at most; `value` is None where only a change of it has a meaning.
     `seen_by_stars`: whether stars are observed under the same condition. `along` is how the places of the field points
@@ -83,6 +81,7 @@ class _Stated(NamedTuple):
     what: str
     unit: str
     remedy: str
+    shown_by: str
     width: float
     changed: Callable[[float], CalibrationSet]
     value: float | None = None
@@ -105,35 +104,41 @@ class _Scored(NamedTuple):
 class _Single(NamedTuple):
     """One number, or a few of one thing, that may be otherwise: its columns, and its size in words.
 
-    `plausible` is the largest mistake to reckon with where the data would not show it; 0 where errors hold it already.
-    `stated` is the number of the set that it is, if it is one.
+    `plausible` is the largest mistake to reckon with where the data would not show it, of each number; 0 where errors
+    hold it already. `stated` is the number of the set that it is, `probe` the effect, if it is one; `shown_by` the
+    measurement that would show it.
     """
 
     candidate: Candidate
     said: Callable[[Score], str]
-    plausible: float = 0.0
+    plausible: float | Float[np.ndarray, " _"] = 0.0
     unit: str = ""
+    shown_by: str = ""
     stated: _Stated | None = None
+    probe: Probe | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Singles:
     """All single numbers of a fit with their scores.
 
-    `along` (q, columns) is what the parameters take up of their columns, Qᵀ C; `left` the square of what they leave.
+    `along` (q, columns) is what the parameters take up of their columns, Qᵀ C; `left` the square of what they leave,
+    `alive` where that is information on them. `asked` are the effects among them, and those that the set cannot show.
     """
 
     rivals: tuple[_Single, ...]
     table: ScoreTable
     along: Float[np.ndarray, "q c"]
     left: Float[np.ndarray, " c"]
+    alive: Bool[np.ndarray, " c"]
+    asked: tuple[Probe, ...] = ()
 
     @classmethod
     def of(cls, design: Design) -> Singles:
         """Conditions that the set states, priors, terms of a camera that have one amplitude, effects with a name."""
-        return scored(
-            design, (*_conditions(design), *_priors(design), *_of_cameras(design), *_of_catalogue(design))
-        )
+        asked = _asked_effects(design)
+        rivals = (*_conditions(design), *_priors(design), *_of_cameras(design), *_of_catalogue(design, asked))
+        return dataclasses.replace(scored(design, rivals), asked=asked)
 
     @property
     def testable(self) -> list[Score]:
@@ -150,66 +155,24 @@ def scored(design: Design, rivals: tuple[_Single, ...]) -> Singles:
     )
     along = design.projector.basis.T @ columns
     if not rivals:
-        return Singles((), ScoreTable((), 1.0, 1.0, 1.0), along, np.zeros(0))
+        return Singles((), ScoreTable((), 1.0, 1.0, 1.0), along, np.zeros(0), np.zeros(0, bool))
     each = [one.candidate.columns for one in rivals]
     space = ScoreSpace.projected(design.projector, names, widths, each)
     residual = design.projector(design.residual)
     table = space.table(columns.T @ residual, float(residual @ residual))
-    return Singles(rivals, table, along, np.diag(space.gram))
+    return Singles(rivals, table, along, np.diag(space.gram), space.alive)
 
 
-def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
-    """Changes of the parameters by single mistakes as large as the data would just have shown at 99 % probability.
-
-    A number that is wrong by h moves the parameters by R⁻¹QᵀC h (J = QR) and is found where h² |PC|² reaches the
-    noncentrality of its test; h is at most the plausible size. Kept are those that move them by more than their
-    standard errors, first those that make q and u of stars most wrong, in the median over the field.
-    """
-    least = noncentrality(local_p(ALARM, len(singles.testable)), 1, PROBABILITY)
-    found: list[tuple[_Single, float, int]] = []
-    first = 0
-    for one in singles.rivals:
-        if one.plausible > 0.0:
-            size = one.plausible
-            if singles.table[one.candidate.name].testable:
-                size = min(size, float(np.sqrt(least / singles.left[first])))
-            if size * float(np.linalg.norm(singles.along[:, first])) > 1.0:
-                found.append((one, size, first))
-        first += len(one.candidate.widths)
-    along = np.array([size * singles.along[:, at] for _, size, at in found]).reshape(len(found), -1).T
-    changes = (design.fit.model.selection() @ design.taken_up(along)).T
-    order = np.argsort(-_errors_of_stars(design, changes), kind="stable")[:MOST_HIDDEN]
-    kept = [found[i] for i in order]
-    return Hidden(
-        names=tuple(one.candidate.name for one, _, _ in kept),
-        sizes=tuple(size for _, size, _ in kept),
-        units=tuple(one.unit for one, _, _ in kept),
-        changes=changes[order],
-    )
-
-
-def _errors_of_stars(design: Design, changes: Float[np.ndarray, "c n"]) -> Float[np.ndarray, " c"]:
-    """Median over some field points of what changes of the parameters do to q and u; 0 where these are not measured."""
-    if not len(changes):
-        return np.zeros(0)
-    fit, points = design.fit, design.fit.calset.points
-    some = np.unique(np.linspace(0, len(points) - 1, STAR_POINTS).astype(int))
-    instrument = fit.model.instrument(fit.values)
-    setting = first_setting(fit.calset, instrument)
-    matrix, slopes = matrix_slopes(instrument, setting, fit.calset.filters, points.x[some], points.y[some])
-    errors = errors_of_changes(matrix, slopes, changes)
-    measured = np.isfinite(errors).all(axis=0)
-    return np.median(errors[:, measured], axis=1) if measured.any() else np.zeros(len(changes))
-
-
-def stated_conditions(design: Design, singles: Singles | None = None) -> Iterator[str]:
+def stated_conditions(
+    design: Design, singles: Singles | None = None, policy: Policy = POLICY
+) -> Iterator[str]:
     """A sentence on the single numbers that the residuals of a fit speak against, the clearest first.
 
     Of a fit that does not explain its data only where one of them alone would.
     """
     singles = singles or Singles.of(design)
     rivals, table, scores = singles.rivals, singles.table, singles.testable
-    found = [score for score in scores if corrected_p(score.log_p, len(scores)) < ALARM]
+    found = [score for score in scores if corrected_p(score.log_p, len(scores)) < policy.alarm]
     if not found:
         return
     found.sort(key=lambda score: score.log_p)
@@ -224,17 +187,17 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     said = {one.candidate.name: one.said for one in rivals}
     told = "; or for ".join(said[score.name](score) for score in likely[:_SHOWN])
     more = f"; or for {len(likely) - _SHOWN} others" if len(likely) > _SHOWN else ""
-    yield f"the residuals ask for {told}{more} (p = {corrected_p(best.log_p, len(scores)):.2g}, limit {ALARM:g})"
+    yield f"the residuals ask for {told}{more} (p = {corrected_p(best.log_p, len(scores)):.2g}, limit {policy.alarm:g})"
 
 
-def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
+def rival_conditions(design: Design, chi2: float, policy: Policy = POLICY) -> Iterator[str]:
     """A sentence on stated conditions, each of which, if wrong, explains the data as well as a model with `chi2` does.
 
     `design` is of the fit before anything was added to its model.
     """
     scored = [item for item in condition_scores(design) if item.score.testable]
     square = float(np.sum(design.projector(design.residual) ** 2))
-    least = special.chdtri(1, local_p(ALARM, len(scored))) if scored else np.inf
+    least = special.chdtri(1, local_p(policy.alarm, len(scored))) if scored else np.inf
     gains = [float(item.score.amplitudes[0]) ** 2 * item.square for item in scored]
     alike = [
         (gain, item)
@@ -245,6 +208,37 @@ def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
         alike.sort(key=lambda pair: -pair[0])
         said = "; or ".join(_in_words(item.stated, item.score) for _, item in alike[:_SHOWN])
         yield f"what was found explains no more than one number that the set states would, if it were {said}"
+
+
+def instead_of_names(before: FitResult, after: FitResult, policy: Policy = POLICY) -> str:
+    """The number that the set states which, if wrong, explains the data better than names do; empty: none.
+
+    Compared are the evidence of the names, ln B of `after` against `before`, and that of the number, fitted exactly,
+    with its width as prior: ½ (χ² − χ²_c) − ½ ln(1 + w² C̃ᵀC̃). One number may so come before sixteen.
+    """
+    asked = [one for one in condition_scores(Design.of(before)) if one.score.testable]
+    asked = [one for one in asked if corrected_p(one.score.log_p, len(asked)) < policy.alarm]
+    best, told = log_evidence_ratio(before, after), ""
+    for one in sorted(asked, key=lambda one: one.score.log_p)[:_FITTED]:
+        found, size, result, now = one.stated, 0.0, before, one
+        for _ in range(_ROUNDS):  # Gauss and Newton: hours are no small step
+            size += float(now.score.amplitudes[0])
+            likelihood = Likelihood.of(found.changed(size), before.model)
+            result = fit(likelihood, start=result.values, noise_scale=before.noise_scale)
+            there = {one.stated.what: one for one in condition_scores(Design.of(result))}
+            if not result.converged or found.what not in there:
+                break
+            now = there[found.what]
+        score, square = now.score, now.square
+        worth = 0.5 * (before.posterior.objective - result.posterior.objective)
+        worth -= 0.5 * float(np.log1p(square * found.width**2))
+        if result.converged and worth > best:
+            value = size if found.value is None else found.value + size
+            sigma = float(np.sqrt(score.covariance[0, 0]))
+            by = " changed by" if found.value is None else ""
+            best, told = worth, f"{found.what}{by} {with_error(value, sigma)} {found.unit}".rstrip()
+            told += f" ({found.remedy}; χ²/dof = {result.chi2 / max(result.dof, 1):.3g})"
+    return told
 
 
 def _holds(one: Score, other: Score) -> bool:
@@ -264,7 +258,9 @@ def _conditions(design: Design) -> Iterator[_Single]:
         candidate = Candidate(one.what, column, np.array([one.width]))
         # What stars see as well is no mistake of the matrix alone.
         plausible = 0.0 if one.seen_by_stars else one.width
-        yield _Single(candidate, lambda score, one=one: _in_words(one, score), plausible, one.unit, one)
+        yield _Single(
+            candidate, lambda score, one=one: _in_words(one, score), plausible, one.unit, one.shown_by, one
+        )
 
 
 def _priors(design: Design) -> Iterator[_Single]:
@@ -300,7 +296,7 @@ def _of_cameras(design: Design) -> Iterator[_Single]:
     median[seen] = np.nanmedian(np.where(measured.used[..., None], counts, np.nan)[:, seen], axis=0)
     typical = float(np.median(counts[measured.used])) if measured.used.any() else 0.0
 
-    def single(k: int, change: np.ndarray, width: float, words: str, unit: str) -> _Single:
+    def single(k: int, change: np.ndarray, width: float, words: str, unit: str, shown_by: str) -> _Single:
         cube = np.zeros_like(counts)
         cube[..., k] = change
         column = project_flux(cube * measured.weight, measured.model, measured.known, measured.shared)
@@ -308,37 +304,44 @@ def _of_cameras(design: Design) -> Iterator[_Single]:
 
         name = words.format(names[k])
         said = functools.partial(_told, f"{name} of", unit=unit)
-        return _Single(Candidate(name, rows, np.array([width])), said, width, unit)
+        return _Single(Candidate(name, rows, np.array([width])), said, width, unit, shown_by)
 
     if not measured.used.any():
         return
     for k in range(measured.cameras):
-        yield single(k, counts[..., k] ** 2 / 1e6, 0.02, "a non-linearity of {}", "at 10⁶ electrons")
+        yield single(k, counts[..., k] ** 2 / 1e6, 0.02, "a non-linearity of {}", "at 10⁶ electrons", _LEVELS)
         level = np.broadcast_to(median[:, k], counts.shape[:2])
-        yield single(k, level, 0.003, "scattered light in {}", "of the median counts")
-        yield single(k, np.ones_like(counts[..., k]), 0.003 * typical, "a pedestal in {}", "electrons")
+        yield single(k, level, 0.003, "scattered light in {}", "of the median counts", _LEVELS)
+        yield single(k, np.ones_like(counts[..., k]), 0.003 * typical, "a pedestal in {}", "electrons", _DARK)
         for other in range(measured.cameras):
             if other != k:
-                yield single(k, counts[..., other], 0.02, f"light of {names[other]} in {{}}", "of its counts")
+                words = f"light of {names[other]} in {{}}"
+                yield single(k, counts[..., other], 0.02, words, "of its counts", _ONE_STAR)
 
 
-def _of_catalogue(design: Design) -> Iterator[_Single]:
-    """Effects that the model has not; those with a place or a gap of their own are left to the patterns."""
+def _asked_effects(design: Design) -> tuple[Probe, ...]:
+    """Probes of effects that the model has not; those with a place or a gap of their own are left to the patterns."""
     fit = design.fit
     template, calset = fit.model.template, fit.calset
     context, known = effect_context(template, calset.exposures), (*fit.model.effect_names, *_ASKED_OTHERWISE)
-    kinds = [kind for kind in EFFECTS if kind.name not in known and not set(kind.shape) & _PLACES]
-    wanted = showable(calset, template, list(probes(applicable(kinds, context, template), context)))
-    columns = Columns(fit.likelihood, fit.values)
-    changes = [[one for member in p.group for one in member.first_order(template)] for p in wanted]
-    asked = [i for i, some in enumerate(changes) if some and all(columns.has(change) for change in some)]
-    found, first = columns.of([change for i in asked for change in changes[i]]), 0
-    for probe in (wanted[i] for i in asked):
-        rows = design.stacked([found[:, first : first + len(probe.widths)]])
-        first += len(probe.widths)
-        candidate = Candidate(probe.name, rows, probe.widths)
+    kinds = [kind for kind in fit.model.catalogue if kind.name not in known and not set(kind.shape) & _PLACES]
+    return tuple(probes(applicable(kinds, context, template), context))
+
+
+def _of_catalogue(design: Design, asked: Sequence[Probe]) -> Iterator[_Single]:
+    """The effects that are asked, as far as the set can show them."""
+    fit = design.fit
+    template = fit.model.template
+    wanted = showable(fit.calset, template, asked)
+    named, _ = all_candidates(fit.likelihood, fit.values, wanted, ())
+    for probe in (one for one in wanted if one.name in named):
+        rows = design.stacked([named[probe.name].columns])
         yield _Single(
-            candidate, lambda score, probe=probe: _effect_in_words(probe, score, template.cameras.names)
+            Candidate(probe.name, rows, probe.widths),
+            lambda score, probe=probe: _effect_in_words(probe, score, template.cameras.names),
+            probe.widths,
+            shown_by=probe.effect.revealed_by,
+            probe=probe,
         )
 
 
@@ -408,7 +411,8 @@ def _stated(calset: CalibrationSet) -> Iterator[_Stated]:
     for name in calset.filters:
         remedy = "check its curve, and what the polariser exposures were taken through"
         moved = functools.partial(_with_wavelength, calset, name)
-        yield _Stated(f"the wavelengths of filter {name}", "um", remedy, 0.05, moved, seen_by_stars=True)
+        what, shown_by = f"the wavelengths of filter {name}", "a measured curve of the filter"
+        yield _Stated(what, "um", remedy, shown_by, 0.05, moved, seen_by_stars=True)
     e = calset.exposures
     for kind in np.unique(e.kind):
         chosen = (e.kind == kind) & np.isfinite(e.teff)
@@ -416,7 +420,8 @@ def _stated(calset: CalibrationSet) -> Iterator[_Stated]:
             typical, remedy = float(np.median(e.teff[chosen])), "check the colour temperature of their light"
             warmer = functools.partial(_moved, calset, chosen, "teff", e.teff / typical)
             stated = typical if np.ptp(e.teff[chosen]) == 0.0 else None
-            yield _Stated(f"TEFF of exposures of kind {kind}", "K", remedy, typical, warmer, stated)
+            what = f"TEFF of exposures of kind {kind}"
+            yield _Stated(what, "K", remedy, "a measured spectrum of their light", typical, warmer, stated)
     yield from _of_sky(calset)
 
 
@@ -443,32 +448,38 @@ def _of_sky(calset: CalibrationSet) -> Iterator[_Stated]:
             return _moved(_moved(calset, moon, "ra", -along_ra, step), moon, "dec", -along_dec, step)
 
         remedy = "they are to be ICRS, not coordinates of date"
-        yield _Stated("the equinox of RA and DEC", "", remedy, 100.0, of_date, 2000.0)
+        solved = "an astrometric solution of frames of the same fields"
+        yield _Stated("the equinox of RA and DEC", "", remedy, solved, 100.0, of_date, 2000.0)
         at = "check RA and DEC: ICRS, of the centre of the field (docs: conventions)"
         when = "check the clock and the time zone: UTC at mid-exposure"
-        for name, unit, width, remedy in (
-            ("RA", "deg", 5.0, at),
-            ("DEC", "deg", 5.0, at),
-            ("MJD", "d", 1.0, when),
+        for name, unit, width, remedy, shown_by in (
+            ("RA", "deg", 5.0, at, solved),
+            ("DEC", "deg", 5.0, at, solved),
+            ("MJD", "d", 1.0, when, "a clock that is compared with UTC"),
         ):
             moved = functools.partial(_moved, calset, moon, name.lower(), 1.0)
-            yield _Stated(f"{name} of sky exposures", unit, remedy, width, moved)
+            yield _Stated(f"{name} of sky exposures", unit, remedy, shown_by, width, moved)
         for name, width in (("longitude", 180.0), ("latitude", 90.0)):
             there = float(getattr(site, name))
 
             def elsewhere(step: float, name: str = name, there: float = there) -> CalibrationSet:
                 return dataclasses.replace(calset, site=dataclasses.replace(site, **{name: there + step}))
 
-            remedy = "check the site in the header"
-            yield _Stated(f"the {name} of the site", "deg", remedy, width, elsewhere, there)
+            remedy, shown_by = "check the site in the header", "the position of the telescope on a map"
+            yield _Stated(f"the {name} of the site", "deg", remedy, shown_by, width, elsewhere, there)
     for kind in np.unique(e.kind[np.isfinite(e.rotator)]):
         remedy = "check its zero and its sense (docs: conventions)"
         moved = functools.partial(_moved, calset, e.kind == kind, "rotator", 1.0)
-        yield _Stated(f"ROTATOR of exposures of kind {kind}", "deg", remedy, 45.0, moved)
+        what, shown_by = (
+            f"ROTATOR of exposures of kind {kind}",
+            "polarised standards at several ROTATOR angles",
+        )
+        yield _Stated(what, "deg", remedy, shown_by, 45.0, moved)
 
 
 def _of_field(calset: CalibrationSet) -> Iterator[_Stated]:
     check = "check X and Y against the frames (docs: conventions)"
+    solved = "an independent check of the field positions"
     x, y = calset.points.x, calset.points.y
     radius, one = float(np.hypot(x, y).max()), np.ones(len(x))
     for what, unit, width, along in (
@@ -478,7 +489,7 @@ def _of_field(calset: CalibrationSet) -> Iterator[_Stated]:
         ("the angle of the field", "rad", 1.0, (-y, x)),
     ):
         moved = functools.partial(_displaced, calset, along)
-        yield _Stated(what, unit, check, width, moved, along=along)
+        yield _Stated(what, unit, check, solved, width, moved, along=along)
 
 
 def _displaced(calset: CalibrationSet, along: tuple[np.ndarray, np.ndarray], step: float) -> CalibrationSet:

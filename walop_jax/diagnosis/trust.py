@@ -35,12 +35,13 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import special
 
-from walop_jax.diagnosis.alternatives import refuse_mixups
+from walop_jax.diagnosis.alternatives import refuse_dead_cameras, refuse_mixups
 from walop_jax.diagnosis.design import Design, pattern_scores
-from walop_jax.diagnosis.examination import ALARM
+from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
+from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.repeated_noise import repeated_noise
 from walop_jax.diagnosis.score import Projector, ScoreTable, local_p
-from walop_jax.diagnosis.stated_conditions import Singles, hidden_mistakes, stated_conditions
+from walop_jax.diagnosis.stated_conditions import Singles, stated_conditions
 from walop_jax.diagnosis.variance_components import (
     VarianceComponent,
     found_components,
@@ -52,7 +53,7 @@ from walop_jax.diagnosis.variance_components import (
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixels
-from walop_jax.fit.verdict import Structure
+from walop_jax.fit.verdict import NOT_MEASURED, Structure
 from walop_jax.io.text import some
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.frames import PixelPosterior
@@ -66,26 +67,30 @@ NOISELESS = 1e-6
 _SHOWN = 3
 
 
-def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> FitResult:
+def examined(
+    result: FitResult, seed: int = 0, *, as_written: bool = False, policy: Policy = POLICY
+) -> FitResult:
     """The fit with the verdict on it: what its residuals say against it, beside χ², priors and convergence.
 
     A fit that explains nothing is held against other readings of its data first (`alternatives`), unless these were
-    tried already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p.
+    tried already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p,
+    `policy` holds the thresholds.
     Of a set with more than `limits.TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at.
     A χ² that is a few per cent too large while nothing else is wrong is put down to the stated errors, and the
     standard errors are made from the residuals. Raises `DataError` with the remedy for data that another reading
     explains.
     """
+    refuse_dead_cameras(result)
     result = with_pixels(result)
     if not result.converged:
         if not as_written and result.chi2 > FAR_OFF * max(result.dof, 1):
-            refuse_mixups(result)
+            refuse_mixups(result, policy)
         return result.judged()
     near = result.explains_data or result.nearly_explains_data
     if not (near or as_written):
-        refuse_mixups(result)
+        refuse_mixups(result, policy)
     whole = on_field_points(result)
-    if not near and (scaled := tuple(_errors_too_small(result, seed))):
+    if not near and (scaled := tuple(_errors_too_small(result, seed, policy))):
         return result.judged(scaled)
     design = Design.of(sampled(whole, _most(whole)))
     if result.errors_too_large and _hold_no_noise(design):
@@ -95,17 +100,17 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
     hidden = None
     if near:
         table, singles = pattern_scores(design, seed), Singles.of(design)
-        hidden = hidden_mistakes(design, singles)
+        hidden = hidden_mistakes(design, singles, policy)
         doubts = (
-            *stated_conditions(design, singles),
-            *_patterns(table),
+            *stated_conditions(design, singles, policy),
+            *_patterns(table, policy),
             *in_words(components),
-            *_groups(design),
-            *repeated_noise(design),
+            *_groups(design, policy),
+            *repeated_noise(design, policy),
         )
     else:  # anything may be in such residuals; what single places of the field share sits on stars as well
         components = [one for one in components if one.grouping.structure]
-        doubts = (*stated_conditions(design), *in_words(components))
+        doubts = (*stated_conditions(design, policy=policy), *in_words(components))
     doubts = (*doubts, *_summed_pixels(result), *_far_from_pixels(result))
     structure = structure_of(components)
     found = with_honest_errors(result)
@@ -113,6 +118,8 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
         of_points = [one for one in components if not any(one is other for other in pixels)]
         found = with_structure(found, design, of_points, len(whole.calset.points))
     found = found.judged(doubts, structure=_with_summed_pixels(result, structure))
+    if unseen := hidden.not_measured() if hidden is not None else ():
+        found = found.remarked(NOT_MEASURED.format("; ".join(unseen)))
     return dataclasses.replace(found, hidden=hidden)
 
 
@@ -159,7 +166,7 @@ def _most(result: FitResult) -> int:
     return max(1, limits.TRUST_ROWS // max(len(result.calset.exposures), 1))
 
 
-def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:
+def _errors_too_small(result: FitResult, seed: int, policy: Policy) -> Iterator[str]:
     """A warning if residuals far larger than the stated errors are nothing but noise."""
     factor = float(np.sqrt(result.chi2 / max(result.dof, 1)))
     scaled = fit(result.likelihood, start=result.values, noise_scale=factor)
@@ -167,7 +174,7 @@ def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:
     design = Design.of(sampled(whole, _most(whole)))
     rough = found_components([*variance_components(design), *_of_pixels(scaled)])
     rough = rough or any(_summed_pixels(result))
-    if pattern_scores(design, seed).p_global >= ALARM and not (rough or any(_groups(design))):
+    if pattern_scores(design, seed).p_global >= policy.alarm and not (rough or any(_groups(design, policy))):
         yield (
             f"N_ERR is {factor:.3g} times too small: with errors as large the residuals hold nothing but noise; check "
             "the gain and the unit of N_ERR"
@@ -199,12 +206,12 @@ def sampled(result: FitResult, most: int) -> FitResult:
     return dataclasses.replace(result, likelihood=Likelihood.of(calset, result.model))
 
 
-def _patterns(table: ScoreTable) -> Iterator[str]:
-    if table.p_global >= ALARM:
+def _patterns(table: ScoreTable, policy: Policy) -> Iterator[str]:
+    if table.p_global >= policy.alarm:
         return
-    names = [score.name for score in table.ranked if table.corrected(score) < ALARM][:_SHOWN]
+    names = [score.name for score in table.ranked if table.corrected(score) < policy.alarm][:_SHOWN]
     yield (
-        f"the residuals hold patterns that noise does not make (p = {table.p_global:.2g}, limit {ALARM:g}: "
+        f"the residuals hold patterns that noise does not make (p = {table.p_global:.2g}, limit {policy.alarm:g}: "
         f"{', '.join(names)}): walop-jax diagnose looks for the cause"
     )
 
@@ -264,10 +271,10 @@ def _groups_of(design: Design) -> Mapping[str, Bool[np.ndarray, "1 e k"]]:
     return groups
 
 
-def _groups(design: Design) -> Iterator[str]:
+def _groups(design: Design, policy: Policy = POLICY) -> Iterator[str]:
     scores = group_scores(design)
     # A part of the data so small that chance moves it by a quarter is held to a far smaller p by the number of groups.
-    limit = local_p(ALARM, len(scores))
+    limit = local_p(policy.alarm, len(scores))
     odd = [s for s in scores if s.p_value < limit and not 1.0 / UNEVEN < s.ratio < UNEVEN]
     if odd:
         odd.sort(key=lambda s: -abs(np.log(max(s.ratio, 1e-12))))

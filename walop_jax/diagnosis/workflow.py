@@ -42,6 +42,7 @@ from walop_jax.diagnosis.search import (
     before_and_after,
     beyond_prior,
     evidence_of_presence,
+    names_first,
     predicts_unseen,
     refit_without,
     refitted_in_order,
@@ -53,7 +54,7 @@ from walop_jax.diagnosis.search import (
     try_shapes,
     with_refuted_priors_widened,
 )
-from walop_jax.diagnosis.stated_conditions import rival_conditions
+from walop_jax.diagnosis.stated_conditions import instead_of_names, rival_conditions
 from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
@@ -102,7 +103,7 @@ def diagnose(
     if len(some.points) < len(calset.points):
         tell(f"looking at {len(some.points)} of {len(calset.points)} field points")
     judge = Refit.of(some, model, catalogue, every, np.random.default_rng(seed), tell, policy, began)
-    readings = () if as_written else mixups_of(judge.fit)
+    readings = () if as_written else mixups_of(judge.fit, policy)
     if readings and readings[0].explained < policy.reading_sure:
         raise refusal(judge.fit, readings)
     before = judge.fit
@@ -115,6 +116,11 @@ def diagnose(
     # Another reading that comes near competes with names and with other descriptions of the instrument.
     if nameless and readings and readings[0].explained * judge.fit.dof < judge.fit.chi2:
         raise refusal(before, readings)
+    if judge.steps and (stated := instead_of_names(before, judge.fit, policy)):
+        names = ", ".join(step.effect for step in judge.steps)
+        text = f"one number that the set states explains more than names do ({names}), if it is {stated}"
+        nameless = Unexplained(first.table.p_global, text, ())
+        judge, last = dataclasses.replace(judge, fit=before, steps=[]), first
     steps = tuple(judge.finished(step, last) for step in judge.steps)
     verdict: Outcome = "unexplained" if nameless else "effect_found" if steps else "consistent"
     tell("examining what is left")
@@ -152,14 +158,16 @@ def _left(first: Examination, judge: Refit, policy: Policy) -> Examination:
 
 def _examined(found: Diagnosis) -> Diagnosis:
     """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked."""
-    after = examined(with_honest_errors(found.after), as_written=True)
+    after = examined(with_honest_errors(found.after), as_written=True, policy=found.policy)
     if found.before is found.after:
         return dataclasses.replace(found, before=after, after=after)
-    for sentence in rival_conditions(Design.of(found.before), found.after.chi2):
+    for sentence in rival_conditions(Design.of(found.before), found.after.chi2, found.policy):
         after = after.remarked(sentence)
     # Where χ² speaks against the model given, the steps say what is missing.
     explained = found.before.explains_data or found.before.nearly_explains_data
-    before = examined(found.before, as_written=True) if explained else found.before.judged()
+    before = found.before.judged()
+    if explained:
+        before = examined(found.before, as_written=True, policy=found.policy)
     return dataclasses.replace(found, before=before, after=after)
 
 
@@ -286,18 +294,18 @@ class Refit:
     def decided(self, trials: list[Trial]) -> list[Trial]:
         """Trials in order of evidence; what scaled errors leave even at the top is decided with errors as stated."""
         even = [t for t in trials if trials[0].evidence - t.evidence < self.policy.even_odds]
-        if self.fit.noise_scale == 1.0 or len(even) < 2:
-            return trials
         exact = [
-            (t, fit(t.fit.likelihood, start=t.fit.values, noise_scale=1.0)) for t in even if t.fit is not None
+            (t, fit(t.fit.likelihood, start=t.fit.values, noise_scale=1.0))
+            for t in (even if self.fit.noise_scale > 1.0 and len(even) > 1 else ())
+            if t.fit is not None
         ]
-        exact.sort(key=lambda pair: pair[1].posterior.objective)
-        best = exact[0][1].posterior.objective
+        best = min((f.posterior.objective for _, f in exact), default=0.0)
         clearly = [
             dataclasses.replace(t, fit=f, evidence=t.evidence - 0.5 * (f.posterior.objective - best))
             for t, f in exact
         ]
-        return [*clearly, *trials[len(even) :]]
+        others = [t for t in trials if not any(t is one for one, _ in exact)]
+        return [*sorted(clearly, key=lambda trial: names_first(trial, self.policy)), *others]
 
     def confirmed(self, state: Examination, trial: Trial) -> bool:
         """True if data that took no part in the fit agree better with the effect than without."""
@@ -317,6 +325,7 @@ class Refit:
             p_value=state.table.corrected(item.score) if item else state.table.p_global,
             log_bayes=trial.evidence,
             nameless=trial.nameless,
+            negligible_below=self.policy.negligible,
             equivalent=trial.rivals,
             alternatives=trial.alternatives,
             **self._compared,

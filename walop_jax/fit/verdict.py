@@ -90,19 +90,39 @@ class Structure:
 NO_STRUCTURE = Structure()
 
 
+NOT_MEASURED = (
+    "the calibration data hold no information on {}; Q_HIDDEN, U_HIDDEN of stars have it, Q_ERR, U_ERR do not"
+)
+"""A remark on what could be wrong by its usual size, whatever the data are."""
+EFFECT, DATA = "effect", "data"
+"""Kinds of mistakes that could hide: of the model of the instrument, of what the set states of its data."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hidden:
     """Single mistakes that the data would not show, by name.
 
     `sizes` in `units` are those that would just have been found, or the largest plausible ones; `changes` what each
     does to the parameters of the model, all of them in tree order. The largest effect of any of them on a star is the
-    protection level of its Stokes parameters (RAIM: National Academies 4920, 2023).
+    protection level of its Stokes parameters (RAIM: National Academies 4920, 2023). `kinds` are `EFFECT` or `DATA`,
+    `remedies` measurements that would show them. What acts on starlight itself is an effect that the model has not:
+    `acts` holds it at its size, as JSON of name and values, "" for all others. It is not `measured` where the data hold
+    no information on it at all.
     """
 
     names: tuple[str, ...]
     sizes: tuple[float, ...]
     units: tuple[str, ...]
     changes: Float[np.ndarray, "s n"]
+    kinds: tuple[str, ...] = ()
+    remedies: tuple[str, ...] = ()
+    acts: tuple[str, ...] = ()
+    measured: tuple[bool, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, usual in (("kinds", DATA), ("remedies", ""), ("acts", ""), ("measured", True)):
+            if not getattr(self, name):
+                object.__setattr__(self, name, (usual,) * len(self.names))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -110,6 +130,17 @@ class Hidden:
     def each(self) -> Iterator[tuple[str, float, str]]:
         """Name, size and unit of each."""
         return zip(self.names, self.sizes, self.units, strict=True)
+
+    def not_measured(self) -> tuple[str, ...]:
+        """Names of all that the data hold no information on, with what would measure it."""
+        together: dict[str, list[str]] = {}
+        for name, remedy, measured in zip(self.names, self.remedies, self.measured, strict=True):
+            if not measured:
+                together.setdefault(remedy, []).append(name)
+        return tuple(
+            f"{', '.join(names)} (to measure it: {remedy})" if remedy else ", ".join(names)
+            for remedy, names in together.items()
+        )
 
     def in_words(self, most: int = 1) -> str:
         """The worst of them in a sentence."""

@@ -46,10 +46,11 @@ from walop_jax.model.responses import GENERATORS, LightResponses, Responses
 from walop_jax.model.sources import Sight
 
 Change = Sequence[tuple[float, Sentence]]
-"""A sum of sentences with their coefficients; a factor of a sentence may be a function of what `_Laid` has."""
+"""A sum of sentences with their coefficients; a factor of a sentence may be a function of what `Laid` has."""
 
 LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
 GAPS_TOGETHER = 32  # thicknesses of air whose fringes are computed together, in one program for any number
+SLOTS = ("inserted", "numbers", "globally", "throughput", "mixed")  # of the analysis vectors
 _BEHIND = ("square", "median", "reported", "afterglow")  # what acts on counts as the detectors report them
 
 
@@ -203,7 +204,7 @@ _detectors = compiled(_pushed, kept_as="detector_slopes")
 
 
 @dataclasses.dataclass(frozen=True)
-class _Laid:
+class Laid:
     """Quantities that factors may ask for: points along the first axis, exposures along the second.
 
     Of angles those in the list of exposures: NaN where an element is out.
@@ -226,6 +227,15 @@ class _Laid:
         """Angle of a moving element, NaN where it is out."""
         position = self.likelihood.calset.exposures.position(prefix)
         return np.deg2rad(np.where(position.inside, position.angle, np.nan))[None]
+
+
+def generator(name: str) -> Float[np.ndarray, "4 4"]:
+    """Generator of a change of the light ahead of the polariser; "q", "u" are added, whatever the light is."""
+    if name not in ("q", "u"):
+        return GENERATORS[name]
+    added = np.zeros((4, 4))
+    added["qu".index(name) + 1, 0] = 1.0
+    return added
 
 
 # ----------------------------------------------------------------------------------------------------- columns
@@ -254,12 +264,13 @@ class Columns:
     def has(self, change: Change) -> bool:
         """True if the responses hold a change."""
         try:
-            self._pieces(change)
+            self.pieces_of(change)
         except NoColumnError:
             return False
         return True
 
-    def _pieces(self, change: Change) -> list[Piece]:
+    def pieces_of(self, change: Change) -> list[Piece]:
+        """The pieces of a change. Raises `NoColumnError` for a sentence that the responses do not hold."""
         found = []
         for size, sentence in change:
             if sentence not in self._known:
@@ -315,7 +326,7 @@ class Columns:
         self, changes: Sequence[Change], exact: int
     ) -> tuple[Float[np.ndarray, "d a"], Float[np.ndarray, "d b"]]:
         """The columns of the first, `exact` changes, and those of the others in single precision."""
-        pieces = [self._pieces(change) for change in changes]
+        pieces = [self.pieces_of(change) for change in changes]
         likelihood, size = self.likelihood, limits.RESPONSES_TOGETHER
         used, cameras = likelihood.used, len(self.patched.cameras)
         length = cameras * int(used.sum())
@@ -326,14 +337,14 @@ class Columns:
         every, first = [piece for each in pieces for piece in each], 0
         for start in range(0, len(used), size):
             rows = cameras * int(used[start : start + size].sum())
-            block = _Block(self, start, every)
+            block = ResponseBlock(self, start, every)
             for some, found in parts:
                 block.fill(some, found[:, first : first + rows])
             first += rows
         return parts[0][1].T, parts[1][1].T
 
 
-class _Block:
+class ResponseBlock:
     """Some field points: responses brought together with their exposures.
 
     Arrays run over sites (m), cameras (k) and pairs of point and exposure (n): those that are used, or all of them
@@ -374,7 +385,7 @@ class _Block:
         if factors not in self._patterns:
             each = []
             for sign in (1.0, -1.0)[: self.sites]:
-                at = _Laid(self.of.likelihood, sign * self.x[:, None], sign * self.y[:, None])
+                at = Laid(self.of.likelihood, sign * self.x[:, None], sign * self.y[:, None])
                 texts = tuple(f for f in factors if isinstance(f, str))
                 value = Sentence("", "", "", texts, units=self.of.patched.units).factor(at)
                 for other in (f for f in factors if not isinstance(f, str)):
@@ -387,14 +398,13 @@ class _Block:
     def _solve(self, pieces: Sequence[Piece], x: Vector, y: Vector) -> None:
         """All cores: what slots do to the counts, or to weighted counts where detectors are linear."""
         keys = list(dict.fromkeys((p.kind, *p.at) for p in pieces))
-        slots = {"inserted", "numbers", "globally", "fringes", "throughput", "mixed"}
-        of_vectors = [key for key in keys if key[0] in slots]
+        of_vectors = [key for key in keys if key[0] in (*SLOTS, "fringes")]
         fringes = self._fringes([key[2] for key in of_vectors if key[0] == "fringes"], x, y)
         # Points that no exposure measures are in no pair.
         some = max(1, int(limits.RESPONSE_NUMBERS // max(1, self.sites * self.cameras * len(self.chosen))))
         for first in range(0, len(of_vectors), some):
             part = of_vectors[first : first + some]
-            change = np.stack([self._change(key, fringes) for key in part])
+            change = np.stack([self.change(key, fringes) for key in part])
             self._cores |= dict(zip(part, self._met(change), strict=True))
         for key in keys:
             if key not in self._cores:
@@ -418,7 +428,7 @@ class _Block:
             for plate in range(whole.shape[2])
         }
 
-    def _change(self, key: tuple[Any, ...], fringes: Mapping[tuple[int, float], np.ndarray]) -> np.ndarray:
+    def change(self, key: tuple[Any, ...], fringes: Mapping[tuple[int, float], np.ndarray]) -> np.ndarray:
         """Change (p m b k 4) of the analysis vectors."""
         kind, *at = key
         vectors = self.found.vectors
@@ -494,12 +504,7 @@ class _Block:
             there = self.found.light.from_sky
         else:
             there = np.broadcast_to(np.asarray(self.of.plan.exposures.clp_in) * 1.0, stokes.shape[:-1])
-        if at[1] in ("q", "u"):  # added, whatever the light is
-            change = np.zeros_like(stokes)
-            change[..., "qu".index(at[1]) + 1] = stokes[..., 0]
-        else:
-            change = stokes @ GENERATORS[at[1]].T
-        return change * there[..., None]
+        return stokes @ generator(at[1]).T * there[..., None]
 
     # --------------------------------------------------------------------------------------------------- columns
 

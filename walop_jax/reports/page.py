@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import jinja2
 import matplotlib
-import numpy as np
 from matplotlib.figure import Figure
 
 from walop_jax.calibration import SUMMARY, read_calibration
@@ -280,7 +279,7 @@ def limits_in_words(found: DetectionLimits | None) -> dict[str, Any] | None:
         "level": f"{level[:1].upper()}{level[1:]}." if level else "",
         "rows": [dict(zip(names, row, strict=True)) for row in found.display().rows],
         "untestable": found.untestable,
-        "median": None if found.worst is None else 100 * float(np.nanmedian(found.protection)),
+        "median": 100 * found.mistakes[0].error[0] if found.mistakes else None,
     }
 
 

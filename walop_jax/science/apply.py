@@ -8,7 +8,7 @@ that has found.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 import jax
@@ -184,10 +184,11 @@ class _Application:
             plain[..., p] -= change
             derivative[..., p] -= np.einsum("rik,rk->ri", found.gain, change)
         if self.slope.any():
-            dq, du = 2.0 * s[:, 2], -2.0 * s[:, 1]  # (q + iu) exp(−2i R) grows by −2i (q + iu) dR
-            turned = np.where(sky[:, None], there[..., 1] * dq[:, None] + there[..., 2] * du[:, None], 0.0)
-            derivative += (found.gain @ turned[..., None]) * self.slope
+            derivative += (found.gain @ _turned(s, there, sky)[..., None]) * self.slope
         derivative = np.add.reduceat(-derivative, first)
+        hidden = _hidden(
+            vectors, derivative, self.shift_by_effects(rows, s, there, sky, found.gain, first, x, y)
+        )
         root = derivative @ vectors.root
         calibration = root @ root.swapaxes(1, 2)
         structure = vectors.calibration.verdict.structure
@@ -220,13 +221,39 @@ class _Application:
             spectrum=spectrum,
             changed=nothing,
             colour=shift(change_of(_ignored_colour(teff))),
-            hidden=_hidden(vectors, derivative),
+            hidden=hidden,
             chi2=found.chi2,
             dof=found.dof,
             rows=np.diff(first, append=len(rows)),
             flag=flag,
         )
         return _Block(rows, star, stars, found, on_sky, sigma, plain, throughput, colour, derivative)
+
+    def shift_by_effects(
+        self,
+        rows: Int[np.ndarray, " r"],
+        s: Float[np.ndarray, "r 3"],
+        there: Float[np.ndarray, "r k 3"],
+        sky: Bool[np.ndarray, " r"],
+        gain: Float[np.ndarray, "r 2 k"],
+        first: Int[np.ndarray, " s"],
+        x: Float[np.ndarray, " r"],
+        y: Float[np.ndarray, " r"],
+    ) -> dict[int, Float[np.ndarray, "s 2"]]:
+        """Shift of q and u of every star by effects that could hide and act on its light (`AnalysisVectors.acting`).
+
+        `s` are the Stokes parameters of the rows in the instrument frame, `there` the vectors.
+        """
+        vectors, lit = self.vectors, {}
+        for k, here in _rows_by_setting(self.setting_of[rows]):
+            for number, added in vectors.added(self.settings[k], x[here], y[here]).items():
+                whole = lit.setdefault(number, np.zeros((len(rows), vectors.cameras)))
+                whole[here] = np.einsum("rs,rks->rk", s[here], added)
+        for number, turn in vectors.turns.items():
+            lit[number] = lit.get(number, 0.0) + turn * _turned(s, there, sky)
+        return {
+            number: np.add.reduceat(-(gain @ one[..., None])[..., 0], first) for number, one in lit.items()
+        }
 
     def outside(self, rows: Int[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:
         """Rows beyond the field of the instrument, or too far beyond that of the calibration to mean anything."""
@@ -506,12 +533,27 @@ def _detector_slopes(
         yield int(place), -np.asarray(change / slope)
 
 
-def _hidden(vectors: AnalysisVectors, derivative: Float[np.ndarray, "s 2 n"]) -> Float[np.ndarray, "s 2"]:
-    """Largest shift of q and u by one of the mistakes that would not have been found; NaN where nobody asked."""
+def _turned(
+    s: Float[np.ndarray, "r 3"], there: Float[np.ndarray, "r k 3"], sky: Bool[np.ndarray, " r"]
+) -> Float[np.ndarray, "r k"]:
+    """Derivative of the counts to ROTATOR: (q + iu) exp(−2i R) grows by −2i (q + iu) dR; 0 where there is none."""
+    return 2.0 * np.where(sky[:, None], there[..., 1] * s[:, 2:] - there[..., 2] * s[:, 1:2], 0.0)
+
+
+def _hidden(
+    vectors: AnalysisVectors, derivative: Float[np.ndarray, "s 2 n"], acting: Mapping[int, np.ndarray]
+) -> Float[np.ndarray, "s 2"]:
+    """Largest shift of q and u by one of the mistakes that would not have been found; NaN where nobody asked.
+
+    `acting` are the shifts by those that act on starlight, by number: the parameters make up for a part of them.
+    """
     hidden = vectors.calibration.hidden
     if hidden is None or not len(hidden):
         return np.full(derivative.shape[:2], np.nan if hidden is None else 0.0)
-    return np.abs(derivative @ hidden.changes[:, vectors.parameters].T).max(axis=2)
+    shift = derivative @ hidden.changes[:, vectors.parameters].T
+    for number, own in acting.items():
+        shift[..., number] -= own
+    return np.abs(shift).max(axis=2)
 
 
 def _rotator_zero(vectors: AnalysisVectors) -> tuple[float, Float[np.ndarray, " n"]]:

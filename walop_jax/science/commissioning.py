@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from walop_jax.calibration.could_hide import off_by, unmeasured
 from walop_jax.data.inspection import inspect
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.display import Display, Displayed
@@ -72,7 +73,7 @@ def commissioning(result: FitResult, accuracy: FieldAccuracy | None) -> Commissi
             "look at the data with walop-jax inspect",
         ),
         Requirement(
-            "the model explains the data", result.trusted, "; ".join(result.warnings) or "trusted",
+            "the model explains the data", result.trusted, "trusted" if result.trusted else "; ".join(result.warnings),
             "walop-jax diagnose says what is missing",
         ),
     ]  # fmt: skip
@@ -92,6 +93,10 @@ def commissioning(result: FitResult, accuracy: FieldAccuracy | None) -> Commissi
             asked = f"p known to {two_digits(100 * MOST)} % in {100 * share:.0f} % of the field"
             said = f"{two_digits(100 * reached)} %{cause}"
             found.append(Requirement(asked, reached <= MOST, said, advice, needed))
+        for name, one in unmeasured(accuracy.not_measured).items():
+            asked = f"what moves stars by {two_digits(100 * MOST)} % is measured"
+            lacking = f"{name} not measured, {off_by(*one.error)} at the usual size"
+            found.append(Requirement(asked, one.error[0] <= MOST, lacking, one.remedy))
         if accuracy.hidden > 0:
             found.append(
                 Requirement(

@@ -15,15 +15,15 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.could_hide import CouldHide, could_hide, off_by, unmeasured
 from walop_jax.calibration.matrix import (
     SMALLEST_DETERMINANT,
-    hidden_errors,
     p_errors,
     p_forms,
     sample_stars,
 )
 from walop_jax.fit.refit import FitResult
-from walop_jax.io.text import rounded, two_digits
+from walop_jax.io.text import two_digits
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.science.star_errors import GOAL
 
@@ -45,13 +45,6 @@ GROUPS = {
 }
 """Parameters by the first part of their names, in words."""
 
-REMEDIES = (
-    (("scattered light", "a non-linearity"), "exposures at a second light level"),
-    (("X of", "Y of", "the scale", "the field"), "an independent check of the field positions"),
-    (("TEFF", "the filter", "filter"), "a measured spectrum of the lamp and of the filter"),
-)
-"""Cures of a mistake, by the beginning of its name: a measurement of the quantity itself."""
-
 
 @dataclasses.dataclass(frozen=True)
 class FieldAccuracy:
@@ -59,8 +52,9 @@ class FieldAccuracy:
 
     `extent` is left, right, bottom and top in degrees. `limited_by` is what most of the error comes from. A
     mistake that the data would not have shown, the worst of them `hidden_by`, can make q or u wrong by `hidden`, the
-    median over the field (NaN: nobody asked), at its just undetected size. `without_u` is the share of the field where
-    a single exposure carries almost no information on u.
+    median over the field (NaN: nobody asked), at its just undetected size, `hidden_worst` where it is largest; `remedy`
+    is the measurement that would show it. `not_measured` are the mistakes on which the data hold no information.
+    `without_u` is the share of the field where a single exposure carries almost no information on u.
     """
 
     error: Float[np.ndarray, "y x"]
@@ -71,6 +65,9 @@ class FieldAccuracy:
     hidden_by: str = ""
     trusted: bool = True
     without_u: float = 0.0
+    hidden_worst: float = np.nan
+    remedy: str = ""
+    not_measured: tuple[CouldHide, ...] = ()
 
     @property
     def share(self) -> float:
@@ -83,29 +80,34 @@ class FieldAccuracy:
         return float(np.median(self.error))
 
     @property
-    def remedy(self) -> str:
-        """The measurement that would show the mistake that could hide."""
-        return next((what for names, what in REMEDIES if self.hidden_by.startswith(names)), "")
+    def apart_from(self) -> str:
+        """Restriction of the error of p where the data do not measure everything that matters; empty: none."""
+        if all(one.ahead for one in self.not_measured):
+            return " behind the telescope" if self.not_measured else ""
+        return " apart from what is not measured"
 
     def document(self) -> dict[str, object]:
         """As plain data, `accuracy_of_p` of summary.json; shares, not per cent."""
         return {
             "median": self.median, "share_below_goal": self.share, "goal": GOAL, "filter": self.filter,
             "limited_by": self.limited_by, "hidden": self.hidden, "hidden_by": self.hidden_by,
+            "hidden_worst": self.hidden_worst, "not_measured": [one.name for one in self.not_measured],
         }  # fmt: skip
 
     def facts(self, *, complete: bool = True) -> tuple[tuple[str, str], ...]:
         """The answer in a few lines: how well, limited by what, and what could hide; of a `complete` model or not."""
         if not self.trusted:
             return (("p of a star", "not known: the calibration is not trusted"),)
-        known = f"{two_digits(100 * self.median)} % (median error for p ≤ 5 %)"
+        known = f"{two_digits(100 * self.median)} %{self.apart_from} (median error for p ≤ 5 %)"
         known += f"; below 0.1 % over {100 * self.share:.0f} % of the field"
         lines = [("p of a star", known if complete else f"{known}, if nothing were missing")]
         if self.limited_by:
             lines.append(("limited by", self.limited_by))
+        if self.not_measured:
+            each = unmeasured(self.not_measured).items()
+            lines.append(("not measured", "; ".join(f"{name}: {off_by(*one.error)}" for name, one in each)))
         if self.hidden > 0:
-            size = f"q or u off by {two_digits(100 * self.hidden)} % (median)"
-            lines.append(("could hide", f"{size} from {self.hidden_by}"))
+            lines.append(("could hide", f"{off_by(self.hidden, self.hidden_worst)} from {self.hidden_by}"))
         if self.hidden > 0 and self.remedy:
             lines.append(("to see that", self.remedy))
         return tuple(lines)
@@ -126,37 +128,21 @@ def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy 
     matrix, covariance, slopes = calibration.over_field(x, y, settings, NODES, TOLERANCE)
     error = p_errors(matrix[: size**2], covariance[: size**2], sample_stars()).reshape(size, size)
     determinant = np.abs(np.linalg.det(matrix.reshape(-1, 2, 3)[: size**2, :, 1:]))
-    matrix, slopes = matrix[size**2 :], slopes[size**2 :]
-    arms = (len(matrix), 2, 3)
-    hidden, worst = np.full(len(matrix), np.nan), ""
-    if calibration.hidden is not None:
-        hidden, worst = hidden_errors(
-            calibration.hidden, matrix.reshape(arms), slopes.reshape(*arms, slopes.shape[2])
-        )
-    known = hidden[np.isfinite(hidden)]
+    mistakes = could_hide(calibration)
+    worst = mistakes[0] if mistakes else None
+    nothing = np.nan if calibration.hidden is None else 0.0
     return FieldAccuracy(
         error,
         calibration.field,
         calibration.usual_filter,
-        limited_by=_limited_by(calibration, matrix, slopes),
-        hidden=float(np.median(known)) if known.size else np.nan,
-        hidden_by=_with_size(calibration, worst),
+        limited_by=_limited_by(calibration, matrix[size**2 :], slopes[size**2 :]),
+        hidden=nothing if worst is None else worst.error[0],
+        hidden_by="" if worst is None else worst.in_words,
+        hidden_worst=nothing if worst is None else worst.error[1],
+        remedy="" if worst is None else worst.remedy,
+        not_measured=tuple(one for one in mistakes if not one.measured),
         trusted=calibration.verdict.trusted,
         without_u=float(np.mean(determinant < SMALLEST_DETERMINANT)),
-    )
-
-
-def _with_size(calibration: Calibration, name: str) -> str:
-    """A mistake that could hide, with the size at which it would just be seen."""
-    hidden = calibration.hidden
-    if hidden is None or name not in hidden.names:
-        return ""
-    at = hidden.names.index(name)
-    size, unit = hidden.sizes[at], hidden.units[at]
-    return (
-        f"{name} (if wrong by {rounded(size, '.2g')} {unit})"
-        if unit
-        else f"{name} (if wrong by {rounded(100 * size, '.2g')} %)"
     )
 
 

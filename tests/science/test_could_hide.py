@@ -1,0 +1,152 @@
+"""What could hide in a calibration, and what its data do not measure at all, against closed forms."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+from astropy.table import Table
+from small_run import SEED, SMALL, small_fit
+from star_tables import SOUTH, setting
+
+from walop_jax.calibration import Calibration, read_calibration, write_calibration
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.calibration.certify import certify
+from walop_jax.calibration.could_hide import change_by_effect, could_hide
+from walop_jax.data.catalogue import read_catalogue
+from walop_jax.data.user_tables import read_input_table
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.hidden_mistakes import _Starlight, hidden_mistakes
+from walop_jax.diagnosis.stated_conditions import Singles
+from walop_jax.diagnosis.trust import examined
+from walop_jax.fit.refit import FitResult, refit
+from walop_jax.fit.verdict import Hidden
+from walop_jax.science.apply import apply
+from walop_jax.science.commissioning import commissioning
+from walop_jax.science.field_accuracy import field_accuracy
+from walop_jax.simulation.simulate import simulate
+
+USUAL = 0.002  # width of the prior of each element of the polarisation of the telescope
+
+
+@functools.cache
+def polariser_alone() -> FitResult:
+    """A set without Moon and standards: everything passes the polariser."""
+    plan = dataclasses.replace(SMALL, moon_patches=0, standards=0)
+    return examined(refit(simulate(plan, seed=SEED).calset))
+
+
+@pytest.fixture
+def product(tmp_path) -> Calibration:
+    """Its calibration, as read from the file."""
+    write_calibration(tmp_path / "calibration.fits", Calibration.from_fit(polariser_alone()))
+    return read_calibration(tmp_path / "calibration.fits")
+
+
+def test_a_telescope_that_nothing_measures_hides_its_usual_polarisation(product):
+    """Light polarised by 0.002 more in q: q is wrong by 0.002. A sky turned by δ: 2 · 0.05 · δ for p = 5 %."""
+    result = polariser_alone()
+    assert result.trusted
+    (remark,) = [text for text in result.warnings if "no information" in text]
+    assert "telescope_polarisation.q, telescope_polarisation.u" in remark
+    found = {one.name: one for one in could_hide(product)}
+    for name in ("telescope_polarisation.q", "telescope_polarisation.u"):
+        assert found[name].error[0] == pytest.approx(USUAL, rel=0.02)
+        assert found[name].error[1] == pytest.approx(
+            USUAL, rel=0.1
+        )  # where u is weak the intensity counts as well
+        assert not found[name].measured
+    # 5.236e-4 = 2 · 0.05 · 0.3°
+    assert found["rotator_zero.angle"].error == pytest.approx((5.236e-4, 5.236e-4), rel=1e-3)
+    assert could_hide(product)[0].name.startswith("telescope_polarisation")
+    assert not {name for name, one in found.items() if not one.measured and "telescope" not in name} - {
+        "rotator_zero.angle"
+    }
+
+
+def test_it_is_no_go_and_not_fit_for_use(product):
+    accuracy = field_accuracy(product, size=5)
+    assert accuracy is not None
+    assert "% behind the telescope" in dict(accuracy.facts())["p of a star"]
+    found = commissioning(polariser_alone(), accuracy)
+    assert not found.go
+    assert "telescope_polarisation.q" in found.missing[0]
+    assert "standards" in found.missing[0]
+    (failed,) = [check for check in certify(product) if not check.passed and check.name != "parents"]
+    assert failed.name == "measured"
+    assert "telescope_polarisation" in failed.found
+
+
+def only(calibration: Calibration, name: str) -> Calibration:
+    """The calibration with one of its mistakes."""
+    hidden = calibration.hidden
+    assert hidden is not None
+    at = [hidden.names.index(name)]
+    kept = {
+        field.name: tuple(getattr(hidden, field.name)[i] for i in at)
+        for field in dataclasses.fields(hidden)
+        if field.name != "changes"
+    }
+    return dataclasses.replace(calibration, hidden=Hidden(**kept, changes=hidden.changes[at]))
+
+
+def star(tmp_path, calibration: Calibration, q: float, plate=None, rotator=None) -> tuple[float, float]:
+    """Q_HIDDEN and U_HIDDEN of a star with exact counts."""
+    vectors = AnalysisVectors(calibration)
+    x, y = np.array([0.11]), np.array([-0.07])
+    a = vectors.exact(setting(plate), x, y, [np.nan])[0, 0]
+    n = 4e6 * a @ np.array([1.0, q, 0.0])
+    table = Table({"ID": [1], "X": x, "Y": y, "N": [n], "N_ERR": [np.sqrt(n)], "TEFF": [np.nan]})
+    table["CHWP_ANGLE"] = [np.nan if plate is None else plate]
+    if rotator is not None:
+        table["ROTATOR"] = [rotator]
+    table.write(tmp_path / "star.fits", overwrite=True)
+    stars = apply(calibration, read_catalogue(read_input_table(tmp_path / "star.fits"), SOUTH))
+    return tuple(stars.hidden[0])
+
+
+def test_stars_have_it(product, tmp_path):
+    """q and u by 0.002 of the telescope; on the sky u of a star with q = 0.5 by 2 · 0.5 · 0.3° of the zero."""
+    assert star(tmp_path, product, 0.0) == pytest.approx((USUAL, USUAL), rel=0.05)
+    zero = only(product, "rotator_zero.angle")
+    q, u = star(tmp_path, zero, 0.5, rotator=0.0)
+    assert u == pytest.approx(5.236e-3, rel=1e-3)
+    assert q == pytest.approx(0.0, abs=1e-6)
+    assert star(tmp_path, zero, 0.5) == (0.0, 0.0)  # without ROTATOR there is no sky
+    assert product.warnings
+    assert "telescope_polarisation" in product.warnings[0]
+
+
+def test_a_plate_that_was_never_in_the_beam_is_unknown_where_stars_are_seen_through_it(product, tmp_path):
+    """A half-wave plate turned by δ turns polarised light by 2δ: (q, u) by 4 · 0.5 · 0.3°; out of the beam by none."""
+    axis = only(product, "chwp_axis.angle")
+    assert np.hypot(*star(tmp_path, axis, 0.5, plate=22.5)) == pytest.approx(0.010472, rel=0.02)
+    assert star(tmp_path, axis, 0.5) == (0.0, 0.0)
+    assert not any("chwp" in one.name for one in could_hide(product))
+
+
+def test_what_moon_and_standards_measure_is_measured():
+    design = Design.of(small_fit())
+    hidden = hidden_mistakes(design, Singles.of(design))
+    assert all(hidden.measured)
+    found = could_hide(dataclasses.replace(Calibration.from_fit(small_fit()), hidden=hidden))
+    assert [one.error[0] for one in found] == sorted((one.error[0] for one in found), reverse=True)
+
+
+@pytest.mark.parametrize("name", ["telescope_polarisation", "hwp1_axis", "camera_leakage", "hwp2_crossing"])
+def test_what_an_effect_does_to_starlight_is_that_of_the_light_path(name):
+    """From the responses, in the colour of the lamp, against the matrix of an instrument that has the effect."""
+    fit = small_fit()
+    design = Design.of(fit)
+    of_stars = _Starlight(design, Singles.of(design).asked, 0)
+    (probe,) = [one for one in of_stars.asked if one.effect.name == name]
+    count = len(probe.widths)
+    none = np.zeros((design.projector.basis.shape[1], count))
+    for one in of_stars.effects(probe, 0.01 * probe.widths, none, np.ones(count, bool)):
+        assert one.acts
+        points = fit.calset.points
+        at = of_stars.setting, fit.calset.filters, points.x, points.y
+        exact = change_by_effect(of_stars.instrument, one.effect, *at)
+        np.testing.assert_allclose(one.change, exact, atol=0.05 * np.abs(exact).max())

@@ -1,0 +1,217 @@
+"""Mistakes that could hide: single ones that the data of a calibration would not have shown, and what they do to stars.
+
+A mistake moves the parameters of the fit by δθ; of what acts on starlight itself the light of stars changes as well.
+Stars are seen through m + δm and calibrated with m + ∂m/∂θ δθ, so that q and u are wrong by
+
+    M⁻¹ (δm − ∂m/∂θ δθ) (1, q, u),   and by 2 p δR where a mistake δR turns the sky against the instrument
+
+Every command that says what could hide asks `could_hide`.
+
+Symbols     m instrument matrix, M its part that acts on q, u; δm its change by an effect at its size; p = 5 %
+Limits      One mistake at a time; to first order in δθ.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.calibration.matrix import LARGEST_P, change_of_qu, matrix_slopes, planned_matrices
+from walop_jax.data.records import FilterCurve
+from walop_jax.data.settings import Settings
+from walop_jax.io.text import rounded, two_digits
+from walop_jax.likelihood.field_table import Vector
+from walop_jax.model import light, responses
+from walop_jax.model.effects import Effect, effect_by_name, in_order
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import field_declarations
+from walop_jax.model.planning import plan_for_settings
+from walop_jax.model.specification import effect_context
+
+if TYPE_CHECKING:
+    from walop_jax.calibration.calibration import Calibration
+
+PLACES = 8  # along each axis of the field, where the errors are asked
+
+
+class CouldHide(NamedTuple):
+    """One mistake that could hide: `error` of q and u (stars with p ≤ 5 %) at `size`, median, largest over the field.
+
+    `kind` is `EFFECT` or `DATA` (`fit.verdict`); it is not `measured` where the data hold no information on it. One
+    that is `ahead` is of the light from the sky before it meets the polariser.
+    """
+
+    name: str
+    kind: str
+    size: float
+    unit: str
+    remedy: str
+    measured: bool
+    ahead: bool
+    error: tuple[float, float]
+
+    @property
+    def in_words(self) -> str:
+        """Name, and the size at which it would just be seen, or the usual one of what the data do not measure."""
+        size = (
+            f"{rounded(self.size, '.2g')} {self.unit}"
+            if self.unit
+            else f"{rounded(100 * self.size, '.2g')} %"
+        )
+        return f"{self.name} ({'if wrong by' if self.measured else 'not measured; usual size'} {size})"
+
+
+def unmeasured(mistakes: Iterable[CouldHide]) -> dict[str, CouldHide]:
+    """Mistakes that the data do not measure, by their names: what one measurement would show together."""
+    together: dict[str, list[CouldHide]] = {}
+    for one in mistakes:
+        if not one.measured:
+            together.setdefault(one.remedy, []).append(one)
+    return {", ".join(one.name for one in some): some[0] for some in together.values()}
+
+
+def off_by(median: float, largest: float) -> str:
+    """Errors of q and u over the field in words; `largest` may be unknown (NaN)."""
+    worst = f", {two_digits(100 * largest)} % at worst" if np.isfinite(largest) else ""
+    return f"q or u off by {two_digits(100 * median)} % (median{worst})"
+
+
+def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
+    """The mistakes that could hide in the data of a calibration, the largest error in the median of the field first.
+
+    In the usual setting, where one exposure gives q and u. None where nobody asked, and without those that do nothing
+    there.
+    """
+    hidden = calibration.hidden
+    if hidden is None or not len(hidden):
+        return ()
+    settings = calibration.usual_settings(filter_name=calibration.usual_filter)
+    errors = hidden_errors(calibration, *calibration.raster(PLACES), settings)
+    errors = errors[:, np.isfinite(errors).all(axis=0)]
+    if not errors.size:
+        return ()
+    acting = acting_effects(calibration)
+    ahead = [number in acting and is_ahead(calibration, acting[number]) for number in range(len(hidden))]
+    columns = zip(
+        *(hidden.names, hidden.kinds, hidden.sizes, hidden.units, hidden.remedies, hidden.measured, ahead),
+        zip(np.median(errors, axis=1).tolist(), errors.max(axis=1).tolist(), strict=True),
+        strict=True,
+    )
+    found = [one for one in itertools.starmap(CouldHide, columns) if one.error[1] > 0.0]
+    return tuple(sorted(found, key=lambda one: (-one.error[0], -one.error[1])))
+
+
+def hidden_errors(
+    calibration: Calibration, x: Vector, y: Vector, settings: Settings
+) -> Float[np.ndarray, "s p"]:
+    """Error of q and u at field positions (deg) by each mistake that could hide; NaN where u is hardly measured."""
+    hidden, instrument = calibration.hidden, calibration.model.instrument(calibration.values)
+    assert hidden is not None
+    filters = {str(settings.filter[0]): calibration.filter_curve(str(settings.filter[0]))}
+    matrix, slopes = matrix_slopes(instrument, settings, filters, x, y)
+    acting, found = acting_effects(calibration), np.empty((len(hidden), len(x)))
+    for number, moved in enumerate(hidden.changes):
+        change, turn = -slopes @ moved, 0.0
+        if number in acting:
+            effect = acting[number]
+            turn = turn_of(instrument, effect)
+            if acts_in(effect, instrument, settings):
+                change = change + change_by_effect(instrument, effect, settings, filters, x, y)
+        found[number] = change_of_qu(matrix, matrix + change) + 2.0 * LARGEST_P * abs(turn)
+    return found
+
+
+# ------------------------------------------------------------------------------------ what acts on starlight itself
+
+
+def as_text(effect: Effect) -> str:
+    """An effect at its values, for `Hidden.acts`."""
+    values = {name: np.asarray(getattr(effect, name)).tolist() for name in field_declarations(type(effect))}
+    return json.dumps({"effect": effect.name, **values, **effect.choices()})
+
+
+def acting_effects(calibration: Calibration) -> Mapping[int, Effect]:
+    """The effects of `Hidden.acts` by their number; without those that the catalogue of the calibration has not."""
+    hidden, model = calibration.hidden, calibration.model
+    context = effect_context(model.template, calibration.exposures)
+    known = {kind.name for kind in model.catalogue}
+    found = {}
+    for number, text in enumerate(() if hidden is None else hidden.acts):
+        values: dict[str, Any] = json.loads(text) if text else {}
+        if (name := values.pop("effect", "")) in known:
+            found[number] = effect_by_name(name, model.catalogue).of(context, **values)
+    return found
+
+
+def moves_with(effect: Effect, instrument: Instrument) -> frozenset[str]:
+    """Column prefixes of the moving elements that an effect is all about: it does nothing where these are out."""
+    bare = dataclasses.replace(instrument, effects=())
+    common, arms = responses.trains(bare.patched())
+    moving = {one.name: one.moves for train in (common, *arms) for one in train if one.moves is not None}
+    found: set[str] = set()
+    for _, change in itertools.chain.from_iterable(effect.first_order(bare)):
+        own = {moving[name] for name in change.place.split(".") if name in moving}
+        if change.where in ("ahead of", "behind") or not own:
+            return frozenset()
+        found |= own
+    return frozenset(found)
+
+
+def acts_in(effect: Effect, instrument: Instrument, settings: Settings) -> bool:
+    """True if an effect does anything to the light of a star in a setting (one row): it is in the beam there."""
+    changes = [
+        one for each in effect.first_order(dataclasses.replace(instrument, effects=())) for _, one in each
+    ]
+    if changes and all(one.kind in responses.LIGHT for one in changes):  # of sources, of the angle of the sky
+        return False
+    needed = moves_with(effect, instrument)
+    return not needed or any(np.isfinite(settings.position(prefix)).any() for prefix in needed)
+
+
+def is_ahead(calibration: Calibration, effect: Effect) -> bool:
+    """True if an effect acts on the light from the sky ahead of the polariser, or turns the sky."""
+    instrument, zero = calibration.model.instrument(calibration.values), jnp.zeros(())
+    after, before = (
+        np.asarray(light.telescope(one, zero, zero)) for one in (with_effect(instrument, effect), instrument)
+    )
+    return bool(np.any(after != before)) or turn_of(instrument, effect) != 0.0
+
+
+def with_effect(instrument: Instrument, effect: Effect) -> Instrument:
+    """The instrument with one effect more, where light meets it."""
+    return dataclasses.replace(instrument, effects=in_order((*instrument.effects, effect)))
+
+
+def turn_of(instrument: Instrument, effect: Effect) -> float:
+    """Angle (rad) by which an effect turns the sky against the instrument, beyond ROTATOR."""
+    changes = [
+        one for each in effect.first_order(dataclasses.replace(instrument, effects=())) for _, one in each
+    ]
+    if changes and all(one.kind != "rotator" for one in changes):
+        return 0.0
+    zeros = (one.patched().rotator_zero for one in (with_effect(instrument, effect), instrument))
+    after, before = (0.0 if zero is None else float(zero) for zero in zeros)
+    return float(np.deg2rad(after - before))
+
+
+def change_by_effect(
+    instrument: Instrument,
+    effect: Effect,
+    setting: Settings,
+    filters: Mapping[str, FilterCurve],
+    x: Vector,
+    y: Vector,
+) -> Float[np.ndarray, "p a 3"]:
+    """Instrument matrix with an effect that stands at its size, less the one without, in one setting."""
+    after, before = (
+        planned_matrices(one, plan_for_settings(one, setting, filters), x, y)
+        for one in (with_effect(instrument, effect), instrument)
+    )
+    return after - before

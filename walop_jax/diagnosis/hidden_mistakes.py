@@ -1,0 +1,227 @@
+"""Mistakes that the data behind a fit would not show: of the set, of the cameras, and effects that the model has not.
+
+A number that is wrong by h moves the parameters by δθ = R⁻¹QᵀC h (J = QR), and is found where h² |PC|² reaches the
+noncentrality of its test (`stated_conditions`), with a probability of 99 %. It hides at that size, or at the largest
+plausible one, for an effect the width of its prior. What the data hold no information on at all hides at that as well:
+P C = 0, or no exposure that could show it. Stars are wrong by what it does to their own light less what δθ makes up for
+(`calibration.could_hide`); what does neither cannot matter, and is left out.
+
+Symbols     C derivative of the residuals; P projection off the free parameters, Q, R of their Jacobian J
+Limits      One mistake at a time, one amplitude of an effect at a time, to first order. Effects of many places or
+            thicknesses (blemish, fringes) are judged by patterns, and are not here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.calibration.could_hide import as_text, change_by_effect, moves_with, turn_of
+from walop_jax.calibration.matrix import LARGEST_P, change_of_qu, first_setting, matrix_slopes
+from walop_jax.data.records import CalibrationSet
+from walop_jax.data.settings import Settings
+from walop_jax.diagnosis.candidates import Probe
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.limits_found import PROBABILITY
+from walop_jax.diagnosis.policy import POLICY, Policy
+from walop_jax.diagnosis.score import local_p, noncentrality
+from walop_jax.diagnosis.stated_conditions import Singles
+from walop_jax.fit.verdict import DATA, EFFECT, Hidden
+from walop_jax.likelihood.columns import Columns
+from walop_jax.likelihood.starlight import added_to_starlight
+from walop_jax.model.effects import Effect
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import field_declarations
+
+STAR_POINTS = 16  # field points at which stars are asked what a mistake does to them
+MOST_HIDDEN = 12  # mistakes that a product keeps: what a star needs for each is a product of two vectors
+_FAINT = 0.1  # of the worst mistake, below which an effect that the data measure is not kept
+_NOTHING = 1e-9  # change of the analysis vectors that is none
+
+
+class _Mistake(NamedTuple):
+    """One number at the size at which it could hide, and what the parameters take up of it.
+
+    `informed`: whether the data hold information on it. Of an effect, at its size, `change` is what it does to the
+    instrument matrix at the field points, and it `acts` on starlight if it does anything.
+    """
+
+    name: str
+    kind: str
+    size: float
+    unit: str
+    shown_by: str
+    along: Float[np.ndarray, " q"]
+    informed: bool
+    effect: Effect | None = None
+    change: Float[np.ndarray, "p a 3"] | float = 0.0
+    acts: bool = False
+
+
+def hidden_mistakes(design: Design, singles: Singles, policy: Policy = POLICY) -> Hidden:
+    """Single mistakes as large as the data would just have shown at 99 % probability, and what they do.
+
+    Kept are those that move the parameters by more than their standard errors, and effects that act on starlight; first
+    those that make q and u of stars most wrong, in the median over the field. An effect that data show below its usual
+    size does little to stars, which see what the polariser sees: it stays if it does a tenth of what the worst does.
+    """
+    fit = design.fit
+    usual = _usual(fit.calset, fit.model.template)
+    instrument = fit.model.instrument(fit.values)
+    found = list(_mistakes(design, singles, usual, policy))
+    along = np.array([one.along for one in found]).reshape(len(found), -1).T
+    changes = (fit.model.selection() @ design.taken_up(along)).T
+    turns = np.array([0.0 if one.effect is None else abs(turn_of(instrument, one.effect)) for one in found])
+    errors = _errors_of_stars(design, found, changes, usual) + 2.0 * LARGEST_P * turns
+    least, strong = _FAINT * errors.max(initial=0.0), np.linalg.norm(along, axis=0) > 1.0
+    best: dict[str, tuple[int, bool, bool]] = {}
+    for i in np.argsort(-errors, kind="stable").tolist():
+        one = found[i]
+        acts = one.acts or turns[i] > 0.0
+        # In the usual setting it is out of the beam; stars that are seen through it have it.
+        elsewhere = not (acts or one.informed or one.effect is None) and bool(
+            moves_with(one.effect, instrument)
+        )
+        if (errors[i] > least or not one.informed) if acts else (strong[i] or elsewhere):
+            best.setdefault(one.name, (i, acts, elsewhere))
+    unseen = {i for i, acts, _ in best.values() if acts and not found[i].informed}
+    always = unseen | {i for i, _, elsewhere in best.values() if elsewhere}
+    others = [i for i, *_ in best.values() if i not in always][:MOST_HIDDEN]
+    order = sorted([*always, *others], key=lambda i: -errors[i])
+    acting = {i for i, acts, elsewhere in best.values() if acts or elsewhere}
+    some = [found[i] for i in order]
+    return Hidden(
+        names=tuple(one.name for one in some),
+        sizes=tuple(one.size for one in some),
+        units=tuple(one.unit for one in some),
+        changes=changes[order],
+        kinds=tuple(one.kind for one in some),
+        remedies=tuple(one.shown_by for one in some),
+        acts=tuple(
+            as_text(one.effect) if one.effect is not None and i in acting else ""
+            for i, one in zip(order, some, strict=True)
+        ),
+        measured=tuple(i not in unseen for i in order),
+    )
+
+
+def _mistakes(design: Design, singles: Singles, usual: int, policy: Policy) -> Iterator[_Mistake]:
+    """All of them, amplitude by amplitude."""
+    of_stars = _Starlight(design, singles.asked, usual)
+    p, first = local_p(policy.alarm, len(singles.testable)), 0
+    shown = set()
+    for one in singles.rivals:
+        count = len(one.candidate.widths)
+        at = slice(first, first + count)
+        first += count
+        plausible, alive = np.broadcast_to(one.plausible, count), singles.alive[at]
+        if not plausible.any():
+            continue
+        least = noncentrality(p, max(singles.table[one.candidate.name].rank, 1), PROBABILITY)
+        left = np.where(alive, singles.left[at], 1.0)
+        sizes = np.where(alive, np.minimum(plausible, np.sqrt(least / left)), plausible)
+        along = singles.along[:, at] * sizes
+        if one.probe is not None:
+            shown.add(one.probe.name)
+            yield from of_stars.effects(one.probe, sizes, along, alive)
+        else:
+            kind = EFFECT if one.stated is None else DATA
+            number = (one.candidate.name, kind, float(sizes[0]), one.unit, one.shown_by)
+            yield _Mistake(*number, along[:, 0], bool(alive[0]))
+    for probe in of_stars.asked:
+        if probe.name not in shown:
+            widths = probe.widths
+            nothing = np.zeros((len(singles.along), len(widths)))
+            yield from of_stars.effects(probe, widths, nothing, np.zeros(len(widths), bool))
+
+
+class _Starlight:
+    """Change of starlight by the effects that are asked, in the setting of an exposure."""
+
+    def __init__(self, design: Design, asked: Sequence[Probe], exposure: int) -> None:
+        self.fit, self.asked = design.fit, asked
+        template, calset = self.fit.model.template, self.fit.calset
+        self.instrument = self.fit.model.instrument(self.fit.values)
+        self.setting = first_setting(calset, self.instrument, exposure)
+        columns = Columns(self.fit.likelihood, self.fit.values)
+        changes = {p.name: [one for m in p.group for one in m.first_order(template)] for p in self.asked}
+        known = [name for name, some in changes.items() if some and all(map(columns.has, some))]
+        self.vectors, added = added_to_starlight(
+            columns, [one for name in known for one in changes[name]], exposure
+        )
+        ends = np.cumsum([len(changes[name]) for name in known])
+        self.added = dict(zip(known, np.split(added, ends[:-1], axis=-1), strict=True)) if known else {}
+
+    def effects(
+        self,
+        probe: Probe,
+        sizes: Float[np.ndarray, " a"],
+        along: Float[np.ndarray, "q a"],
+        alive: Bool[np.ndarray, " a"],
+    ) -> Iterator[_Mistake]:
+        """The amplitudes of a probe, each by itself."""
+        declared, fit = field_declarations(probe.effect), self.fit
+        pairs, points = self.instrument.cameras.pairs, fit.calset.points
+        for number, (parameter, effect) in enumerate(_at_sizes(probe, sizes)):
+            if probe.name in self.added:
+                added = self.added[probe.name][..., number] * sizes[number]
+                change = _of_matrix(self.vectors, added, pairs)
+            else:  # of a user's own: the responses do not hold it
+                at = self.setting, fit.calset.filters, points.x, points.y
+                added = change = change_by_effect(self.instrument, effect, *at)
+            size, unit = float(sizes[number]), declared[parameter].unit
+            number_of = (f"{probe.effect.name}.{parameter}", EFFECT, size, unit, probe.effect.revealed_by)
+            acts = bool(np.abs(added).max(initial=0.0) > _NOTHING)
+            yield _Mistake(*number_of, along[:, number], bool(alive[number]), effect, change, acts)
+
+
+def _of_matrix(
+    vectors: Float[np.ndarray, "p k 3"],
+    added: Float[np.ndarray, "p k 3"],
+    pairs: Sequence[tuple[int, int]],
+) -> Float[np.ndarray, "p a 3"]:
+    """Change of the instrument matrix, to first order, where the analysis vectors change."""
+    one, other = ([pair[i] for pair in pairs] for i in (0, 1))
+    light = vectors[:, one, :1] + vectors[:, other, :1]
+    matrix = (vectors[:, one] - vectors[:, other]) / light
+    return (added[:, one] - added[:, other] - matrix * (added[:, one, :1] + added[:, other, :1])) / light
+
+
+def _at_sizes(probe: Probe, sizes: Float[np.ndarray, " a"]) -> Iterator[tuple[str, Effect]]:
+    """Each amplitude of a probe by itself: its parameter, and the effect with it at its size."""
+    rest = iter(sizes)
+    for member in probe.group:
+        for name in probe.effect.amplitudes():
+            neutral = np.asarray(getattr(member, name), float)
+            for at in np.ndindex(neutral.shape):
+                value = neutral.copy()
+                value[at] += next(rest)
+                yield name, dataclasses.replace(member, **{name: jnp.asarray(value)})
+
+
+def _usual(calset: CalibrationSet, instrument: Instrument) -> int:
+    """The exposure in the most usual setting: the first of those with fewest moving elements in the beam."""
+    inside = [calset.exposures.position(prefix).inside for prefix in instrument.patched().moving()]
+    return int(np.argmin(np.sum(inside, axis=0))) if inside else 0
+
+
+def _errors_of_stars(
+    design: Design, mistakes: Sequence[_Mistake], changes: Float[np.ndarray, "c n"], exposure: int
+) -> Float[np.ndarray, " c"]:
+    """Median over some field points of what mistakes do to q and u; 0 where these are not measured."""
+    fit, points = design.fit, design.fit.calset.points
+    some = np.unique(np.linspace(0, len(points) - 1, STAR_POINTS).astype(int))
+    instrument = fit.model.instrument(fit.values)
+    setting: Settings = first_setting(fit.calset, instrument, exposure)
+    matrix, slopes = matrix_slopes(instrument, setting, fit.calset.filters, points.x[some], points.y[some])
+    found = np.zeros(len(mistakes))
+    for i, (one, moved) in enumerate(zip(mistakes, changes, strict=True)):
+        own = one.change[some] if isinstance(one.change, np.ndarray) else one.change
+        error = change_of_qu(matrix, matrix + (own - slopes @ moved))
+        found[i] = np.median(error[np.isfinite(error)]) if np.isfinite(error).any() else 0.0
+    return found

@@ -1,0 +1,70 @@
+"""Change of the light of a star by small changes of an instrument: to first order, from the responses of the columns.
+
+Equation    δa = Σ f B G F + a G_t      of the optics behind the telescope, of the light ahead of the polariser
+Symbols     a analysis vectors (camera; 1, q, u) of one setting; B, G, F as in `model.responses`; G_t generator of what
+            acts on the light itself; f what the change grows with over the field
+Limits      First order. Changes of sources, of the polariser, of detectors and in single exposures do nothing to a
+            star; what grows with time, temperature or an angle is 0 in the usual setting.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.columns import SLOTS, Change, Columns, Laid, ResponseBlock, generator
+from walop_jax.likelihood.pieces import Piece
+from walop_jax.model.effects.factors import FIELD, factor
+
+
+def added_to_starlight(
+    columns: Columns, changes: Sequence[Change], exposure: int
+) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
+    """Analysis vectors at the field points in the setting of an exposure, and what one unit of each change adds."""
+    pieces = [columns.pieces_of(change) for change in changes]
+    points, size, found = len(columns.likelihood.used), limits.RESPONSES_TOGETHER, []
+    for start in range(0, points, size):
+        parts = _at_points(ResponseBlock(columns, start, ()), pieces, exposure)
+        found.append(tuple(part[: points - start] for part in parts))
+    vectors, added = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return vectors, added
+
+
+def _at_points(
+    block: ResponseBlock, changes: Sequence[Sequence[Piece]], exposure: int
+) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
+    every, band = np.arange(len(block.x)), block.band[:, exposure]
+    vectors = block.found.vectors.vectors[every, 0, band]  # p k 4
+    added = np.zeros((*vectors.shape[:-1], 3, len(changes)))
+    at = Laid(block.of.likelihood, block.x[:, None], block.y[:, None])
+    for a, pieces in enumerate(changes):
+        for piece in pieces:
+            if piece.kind in SLOTS:
+                change = block.change((piece.kind, *piece.at), {})[every, 0, band]
+            elif piece.kind == "light" and piece.at[0] == "ahead":
+                change = vectors @ generator(piece.at[1])
+            elif piece.kind == "counts":
+                change = vectors * np.asarray(piece.at)[:, None]
+            else:
+                continue
+            size = _for_stars(piece.factors, at, exposure) * piece.size
+            added[..., a] += size[:, None, None] * change[..., :3]
+    return vectors[..., :3], added
+
+
+def _for_stars(factors: Sequence[Any], at: Laid, exposure: int) -> Float[np.ndarray, " p"]:
+    """Product of factors for stars in the setting of an exposure: at its time, temperature and angles nothing grows."""
+    points, product = len(at.x), np.ones(len(at.x))
+    for one in factors:
+        if not isinstance(one, str):
+            shape = (points, len(at.likelihood.flux_known))
+            product = product * np.broadcast_to(one(at), shape)[:, exposure]
+        elif (known := factor(one)).depends_on == FIELD:
+            product = product * np.broadcast_to(known.value(at), (points, 1))[:, 0]
+        else:
+            return np.zeros(points)
+    return product
