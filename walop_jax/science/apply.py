@@ -141,6 +141,7 @@ class _Application:
         self.counts = linearised(calibration, catalogue.counts)
         self.offset, self.slope = _rotator_zero(self.vectors)
         self.order = np.argsort(catalogue.star, kind="stable")
+        self.on_sky = bool(np.isfinite(catalogue.rotator).any())
 
     def blocks(self) -> Iterator[tuple[int, Int[np.ndarray, " r"]]]:
         """Rows of whole stars, each with the number of rows done after it."""
@@ -223,7 +224,7 @@ class _Application:
             hidden=_hidden(vectors, derivative),
             chi2=found.chi2,
             dof=found.dof,
-            rows=np.diff(first, append=len(rows)),
+            rows=np.add.reduceat((~catalogue.copy[rows]).astype(int), first),
             flag=flag,
         )
         return _Block(rows, star, stars, found, on_sky, sigma, plain, throughput, colour, derivative)
@@ -246,11 +247,13 @@ class _Application:
         points, sigma = self.catalogue.points, self.catalogue.sigma[rows]
         settings, calibration = points.settings[rows], self.vectors.calibration
         bits = calibration.flags(points.x[rows], points.y[rows], settings)
-        bits[bits & Quality.BEYOND_SETTINGS > 0] |= Quality.VALIDITY_FORCED
+        bits[calibration.beyond_settings(settings)] |= Quality.VALIDITY_FORCED
         bits[self.outside(rows)] |= Quality.BEYOND_FIELD
         bits[settings.teff < COOLEST] |= Quality.BEYOND_SETTINGS
-        bits[~np.isfinite(counts * sigma).all(axis=1)] |= Quality.CAMERA_MISSING
+        bits[~np.isfinite(counts * sigma).all(axis=1) & ~self.catalogue.copy[rows]] |= Quality.CAMERA_MISSING
         bits[self.catalogue.spoilt[rows]] |= Quality.SATURATED
+        bits[self.catalogue.repeated[rows]] |= Quality.REPEATED
+        bits[self.on_sky & ~np.isfinite(self.catalogue.rotator[rows])] |= Quality.OTHER_FRAME
         flag = np.bitwise_or.reduceat(bits, first) | calibration.verdict.quality
         flag[~(found.condition < ILL_POSED)] |= Quality.HIGH_CROSSTALK
         flag[~np.isfinite(found.qu).all(axis=1)] |= Quality.NO_STOKES
@@ -272,7 +275,7 @@ class _Application:
         catalogue, vectors, stars = self.catalogue, self.vectors, block.stars
         number = catalogue.star[block.rows]
         first = np.flatnonzero(np.diff(block.star, prepend=-1))
-        beyond = Quality.BEYOND_FIELD | Quality.BEYOND_SETTINGS | Quality.NO_STOKES
+        beyond = Quality.BEYOND_FIELD | Quality.BEYOND_SETTINGS | Quality.NO_STOKES | Quality.REPEATED
         good = chosen[number[first]] & (stars.flag & beyond == 0) & (stars.dof > 0)
         r = np.flatnonzero(good[block.star])
         if not r.size:
