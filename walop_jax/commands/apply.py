@@ -45,10 +45,11 @@ def apply(
 ) -> Outcome[Any]:
     """Turn the intensities of stars into Stokes parameters: Q, U, P, EVPA and their errors.
 
-    X and Y in degrees, N and N_ERR (one value per camera) in electrons; optional ID, TEFF, ROTATOR, N_FLAG (or FLAG,
-    or O1_FLAG, …; any bit: not used), FILTER, TEMP, HA, and CHWP_ANGLE, CHWP_IN or those of any other moving element. Rows of one ID (and filter)
-    are one star: they are combined, wherever the moving elements stand, and all hold the same result. With
-    ROTATOR the results are on the sky. Two cameras see one combination of q and u: a star needs several settings.
+    X and Y in degrees, N and N_ERR (one value per camera) in electrons; optional ID, TEFF, ROTATOR, FILTER, TEMP, HA,
+    N_FLAG (or FLAG, or O1_FLAG, …; any bit: not used), and CHWP_ANGLE, CHWP_IN or those of any other moving element.
+    Rows of one ID (and filter) are one star: they are combined, wherever the moving elements stand, and all hold the
+    same result. With ROTATOR the results are on the sky. Two cameras see one combination of q and u: a star needs
+    several settings.
 
     Errors hold photon noise and calibration; Q_COLOUR and U_COLOUR say what ignoring TEFF does, Q_HIDDEN and U_HIDDEN
     what a single mistake would do that the data of the calibration could not show (beside Q_ERR and U_ERR). FLAG: 16 a

@@ -78,8 +78,8 @@ _OF_A_SOURCE = Rule(
 )
 _IS_JULIAN = Rule(
     lambda mjd: np.abs(mjd) > 1e6,
-    "is no modified Julian date",
-    "in days: MJD = JD − 2400000.5; of Unix time in seconds MJD = 40587 + t/86400",
+    "is not a Modified Julian Date",
+    "is this a Julian Date? subtract 2400000.5",
 )
 _TIME = Rule(lambda time: (time < 0) | np.isinf(time), "is not a time", "seconds; NaN where it is not known")
 _POSITIVE = Rule(

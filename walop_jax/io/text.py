@@ -235,6 +235,6 @@ def unpacking(path: Path) -> tuple[io.BufferedIOBase, str] | None:
             raise fail(what, file=path, advice="unpack it, and give one of them")
         if entries[0].flag_bits & 1:
             raise fail("is encrypted", file=path, advice="unpack it first")
-        return archive.open(names[0]), names[0]
+        return archive.open(names[0]), names[0]  # pyright: ignore[reportReturnType]
     opener = next((opener for start, opener in _PACKED.items() if head.startswith(start)), None)
     return None if opener is None else (opener(path, "rb"), path.stem)
