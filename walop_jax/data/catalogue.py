@@ -224,6 +224,19 @@ class Catalogue:
     def __len__(self) -> int:
         return len(self.star)
 
+    def of_stars(self, chosen: Bool[np.ndarray, " s"]) -> Catalogue:
+        """The rows of some of the stars."""
+        rows, points = np.flatnonzero(chosen[self.star]), self.points
+        there = FieldPoints(points.x[rows], points.y[rows], points.settings[rows], points.outside[rows])
+        others = {
+            f.name: getattr(self, f.name)
+            for f in dataclasses.fields(self)
+            if f.name not in ("points", "remarks")
+        }
+        cut = {name: values[rows] for name, values in others.items()}
+        cut["star"] = np.unique(cut["star"], return_inverse=True)[1].reshape(-1)
+        return Catalogue(points=there, **cut)
+
 
 def read_catalogue(
     source: InputTable,
