@@ -37,7 +37,8 @@ ILL_POSED = 10.0  # ratio of the errors of the two principal directions from whi
 COOL, HOT = 3500.0, 10000.0
 """Colour temperatures (K) between which 95 % of the stars without TEFF are taken to lie, normal in 1/T."""
 _ROUNDS = 16
-_EXPANSIONS = 2  # of the counts, about the errors of the calibration that explain the stars best
+_EXPANSIONS = 8  # of the counts, about the errors of the calibration that explain the stars best, …
+_STRAIGHT = 0.01  # … until second derivatives make less difference than this share of the noise, squared
 IMPROBABLE = 1e-6
 """Probability of a CHI2 as large below which FLAG 131072 is set, …"""
 ROUGH = 0.005
@@ -333,9 +334,11 @@ class _Application:
             moved = dataclasses.replace(vectors.calibration, values=values)
             seen = self.catalogue.of_stars(chosen)
             left = residuals_of(AnalysisVectors(moved), seen, len(seen), force=True)
-            if not left:
+            there = StarResiduals.joined(left) if left else None
+            same = there is not None and there.residual.shape == search.stars.residual.shape
+            if there is None or (same and search.bend(errors, there.residual) < _STRAIGHT):
                 break
-            search = CatalogueSearch(StarResiduals.joined(left), names, vectors.named, vectors.root, errors)
+            search = CatalogueSearch(there, names, vectors.named, vectors.root, errors)
             check = search.answer()
         return check
 

@@ -55,6 +55,7 @@ NOISE_MATTERS = 1.1
 _MOST_CHANGES = 6
 _ROUNDS = 8
 _SETTLED = 0.05  # standard errors
+_FARTHEST = 5.0  # standard errors in every direction: no calibration is so far off by chance
 _REFERENCE = 1e6  # electron
 _SEEN = 2.33  # one-sided 99 %
 
@@ -159,7 +160,7 @@ class CatalogueCheck(Displayed):
     one row, and `rows_p` its chance beside `noise`. `scale` are the factors on the photon covariance of stars of one
     row and of several: 1 unless errors are off. `tests` are the `asked` questions in their first answer; `smallest` is
     the gain change of the camera seen best that would be found in 99 % of cases (nan: none). `stars` and `rows_used`
-    count what was looked at; `growth` holds the units of X, Y and time. `places` are those where stars disagree together.
+    count what was looked at; `growth` holds the units of X, Y and time; stars of `places` disagree together.
     """
 
     stars: int
@@ -366,8 +367,8 @@ class CatalogueSearch:
         amounts = self.mixing @ (sizes - self.start)
         return self.stars.behind(self.stars.residual, lambda part, _: self._columns(part) @ amounts)
 
-    def _looked(self, sizes: Float[np.ndarray, " c"]) -> _Look:
-        """Scales, Q and g (priors included) with these changes taken away."""
+    def _looked(self, sizes: Float[np.ndarray, " c"], *, stated: bool = False) -> _Look:
+        """Scales, Q and g (priors included) with these changes taken away; with `stated` of N_ERR as it is."""
         stars, dof = self.stars, self.stars.dof.astype(float)
 
         def scale_of(residual: Float[np.ndarray, "r k"]) -> Scale:
@@ -380,13 +381,15 @@ class CatalogueSearch:
             off = is_off(scale, self._alarm) and not self.crowded
             single = heavier * (scale.value if scale.value > 1 or off else 1.0)
             several = single
-            if rows is not None and _chance_beside(rows, noise) < self._alarm:
+            if not stated and rows is not None and _chance_beside(rows, noise) < self._alarm:
                 several = max(single, rows.value)
             each = self.variance * np.where(stars.rows > 1, several, single)
             matrix, score = normal_matrix(stars, residual, self._columns, scale.kept / each, scale.share)
             matrix = self.mixing.T @ matrix @ self.mixing + np.diag(self.prior)
             return _Look(noise, rows, matrix, self.mixing.T @ score - self.prior * sizes)
 
+        if stated:
+            return look(noise._replace(value=1.0))
         found = look(noise)
         # What all stars have in common is no noise: weights come from the scatter about the gains that fit them best.
         for _ in range(ABOUT_GAINS if is_off(noise, self._alarm) else 0):
@@ -415,6 +418,11 @@ class CatalogueSearch:
         look = self._looked(sizes)
         tests = self._beside(look.matrix, look.score, chosen)
         if self._suspicious(look, tests):  # else one linear step is all there is to do
+            explained = self._explained()
+            by_errors = None if explained is None else self._looked(explained)
+            # Scatter that errors of the calibration can explain is not held against N_ERR.
+            if explained is not None and by_errors is not None and not is_off(by_errors.noise, self._alarm):
+                look, sizes = by_errors, explained
             look, sizes = self._settled(look, sizes, chosen)
             tests = self._beside(look.matrix, look.score, chosen)
         smallest = self._smallest(tests)
@@ -464,15 +472,30 @@ class CatalogueSearch:
                 break
         return places
 
+    def _explained(self) -> Float[np.ndarray, " c"] | None:
+        """Errors of the calibration that explain the stars best with N_ERR as stated; None if they cannot be."""
+        _, sizes = self._settled(self._looked(self.start, stated=True), self.start, [], stated=True)
+        errors = sizes[self.asked : -2]
+        return sizes if errors @ errors <= _FARTHEST**2 * len(errors) else None
+
     def errors_of_calibration(self) -> Float[np.ndarray, " n"] | None:
-        """Errors of the calibration that explain the stars best, in units of `root`; None if they are improbable."""
-        _, sizes = self._settled(self._looked(self.start), self.start, [])
-        likely = sizes[self.asked : -2]
-        if special.chdtrc(max(len(likely), 1), likely @ likely) < self._alarm:
-            return None
+        """Errors of the calibration, in units of `root`, that explain the stars best; None if they cannot be.
+
+        With N_ERR as stated, else with errors as large as the scatter.
+        """
+        sizes = self._explained()
+        if sizes is None:
+            sizes = self._settled(self._looked(self.start), self.start, [])[1]
         errors = np.zeros(len(self.matters))
-        errors[self.matters] = likely
-        return errors
+        errors[self.matters] = sizes[self.asked : -2]
+        return errors if errors @ errors <= _FARTHEST**2 * self.matters.sum() else None
+
+    def bend(self, errors: Float[np.ndarray, " n"], residual: Float[np.ndarray, "r k"]) -> float:
+        """Mean square, per degree of freedom, of the residuals with errors of the calibration less first order."""
+        sizes = self.start.copy()
+        sizes[self.asked : -2] = errors[self.matters]
+        off = self.stars.chi2(residual - self._left(sizes)) / self.variance
+        return float(np.median(off / np.maximum(self.stars.dof, 1)))
 
     @property
     def _alarm(self) -> float:
@@ -486,7 +509,7 @@ class CatalogueSearch:
         return min(rows, chance_of_scale(look.noise), _chance(strongest)) < near
 
     def _settled(
-        self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int]
+        self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], *, stated: bool = False
     ) -> tuple[_Look, Float[np.ndarray, " c"]]:
         """Changes `chosen` and errors of the calibration fitted together, with the stars that this keeps."""
         fitted = np.array([*chosen, *range(self.asked, len(sizes))])
@@ -498,7 +521,7 @@ class CatalogueSearch:
                 break
             sizes = sizes.copy()
             sizes[fitted] += step
-            look = self._looked(sizes)
+            look = self._looked(sizes, stated=stated)
         return look, sizes
 
     def _beside(
