@@ -69,9 +69,7 @@ class InputTable:
         if kept:
             sentences.append(f"{kept[0]} of the table is {self.new_name(kept[0])} in the result")
         if gone := [name for name in replaced if name not in self.used]:
-            sentences.append(
-                f"{_columns(gone)} of the table replaced by the result{_hints(gone, self.lacking)}"
-            )
+            sentences.append(f"{_columns(gone)} replaced by the result")
         if unused:
             sentences.append(f"{_columns(unused)} not used{_hints(unused, self.lacking)}")
         return tuple(sentences)
