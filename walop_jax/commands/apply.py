@@ -98,6 +98,7 @@ def apply(
         stars = apply_to_rows(
             used, rows, lambda done, total: job.tell(f"{done} of {total} rows"), force=force
         )
+    at_places = {place.words() for place in stars.check.places}
     job.begin("writing")
     alone = len(set(rows.star.tolist())) == len(rows.star) and len(used.model.template.arms) == 1
     settings = ": with one arm a star needs rows at several settings, of one ID" if alone else ""
@@ -142,7 +143,10 @@ def apply(
             * (n[Quality.HIGH_CROSSTALK] > 0)
         ),
         warnings=[
-            *(f"{text} (FLAG {Quality.CATALOGUE:d})" for text in stars.check.warnings()),
+            *(
+                f"{text} (FLAG {Quality.PLACE if text in at_places else Quality.CATALOGUE:d})"
+                for text in stars.check.warnings()
+            ),
             *_about_noise(rows.counts, rows.sigma),
             *_about_places(rows, stars.flag),
         ],

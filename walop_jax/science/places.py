@@ -87,12 +87,14 @@ class Place:
 
 
 class _Seen(NamedTuple):
-    """Stars at places: positions, z and α of every camera."""
+    """Stars at places: positions, z and α of every camera; χ² and its degrees of freedom."""
 
     x: Float[np.ndarray, " s"]
     y: Float[np.ndarray, " s"]
     z: Float[np.ndarray, "s k"]
     alpha: Float[np.ndarray, "s k"]
+    chi2: Float[np.ndarray, " s"]
+    dof: Float[np.ndarray, " s"]
 
 
 def places_of(
@@ -161,6 +163,8 @@ def _seen(
                 part.y[first],
                 np.where(sees, score / root, 0.0),
                 np.where(sees, root / spread, 0.0),
+                summed(np.sum(residual[rows] ** 2, axis=1)) / spread[:, 0],
+                np.maximum(part.dof[own] / np.bincount(own)[own], 0.5),
             )
         )
     return _Seen(*(np.concatenate(values) for values in zip(*parts, strict=True)))
@@ -214,42 +218,38 @@ def _described(
     part = _Seen(*(values[near] for values in seen))
     fits = []
     for k, name in enumerate(cameras):
-        x, y, size, chi2 = _fitted(part, k, centre)
-        fits.append((chi2, k, name, Place(x, y, size, sigma, 0, ())))
-    fits.sort(key=lambda fit: fit[0])
-    least, place = fits[0][0], fits[0][-1]
-    limit = least + RIVAL * max(1.0, least / max(int(near.sum()) - 4, 1))
+        x, y, size = _fitted(part, k, centre)
+        place = Place(x, y, size, sigma, 0, ())
+        share, error, gain = _share(part, k, place.profile(part.x, part.y))
+        fits.append((gain, place, CameraAtPlace(k, name, share, error)))
+    fits.sort(key=lambda fit: -fit[0])
+    best, place = fits[0][0], fits[0][1]
+    scatter = (part.chi2.sum() - best) / max(part.dof.sum() - 4.0, 1.0)
+    alike = [camera for gain, _, camera in fits if gain > best - RIVAL * max(1.0, scatter)]
     g = place.profile(part.x, part.y)
-    alike = [CameraAtPlace(k, name, *_share(part, k, g)[:2]) for chi2, k, name, _ in fits if chi2 < limit]
     return dataclasses.replace(place, stars=int((g > np.exp(-2.0)).sum()), alike=tuple(alike))
 
 
-def _fitted(
-    seen: _Seen, camera: int, centre: tuple[float, float, float]
-) -> tuple[float, float, float, float]:
-    """Centre, size and χ² of the place that describes the stars best by one camera."""
+def _fitted(seen: _Seen, camera: int, centre: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Centre and size of the place that describes the stars best by one camera, near those that were looked for."""
     x, y, size = centre
 
-    def misfit(moved: Float[np.ndarray, " 3"]) -> float:
-        spot = Place(x + size * moved[0], y + size * moved[1], size * np.exp(moved[2]), 0.0, 0, ())
-        return _share(seen, camera, spot.profile(seen.x, seen.y))[2] + float(moved @ moved)
+    def place(moved: Float[np.ndarray, " 3"]) -> tuple[float, float, float]:
+        return x + size * moved[0], y + size * moved[1], size * float(np.exp(moved[2]))
 
-    start = optimize.minimize(
-        misfit, np.zeros(3), method="Nelder-Mead", options={"maxiter": 120, "xatol": 0.02}
-    )
-    moved = np.clip(start.x, -_WIDER, _WIDER)
-    moved[2] = np.clip(moved[2], -1.0, np.log(_WIDER))
-    return (
-        float(x + size * moved[0]),
-        float(y + size * moved[1]),
-        float(size * np.exp(moved[2])),
-        misfit(moved),
-    )
+    def misfit(moved: Float[np.ndarray, " 3"]) -> float:
+        g = Place(*place(moved), 0.0, 0, ()).profile(seen.x, seen.y)
+        return float(moved @ moved) - _share(seen, camera, g)[2]
+
+    bounds = [(-_WIDER, _WIDER)] * 2 + [(-1.0, np.log(_WIDER))]
+    first = np.vstack([np.zeros(3), 0.5 * np.eye(3)])
+    options = {"maxiter": 200, "xatol": 0.01, "fatol": 0.1, "initial_simplex": first}
+    found = optimize.minimize(misfit, np.zeros(3), method="Nelder-Mead", bounds=bounds, options=options)
+    return place(found.x)
 
 
 def _share(seen: _Seen, camera: int, g: Float[np.ndarray, " s"]) -> tuple[float, float, float]:
-    """β of a camera, its standard error, and χ² behind it."""
-    z, shape = seen.z[:, camera], seen.alpha[:, camera] * g
-    square = float(shape @ shape)
-    size = float(shape @ z) / square if square > 0 else 0.0
-    return size, square**-0.5 if square > 0 else np.inf, float(np.sum((z - size * shape) ** 2))
+    """β of a camera, its standard error, and by how much it makes χ² smaller."""
+    shape = seen.alpha[:, camera] * g
+    square, score = float(shape @ shape), float(shape @ seen.z[:, camera])
+    return (score / square, square**-0.5, score**2 / square) if square > 0 else (0.0, np.inf, 0.0)
