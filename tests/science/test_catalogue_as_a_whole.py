@@ -85,8 +85,16 @@ def test_two_settings_of_the_plate_name_the_camera(vectors, calibration, tmp_pat
 
 
 def test_rows_that_are_there_four_times_are_said(vectors, calibration, tmp_path):
+    """Extracted four times from one exposure, they share its noise; copies to the last digit count once."""
     table, qu = noisy(vectors, tmp_path)
     fourfold = Table({name: np.concatenate([table[name]] * 4) for name in table.colnames})
+    copied = apply(calibration, read(fourfold, tmp_path))
+    assert copied.check.holds
+    np.testing.assert_allclose(
+        copied.covariance, apply(calibration, read(table, tmp_path)).covariance, rtol=1e-9
+    )
+    assert np.all(copied.rows == 1)
+    fourfold["N"] *= 1.0 + 1e-6 * np.random.default_rng(0).standard_normal(fourfold["N"].shape)
     found = apply(calibration, read(fourfold, tmp_path))
     (sentence,) = found.check.warnings()
     assert "the rows of a star agree more than independent rows do" in sentence
@@ -158,3 +166,18 @@ def test_structure_and_hidden_mistakes_of_the_calibration_reach_the_stars(vector
     plain = apply(known, read(clean, tmp_path))
     np.testing.assert_allclose(plain.hidden, np.abs(other.qu - plain.qu), rtol=0.02, atol=1e-6)
     assert np.isnan(apply(calibration, read(clean, tmp_path)).hidden).all()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_bright_stars_under_a_poor_calibration_say_nothing_of_their_errors(calibration, tmp_path, seed):
+    """The true instrument lies within the errors of the calibration, far enough for their second order to show."""
+    poor = dataclasses.replace(calibration, covariance=9.0**2 * calibration.covariance)
+    root = np.linalg.cholesky(poor.covariance + 1e-24 * np.eye(len(poor.values)))
+    values = poor.values + root @ np.random.default_rng(seed).standard_normal(len(poor.values))
+    truth = AnalysisVectors(dataclasses.replace(poor, values=values))
+    bright, qu = stars(truth, 400, np.random.default_rng(2), flux=4e8, teff=5500.0)
+    found = apply(poor, read(bright, tmp_path))
+    assert found.check.holds, found.check.warnings()
+    assert np.all(pulls(found, qu) < 1.6)
+    bright["N_ERR"] *= 0.2
+    assert any("N_ERR is" in text for text in apply(poor, read(bright, tmp_path)).check.warnings())

@@ -392,6 +392,12 @@ class Calibration(Fitted):
         return tuple(prefix for prefix in moving if self.exposures.position(prefix).inside.all())
 
     @property
+    def never_in(self) -> tuple[str, ...]:
+        """Column prefixes of the moving elements that were in the beam in no exposure."""
+        moving = self.model.template.patched().moving()
+        return tuple(prefix for prefix in moving if not self.exposures.position(prefix).inside.any())
+
+    @property
     def left_behind(self) -> tuple[str, ...]:
         """Effects of the model of which a part belongs to its exposures, so that no matrix and no star can have it."""
         return left_behind(self.model.template)
@@ -428,6 +434,8 @@ class Calibration(Fitted):
         high_x, high_y = self.field[1] + margin, self.field[3] + margin
         flags[(x < low_x) | (x > high_x) | (y < low_y) | (y > high_y)] |= Quality.BEYOND_FIELD
         flags[self.beyond_settings(settings)] |= Quality.BEYOND_SETTINGS
+        for prefix in self.never_in:
+            flags[np.isfinite(settings.position(prefix))] |= Quality.BEYOND_SETTINGS
         return flags
 
     def beyond_settings(self, settings: Settings) -> Bool[np.ndarray, " p"]:

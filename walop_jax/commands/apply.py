@@ -26,6 +26,7 @@ CATALOGUE = Argument(
 DEBIAS = Option("Estimator of P_DEBIASED: Plaszczynski et al. 2014, or Wardle and Kronberg 1974.", "MAS|WK")
 SATURATION = Option("Counts from here on are not used (FLAG 256).", "ELECTRONS", float)
 BRIGHT = 1000.0  # electrons: their errors are a few per cent, with a read noise of 100 electrons a tenth
+APART = 0.005  # deg: rows of one star that lie farther apart may be those of two
 FORCE = Option("Also stars whose filter or temperature it does not cover (FLAG 2048).")
 
 
@@ -44,16 +45,20 @@ def apply(
 ) -> Outcome[Any]:
     """Turn the intensities of stars into Stokes parameters: Q, U, P, EVPA and their errors.
 
-    X and Y in degrees, N and N_ERR (one value per camera) in electrons; optional ID, TEFF, ROTATOR, N_FLAG,
-    FILTER, TEMP, HA, and CHWP_ANGLE, CHWP_IN or those of any other moving element. Rows of one ID (and filter)
-    are one star: they are combined, wherever the moving elements stand, and all hold the same result. With
-    ROTATOR the results are on the sky. Two cameras see one combination of q and u: a star needs several settings.
+    X and Y in degrees, N and N_ERR (one value per camera) in electrons; optional ID, TEFF, ROTATOR, FILTER, TEMP, HA,
+    N_FLAG (or FLAG, or O1_FLAG, …; any bit: not used), and CHWP_ANGLE, CHWP_IN or those of any other moving element.
+    Rows of one ID (and filter) are one star: they are combined, wherever the moving elements stand, and all hold the
+    same result. With ROTATOR the results are on the sky. Two cameras see one combination of q and u: a star needs
+    several settings.
 
-    Errors hold photon noise and calibration; Q_COLOUR and U_COLOUR say what ignoring TEFF does. FLAG: 16 a
+    Errors hold photon noise and calibration; Q_COLOUR and U_COLOUR say what ignoring TEFF does, Q_HIDDEN and U_HIDDEN
+    what a single mistake would do that the data of the calibration could not show (beside Q_ERR and U_ERR). FLAG: 16 a
     direction of (q, u) is hardly measured, 32 beyond the calibrated field (no result a quarter beyond), 64
     filter, temperature or colour that the calibration has not seen, 128 a camera is missing, 256 flagged or
     saturated counts, 2048 used with --force, 16384 no result, 131072 intensities that disagree with the
-    calibration by more than noise and half a per cent; bits of the calibration itself are added to all rows.
+    calibration by more than noise and half a per cent, 1048576 a place in the field where stars disagree together,
+    2097152 no ROTATOR where others have one, 4194304 the counts of another row; bits of the calibration itself are
+    added to all rows. Copies of a row are left out; columns that are not used are named.
 
     Of a SURVEY (walop-jax stack) the calibration at the MJD of the stars is taken: those of one night in a catalogue.
 
@@ -63,8 +68,8 @@ def apply(
     >>> walop.apply(result, star)["P", "P_ERR", "EVPA"]  # doctest: +SKIP
     """
     from walop_jax.data.catalogue import read_catalogue
-    from walop_jax.data.user_tables import table_format
     from walop_jax.fit.verdict import Quality
+    from walop_jax.io.plain_tables import table_format
     from walop_jax.nights.stacking import calibration_of_stars, is_survey, read_survey
     from walop_jax.posterior import with_moments
     from walop_jax.science.apply import apply as apply_to_rows
@@ -85,13 +90,15 @@ def apply(
     else:
         held = calibration_of(calibration, effects)
     limit = math.inf if saturation is None else saturation
-    rows = read_catalogue(table, held.model.template.patched(), limit, always_in=held.always_in)
+    instrument, always, never = held.model.template.patched(), held.always_in, held.never_in
+    rows = read_catalogue(table, instrument, limit, always_in=always, never_in=never)
     job.tell("tabulating the analysis vectors", "tabulating")
     used = held if posterior is None else with_moments(held, posterior)
     with errors_naming(table.path):
         stars = apply_to_rows(
             used, rows, lambda done, total: job.tell(f"{done} of {total} rows"), force=force
         )
+    at_places = {place.words() for place in stars.check.places}
     job.begin("writing")
     alone = len(set(rows.star.tolist())) == len(rows.star) and len(used.model.template.arms) == 1
     settings = ": with one arm a star needs rows at several settings, of one ID" if alone else ""
@@ -111,6 +118,10 @@ def apply(
             Quality.BEYOND_SETTINGS: "star(s) with a filter, temperature or TEFF beyond the calibration",
             Quality.DISAGREES: "star(s) whose intensities disagree with the calibration (FLAG 131072, CHI2): is "
             "the background subtracted, are the cameras in order?",
+            Quality.PLACE: "star(s) at a place of the field where stars disagree with the calibration together "
+            "(FLAG 1048576): their errors are enlarged",
+            Quality.OTHER_FRAME: "star(s) without ROTATOR, in the frame of the instrument (FLAG 2097152)",
+            Quality.REPEATED: "star(s) with the place and counts of another star or setting (FLAG 4194304)",
         },
         untold=(
             Quality.HIGH_CROSSTALK,
@@ -132,8 +143,12 @@ def apply(
             * (n[Quality.HIGH_CROSSTALK] > 0)
         ),
         warnings=[
-            *(f"{text} (FLAG {Quality.CATALOGUE:d})" for text in stars.check.warnings()),
+            *(
+                f"{text} (FLAG {Quality.PLACE if text in at_places else Quality.CATALOGUE:d})"
+                for text in stars.check.warnings()
+            ),
             *_about_noise(rows.counts, rows.sigma),
+            *_about_places(rows, stars.flag),
         ],
     )
 
@@ -145,6 +160,22 @@ def _about_noise(counts: Any, sigma: Any) -> Iterator[str]:
     bright = counts > BRIGHT
     if bright.any() and (share := float(np.median(sigma[bright] / counts[bright]))) > 0.5:
         yield f"N_ERR of bright stars is {share:.2g} times N: are these variances? Standard errors are wanted"
+
+
+def _about_places(rows: Any, flag: Any) -> Iterator[str]:
+    """A sentence where rows of one star disagree, and lie at different places of the field."""
+    import numpy as np
+
+    from walop_jax.fit.verdict import Quality
+
+    apart = np.zeros(len(flag))
+    for place in (rows.points.x, rows.points.y):
+        low, high = np.full(len(flag), np.inf), np.full(len(flag), -np.inf)
+        np.minimum.at(low, rows.star, place)
+        np.maximum.at(high, rows.star, place)
+        apart = np.maximum(apart, high - low)
+    if number := int(((apart > APART) & (flag & Quality.DISAGREES > 0)).sum()):
+        yield f"{number} of the stars that disagree have rows at different places: is their ID that of one star?"
 
 
 def _errors(columns: Mapping[str, tuple[Any, ...]]) -> str:

@@ -317,7 +317,8 @@ def table_outcome(
     """A table with what a calibration adds to it, written if it has an output.
 
     `flag` are the bits of its rows: those `told` have a warning each, those `untold` are counted only. `lost` are the
-    effects that could not be carried over, `more` goes into the document, `text` is given the counts.
+    effects that could not be carried over, `more` goes into the document, `text` is given the counts. Columns of the
+    table that are not used or are replaced are named.
     """
     from walop_jax.data.user_tables import extended
     from walop_jax.io.plain_tables import write_table
@@ -327,6 +328,7 @@ def table_outcome(
     if output is not None:
         write_table(output, made, overwrite=job.overwrite)
     counts = {bit: int((flag & bit > 0).sum()) for bit in sorted((*told, *untold))}
+    remarks = table.about(columns)
     document = {
         "output": output,
         "rows": table.rows,
@@ -334,6 +336,7 @@ def table_outcome(
         "flags": {str(int(bit)): count for bit, count in counts.items()},
         "product": held.content_hash(),
         NOT_CARRIED_OVER: list(lost),
+        "remarks": list(remarks),
         **(more or {}),
     }
     return Outcome(
@@ -343,7 +346,7 @@ def table_outcome(
         warnings=(
             *held.warnings,
             *left_out_sentences(lost, held.path),
-            *(f"{table.path}: {sentence}" for sentence in warnings),
+            *(f"{table.path}: {sentence}" for sentence in (*remarks, *warnings)),
             *(f"{table.path}: {counts[bit]} {sentence}" for bit, sentence in told.items() if counts[bit]),
         ),
     )

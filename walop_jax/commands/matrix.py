@@ -20,7 +20,7 @@ from walop_jax.commands.inputs import (
     table_of,
     table_outcome,
 )
-from walop_jax.io.errors import errors_naming, nearest
+from walop_jax.io.errors import errors_naming, fail, nearest
 
 POINTS = Option("FITS, CSV, ECSV or VOTable with X, Y in degrees.", "TABLE", Path)
 OUT = Option("Table to write (.fits, .csv, .ecsv); needed with --points.", "OUT", Path, "-o")
@@ -63,6 +63,8 @@ def matrix(
     points of the calibration, 64 filter or temperature that the calibration has not seen. Beyond the field
     of the instrument (0.35 degrees for the WALOPs) there is no value: NaN and FLAG 32.
 
+    Columns of a table that are not used are named.
+
     In Python: an astropy table, for `x`, `y` (degrees or quantities) or for the table `points`: a path, an astropy
     table, columns by name. `columns` are others of those above, such as temp=5 or chwp_angle=45.
 
@@ -71,9 +73,8 @@ def matrix(
       m21 0.0716... ± 0.000...
     """
     from walop_jax.data.catalogue import POINT_COLUMNS, field_points
-    from walop_jax.data.user_tables import table_format
     from walop_jax.fit.verdict import Quality
-    from walop_jax.io.plain_tables import MatrixTable
+    from walop_jax.io.plain_tables import MatrixTable, table_format
     from walop_jax.posterior import with_draws
 
     if (points is None) == (x is None):
@@ -100,7 +101,12 @@ def matrix(
             what = f"there is no argument or column {name!r}; {nearest(name.upper(), known)}"
             raise TypeError(f"matrix: {what}")
     table = table_of({"X": x, "Y": y} if points is None else points, columns)
-    wanted = field_points(table, instrument, held.always_in)
+    never = [prefix for prefix in held.never_in if f"{prefix}_ANGLE" not in map(str.upper, columns)]
+    wanted = field_points(table, instrument, held.always_in, never)
+    if points is None and wanted.outside.all():
+        limit = instrument.field_limit
+        what = f"beyond the field of {instrument.name} (±{limit:g}°)"
+        raise fail(what, column="X, Y", advice="give degrees; are these arcmin?")
     job.tell("working out the matrix")
     used = held if posterior is None else with_draws(held, posterior)
     with errors_naming(table.path):
@@ -125,6 +131,7 @@ def matrix(
         text=lambda n: f"{output}: {table.rows} rows, {n[crossed]} of them in zones of high cross-talk",
     )
     made = MatrixTable(found.value, copy=False)
+    made.meanings = {int(bit): bit.meaning for bit in Quality}
     if output is not None:
         return dataclasses.replace(found, value=made)
     advice = ("walop-jax matrix RUN --points TABLE -o OUT, for many points",)

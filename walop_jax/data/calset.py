@@ -35,7 +35,16 @@ from walop_jax.data.records import (
     Site,
     Sources,
 )
-from walop_jax.data.schema import CALVERS, Place, column_names, in_unit, read_table, table_of, table_rules
+from walop_jax.data.schema import (
+    CALVERS,
+    Place,
+    column_names,
+    in_unit,
+    read_table,
+    table_of,
+    table_rules,
+    without_mask,
+)
 from walop_jax.data.settings import builtin_filter
 from walop_jax.data.table_intensities import TableIntensities, mask_repeats, table_intensities, usable
 from walop_jax.data.write import EXTENSION, filter_columns, read_compression, remark, set_tables
@@ -342,7 +351,7 @@ def from_arrays(
     tables: dict[str, Mapping[str, Any]] = {
         "EXPOSURES": {
             "EXPOSURE": np.arange(number),
-            "KIND": np.broadcast_to(np.asarray(kinds), number),
+            "KIND": _column("KIND", kinds, number),
             "CLP_IN": inside,
             "CLP_ANGLE": np.where(inside, angles, np.nan),
         }
@@ -351,7 +360,9 @@ def from_arrays(
         "INTENSITIES": {
             "EXPOSURE": exposure,
             "POINT": point,
-            "SOURCE": np.full(len(point), -1) if source is None else np.asarray(source)[point, exposure],
+            "SOURCE": np.full(len(point), -1)
+            if source is None
+            else _none_where_masked(source)[point, exposure],
             "N": counts[point, exposure],
             "N_ERR": errors[point, exposure],
         },
@@ -416,7 +427,11 @@ def _spoilt(counts: np.ndarray) -> Iterator[str]:
 
 def _column(name: str, values: Any, number: int) -> np.ndarray:
     unit = _UNITS.get(name, "deg" if name.endswith("_ANGLE") else "")
-    raw = np.asarray(getattr(values, "value", values))
+    raw, masked = without_mask(getattr(values, "value", values))
+    if raw.dtype.kind in "bSU":
+        Place(NAME, "EXPOSURES").refuse(
+            np.atleast_1d(masked), "is masked", name.lower(), "fill or remove these"
+        )
     plain = raw if raw.dtype.kind in "bSU" else in_unit(values, unit, name.lower())
     try:
         return np.broadcast_to(plain, number).copy()
@@ -426,6 +441,11 @@ def _column(name: str, values: Any, number: int) -> np.ndarray:
             column=name.lower(),
             advice="one value for each",
         ) from None
+
+
+def _none_where_masked(source: Any) -> np.ndarray:
+    values, masked = without_mask(source)
+    return np.where(masked, -1, values)
 
 
 def _sources(given: Mapping[str, Any]) -> dict[str, np.ndarray]:

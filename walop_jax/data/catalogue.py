@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 from collections.abc import Collection, Mapping, Sequence, Sized
 from typing import Protocol, runtime_checkable
 
@@ -15,11 +16,19 @@ from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.schema import EXPOSURES, Column, Place, check, finite
 from walop_jax.data.settings import TEMPERATURE, Settings
-from walop_jax.data.user_tables import InputTable, numeric_column, read_input_table, vector_column
+from walop_jax.data.user_tables import (
+    MISSING,
+    InputTable,
+    numeric_column,
+    plain_column,
+    read_input_table,
+    vector_column,
+)
 from walop_jax.io.errors import rows_text
 
 _NEGATIVE = 5.0  # sigma: what noise about a subtracted background may do, and no more
 _SINGLE = 1  # point: it may lie outside without a doubt about its unit
+_WHOLE = 1e-4  # deg: angles in radians that are so close to whole degrees are not read as degrees
 _FINITE = finite("correct or remove these rows")
 
 
@@ -94,13 +103,17 @@ class FieldPoints:
 
 
 def field_points(
-    source: InputTable, instrument: InstrumentOfTables, always_in: Collection[str] = ()
+    source: InputTable,
+    instrument: InstrumentOfTables,
+    always_in: Collection[str] = (),
+    never_in: Collection[str] = (),
 ) -> FieldPoints:
     """The X, Y and optional settings of a table of field points of an instrument.
 
     A moving element has the columns `<P>_ANGLE` and `<P>_IN`; without the latter it is in the beam where it has an
-    angle. The elements `always_in` (column prefixes) must have an angle. Single points outside the field are marked; if
-    most of them lie outside, the unit must be wrong.
+    angle. Of column prefixes, those `always_in` must have an angle, and those `never_in`, in the beam in no exposure of
+    the calibration, are in it only where `<P>_IN` says so. Single points outside the field are marked; if most of
+    them lie outside, the unit must be wrong.
 
     Raises `DataError` naming file, column and row for anything that cannot be meant.
     """
@@ -112,14 +125,21 @@ def field_points(
     for prefix in instrument.moving():
         name = f"{prefix}_ANGLE"
         if prefix in always_in and name not in source.names:
-            advice = (
-                f"give it in a table: {prefix} was in the beam in all exposures of the calibration (NaN: out)"
+            what = (
+                f"the angle of {prefix} is missing, which was in the beam in all exposures of the calibration"
             )
-            raise place.fail("the column is missing", name, advice)
+            advice = (
+                f"give the column {name} (deg, NaN: out); for all points of walop-jax matrix --at {prefix}=0"
+            )
+            raise place.fail(what, name, advice)
         angle = numeric_column(source, name, EXPOSURES["CLP_ANGLE"])
+        _doubt_radians(source, name, angle, place)
         inside = np.isfinite(angle)
         if f"{prefix}_IN" in source.names:
             inside = numeric_column(source, f"{prefix}_IN", EXPOSURES["CHWP_IN"])
+        elif prefix in never_in:
+            what = f"has values, but no exposure of the calibration had {prefix} in the beam: was it, in"
+            place.refuse(inside, what, name, f"add {prefix}_IN: F where it was out, T where it was in")
         advice = f"{prefix}_IN is true: give the angle"
         place.refuse(inside & ~np.isfinite(angle), "is not finite", name, advice)
         check({name: angle}, {name: EXPOSURES["CLP_ANGLE"]}, place)
@@ -140,6 +160,23 @@ def field_points(
         positions=positions,
     )
     return FieldPoints(x=x, y=y, settings=settings, outside=outside)
+
+
+def _doubt_radians(source: InputTable, name: str, angle: Float[np.ndarray, " n"], place: Place) -> None:
+    """Refuse angles without a unit that are whole degrees if they are radians; remark on others within ±2π."""
+    column = source.column(name)
+    if column is None or getattr(column, "unit", None):
+        return
+    turned = angle[np.isfinite(angle) & (angle != 0)]
+    if not turned.size or np.abs(turned).max() > 6.2832 or np.all(turned == np.round(turned)):
+        return
+    degrees = np.rad2deg(turned)
+    if np.all(np.abs(degrees - np.round(degrees)) < _WHOLE):
+        what = (
+            f"has no unit and is a whole number of degrees in radians ({turned[0]:.6g} = {degrees[0]:.0f}°)"
+        )
+        raise place.fail(what, name, "give degrees, or state the unit of the column")
+    source.remarks.append(f"{name} has no unit and lies within ±2π: taken to be degrees; are these radians?")
 
 
 def true_matrices(
@@ -167,20 +204,38 @@ class Catalogue:
     """The rows of a science catalogue.
 
     `points` are positions and settings; `counts` and `sigma` [electron] are NaN where a camera is not used;
-    `spoilt` marks rows in which a camera was flagged. `star` numbers the stars from 0; `rotator` [deg] is NaN
-    for results in the instrument frame, `time` [MJD, d] where it is not known.
+    `spoilt` marks rows in which a camera was flagged, `copy` those that repeat another row of their star to the last
+    bit, which are not used, and `repeated` those that have the counts of another star or setting. `star` numbers the
+    stars from 0; `rotator` [deg] is NaN for results in the instrument frame, `time` [MJD, d] where it is not known.
+    `remarks` say what is odd in the table, and what of it is not used.
     """
 
     points: FieldPoints
     counts: Float[np.ndarray, "n k"]
     sigma: Float[np.ndarray, "n k"]
     spoilt: Bool[np.ndarray, " n"]
+    copy: Bool[np.ndarray, " n"]
+    repeated: Bool[np.ndarray, " n"]
     star: Int[np.ndarray, " n"]
     rotator: Float[np.ndarray, " n"]
     time: Float[np.ndarray, " n"]
+    remarks: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.star)
+
+    def of_stars(self, chosen: Bool[np.ndarray, " s"]) -> Catalogue:
+        """The rows of some of the stars."""
+        rows, points = np.flatnonzero(chosen[self.star]), self.points
+        there = FieldPoints(points.x[rows], points.y[rows], points.settings[rows], points.outside[rows])
+        others = {
+            f.name: getattr(self, f.name)
+            for f in dataclasses.fields(self)
+            if f.name not in ("points", "remarks")
+        }
+        cut = {name: values[rows] for name, values in others.items()}
+        cut["star"] = np.unique(cut["star"], return_inverse=True)[1].reshape(-1)
+        return Catalogue(points=there, **cut)
 
 
 def read_catalogue(
@@ -189,8 +244,9 @@ def read_catalogue(
     saturation: float = np.inf,
     *,
     always_in: Collection[str] = (),
+    never_in: Collection[str] = (),
 ) -> Catalogue:
-    """The catalogue in a table of an instrument; `always_in` as for `field_points`.
+    """The catalogue in a table of an instrument; `always_in` and `never_in` as for `field_points`.
 
     Counts from `saturation` [electron] on, or below −5 σ, are not used.
 
@@ -198,14 +254,17 @@ def read_catalogue(
     above 0, a ROTATOR that only some rows of a star have.
     """
     place = Place(source.path, "")
-    points, cameras = field_points(source, instrument, always_in), len(instrument.cameras)
+    points, cameras = field_points(source, instrument, always_in, never_in), len(instrument.cameras)
     rule = Column("float", "electron", width=cameras, shape_advice=f"one row holds all {cameras} cameras")
     counts, sigma = (vector_column(source, name, rule, instrument.cameras.names) for name in ("N", "N_ERR"))
     advice = "standard errors in electrons; NaN for a camera that is not to be used"
     place.refuse(np.isfinite(counts) & (sigma <= 0), "is not above 0", "N_ERR", advice)
-    bad = _flagged(source, cameras, place) | (counts >= saturation) | (counts < -_NEGATIVE * sigma)
-    rotator = numeric_column(source, "ROTATOR", EXPOSURES["ROTATOR"])
-    star = _stars(source, points)
+    flagged = _flagged(source, instrument.cameras.names, place)
+    bad = flagged | (counts >= saturation) | (counts < -_NEGATIVE * sigma)
+    rotator, time = (numeric_column(source, name, EXPOSURES[name]) for name in ("ROTATOR", "MJD"))
+    check({"ROTATOR": rotator, "MJD": time}, {name: EXPOSURES[name] for name in ("ROTATOR", "MJD")}, place)
+    _doubt_radians(source, "ROTATOR", rotator, place)
+    star = _stars(source, points, place)
     on_sky = np.isfinite(rotator)
     most = np.zeros(star.max() + 1, bool)
     most[star[on_sky]] = True
@@ -213,42 +272,156 @@ def read_catalogue(
     if mixed.size:
         what = f"is missing in {rows_text(mixed)}, but other rows of the same ID have it"
         raise place.fail(what, "ROTATOR", "give it for all rows of a star, or for none")
+    if on_sky.any() and not on_sky.all():
+        missing = rows_text(np.flatnonzero(~on_sky))
+        source.remarks.append(f"ROTATOR is missing in {missing}: these are in the frame of the instrument")
+    copy, repeated = _copies(source, points, counts, sigma, rotator, star)
+    bad |= copy[:, None]
     return Catalogue(
         points=points,
         counts=np.where(bad, np.nan, counts),
         sigma=np.where(bad, np.nan, sigma),
-        spoilt=np.any(bad, axis=1),
+        spoilt=np.any(bad, axis=1) & ~copy,
+        copy=copy,
+        repeated=repeated,
         star=star,
         rotator=rotator,
-        time=numeric_column(source, "MJD", EXPOSURES["MJD"]),
+        time=time,
+        remarks=source.about(),
     )
 
 
-def _flagged(source: InputTable, cameras: int, place: Place) -> Bool[np.ndarray, "n k"]:
-    """Cameras that the catalogue itself says are not to be used."""
-    if "N_FLAG" not in source.names:
-        return np.zeros((source.rows, cameras), bool)
-    column = source.table.columns[source.names.index("N_FLAG")]
-    bits = np.ma.filled(np.ma.asarray(column), 0)
-    if bits.dtype.kind not in "iub" or bits.shape[1:] not in ((), (cameras,)):
+def _flagged(source: InputTable, cameras: Sequence[str], place: Place) -> Bool[np.ndarray, "n k"]:
+    """Cameras that the catalogue itself says are not to be used: N_FLAG, FLAG, or a column for each camera."""
+    flagged = np.zeros((source.rows, len(cameras)), bool)
+    names = ["N_FLAG"]
+    if not {"QU_COV", "P_DEBIASED"} <= set(
+        source.names
+    ):  # else FLAG is that of a star, of an earlier `apply`
+        names.append("FLAG")
+    for name in names:
+        if source.column(name) is not None:
+            flagged |= _bits(source, name, len(cameras), place)
+    for k, camera in enumerate(cameras):
+        for name in (f"N{k}_FLAG", f"N_FLAG{k}", f"{camera.upper()}_FLAG"):
+            if name in source.names:
+                flagged[:, k] |= _bits(source, name, 1, place)[:, 0]
+    return flagged
+
+
+def _bits(source: InputTable, name: str, cameras: int, place: Place) -> Bool[np.ndarray, "n m"]:
+    """True where a column of flags has any bit set, for all cameras or for each: whole numbers, truth values, texts."""
+    values, missing, _ = plain_column(source.column(name), name, Column("int"), place)
+    values, missing = values.reshape(source.rows, -1), missing.reshape(source.rows, -1)
+    if values.dtype.kind in "OSU":
+        texts, of = np.unique(np.char.strip(values.astype(str)), return_inverse=True)
+        values = np.array([_bit(text.lower(), name, place) for text in texts])[of].reshape(values.shape)
+    elif values.dtype.kind == "f":
+        missing = missing | np.isnan(values)
+    several = values.dtype.kind == "b" and values.shape[1] > 1 and values.shape[1] != cameras  # single bits
+    whole = values.dtype.kind in "iubf" and np.all(missing | (values == np.round(values)))
+    if not whole or (values.shape[1] not in (1, cameras) and not several):
         what = f"is neither one integer in a row nor {cameras}"
-        raise place.fail(what, "N_FLAG", "bits as in a calibration set")
-    return np.broadcast_to(bits.reshape(source.rows, -1) != 0, (source.rows, cameras))
+        raise place.fail(what, name, "bits as in a calibration set")
+    flagged = (values != 0) & ~missing
+    return flagged.any(axis=1, keepdims=True) if several else flagged
 
 
-def _stars(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n"]:
-    """Number of the star of every row: by ID and FILTER; a row without an ID is a star of its own."""
+def _bit(text: str, name: str, place: Place) -> bool:
+    if text in (*MISSING, "f", "false", "no"):
+        return False
+    digits = re.fullmatch(r"0x([0-9a-f]+)|0b([01]+)|(\d+)(?:\.0*)?", text)
+    if digits is None and text not in ("t", "true", "yes"):
+        what = f"{text!r} is neither a number nor true or false"
+        raise place.fail(what, name, "write bits as in a calibration set")
+    return digits is None or set("".join(filter(None, digits.groups()))) != {"0"}
+
+
+_NO_ID = (*MISSING, "-1", "unknown")
+
+
+def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndarray, " n"]:
+    """Number of the star of every row: by ID and FILTER; a row without an ID is a star of its own.
+
+    IDs that are missing, empty or negative are none.
+    """
     rows = np.arange(source.rows)
-    if "ID" not in source.names:
+    column = source.column("ID")
+    if column is None:
         return rows
-    column = source.table.columns[source.names.index("ID")]
-    masked = np.broadcast_to(np.asarray(getattr(column, "mask", False)), rows.shape)
-    values = np.ma.getdata(np.ma.asarray(column))
-    if values.dtype.kind not in "iu":
+    values, missing, _ = plain_column(column, "ID", Column("str"), place)
+    if values.ndim == 2 and values.shape[1] == 1:
+        values, missing = values[:, 0], missing[:, 0]
+    if values.ndim != 1:
+        raise place.fail(f"has shape {values.shape[1:]} in a row, one value is needed", "ID", "split it")
+    if values.dtype.kind == "f":
+        largest = 2.0 ** (np.finfo(values.dtype).nmant + 1)
+        missing = missing | np.isnan(values)
+        what = f"is a float beyond 2**{np.finfo(values.dtype).nmant + 1}, where neighbouring numbers are one"
+        advice = "write identifiers as integers or as text"
+        place.refuse(~missing & (np.abs(values) >= largest), what, "ID", advice)
+    if values.dtype.kind in "iuf":
+        unknown = ~missing & ((values < 0) | (values == np.iinfo(np.uint64).max))
+    else:
         values = np.char.strip(values.astype(str))
-        masked = masked | (values == "") | (values == "nan")
+        missing = missing | (values == "")
+        unknown = ~missing & np.isin(np.char.lower(values), _NO_ID)
+    if unknown.any():
+        which = rows_text(np.flatnonzero(unknown))
+        source.remarks.append(
+            f"ID is {values[unknown][0]} in {which}: unknown, a star of its own in each row"
+        )
     _, name = np.unique(values, return_inverse=True)
     _, band = np.unique(points.settings.filter, return_inverse=True)
     key = name.reshape(-1) * (band.max() + 1) + band.reshape(-1)
     alone = key.max() + 1 + rows
-    return np.unique(np.where(masked, alone, key), return_inverse=True)[1].reshape(-1)
+    return np.unique(np.where(missing | unknown, alone, key), return_inverse=True)[1].reshape(-1)
+
+
+def _copies(
+    source: InputTable,
+    points: FieldPoints,
+    counts: Float[np.ndarray, "n k"],
+    sigma: Float[np.ndarray, "n k"],
+    rotator: Float[np.ndarray, " n"],
+    star: Int[np.ndarray, " n"],
+) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Rows that repeat one of their star, and rows with the position and counts of another star or setting.
+
+    Noise does not repeat to the digits of a float32 in all cameras: such rows are one measurement.
+    """
+    measured = np.isfinite(counts).any(axis=1)
+    same = _groups([*counts.T, *sigma.T, points.x, points.y])
+    copy = repeated = np.zeros(len(star), bool)
+    if np.bincount(same[measured], minlength=1).max() < 2:
+        return copy, repeated
+    settings = points.settings
+    angles = [np.mod(angle, 360.0) for angle in (*settings.positions.values(), rotator)]
+    _, band = np.unique(settings.filter, return_inverse=True)
+    first = np.unique(_groups([same, star, band.reshape(-1), *angles]), return_index=True)[1]
+    copy = measured & ~np.isin(np.arange(len(star)), first)
+    repeated = measured & (np.bincount(same[measured & ~copy], minlength=len(star))[same] > 1)
+    if copy.any():
+        which = rows_text(np.flatnonzero(copy))
+        source.remarks.append(f"{which}: copies of another row of the same star, left out")
+    if repeated.any():
+        which = rows_text(np.flatnonzero(repeated))
+        what = "the same place and counts under another ID or setting: they are one measurement"
+        source.remarks.append(f"{which}: {what}")
+    return copy, repeated
+
+
+def _groups(columns: Sequence[np.ndarray]) -> Int[np.ndarray, " n"]:
+    """Number of the group of equal rows of columns, floats as float32, that every row is in."""
+    mixed = np.full(len(columns[0]), 0x9E3779B97F4A7C15, np.uint64)
+    for column in columns:  # a hash of 64 bits: of a million rows two collide in one of 10⁷ tables
+        if column.dtype.kind == "f":
+            single = np.where(
+                np.isnan(column), np.float32(np.nan), column.astype(np.float32) + np.float32(0.0)
+            )
+            words = single.astype(np.float32).view(np.uint32).astype(np.uint64)
+        else:
+            words = column.astype(np.uint64)
+        mixed = (mixed ^ words) * np.uint64(0xBF58476D1CE4E5B9)
+        mixed ^= mixed >> np.uint64(29)
+    return np.unique(mixed, return_inverse=True)[1].reshape(-1)

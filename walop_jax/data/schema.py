@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from astropy import units
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, PREFIX
 from walop_jax.io.errors import fail, nearest, rows_text
@@ -76,6 +76,11 @@ _OF_A_SOURCE = Rule(
     "is not a temperature of a source",
     "in kelvin; NaN means a flat photon spectrum, as an empty cell of a text does",
 )
+_IS_JULIAN = Rule(
+    lambda mjd: np.abs(mjd) > 1e6,
+    "is not a Modified Julian Date",
+    "is this a Julian Date? subtract 2400000.5",
+)
 _TIME = Rule(lambda time: (time < 0) | np.isinf(time), "is not a time", "seconds; NaN where it is not known")
 _POSITIVE = Rule(
     lambda error: ~(error > 0) | np.isinf(error),
@@ -95,7 +100,7 @@ _ANGLE = _number("deg", within(36000.0, "encoder readings are in degrees: are th
 EXPOSURES: Mapping[str, Column] = {
     "EXPOSURE": _IDENTIFIER,
     "KIND": Column("str"),
-    "MJD": _number("d"),
+    "MJD": _number("d", _IS_JULIAN),
     "EXPTIME": _number("s", _TIME),
     "FILTER": Column("str", missing="SDSS-r"),
     "CLP_IN": Column("bool"),
@@ -106,7 +111,7 @@ EXPOSURES: Mapping[str, Column] = {
     "HA": _number("h", within(24.0, "hour angles are in hours: are these degrees?")),
     "RA": _number("deg", within(360.0, "right ascensions are in degrees")),
     "DEC": _number("deg", within(90.0, "declinations are in degrees")),
-    "ROTATOR": _number("deg", within(3600.0, "position angles are in degrees")),
+    "ROTATOR": _number("deg", within(720.0, "position angles are in degrees; NaN where it is not known")),
     "TEFF": _TEFF,
 }
 _COORDINATE = Column("float", "deg", rules=(finite("remove these points"),))
@@ -301,9 +306,12 @@ def table_of(given: Mapping[str, Any], columns: Mapping[str, Column], place: Pla
             raise place.fail(f"has {len(values)} values, another column {rows}", name, "one for each row")
     for name, column in columns.items():
         if name in given:
-            table[name] = converted(
-                _shaped(np.asarray(given[name]), name, column, place), "", name, column, place
-            )
+            values, masked = without_mask(given[name])
+            if column.kind == "float":
+                values = np.where(masked, np.nan, values) if masked.any() else values
+            else:
+                place.refuse(masked, "is masked", name, "fill or remove these rows")
+            table[name] = converted(_shaped(values, name, column, place), "", name, column, place)
         elif column.missing is None:
             raise place.fail("the column is missing", name, "add it")
         else:
@@ -314,19 +322,31 @@ def table_of(given: Mapping[str, Any], columns: Mapping[str, Column], place: Pla
 # ---------------------------------------------------------------------------------------- values of a column
 
 
+def undefined(hdu: Any, index: int) -> Bool[np.ndarray, ...]:
+    """True where a FITS table holds no value: stored integers equal to TNULL, logical values that are neither T nor F.
+
+    The stored integers are compared, ahead of TSCAL and TZERO (FITS standard 4.0, section 7.3.2).
+    """
+    column = hdu.columns[index]
+    stored = np.asarray(hdu.data.view(np.ndarray)[hdu.data.dtype.names[index]])
+    if getattr(column.format, "format", "") == "L":
+        return (stored != ord("T")) & (stored != ord("F"))
+    if column.null in (None, "") or stored.dtype.kind not in "iu":
+        return np.zeros(stored.shape, bool)
+    return stored == int(column.null)
+
+
 def _fits_values(hdu: Any, index: int, name: str, column: Column, place: Place) -> np.ndarray:
     """The values of a column of a FITS table as they are stored, none of them undefined."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             values = np.asarray(hdu.data.field(index))
+            missing = undefined(hdu, index)
     except (ValueError, TypeError, OSError, UnicodeError, KeyError, IndexError, Warning) as error:
         raise place.fail(f"cannot be read: {error}", name, "write the column again") from error
-    values = _shaped(values, name, column, place)
-    null = hdu.columns[index].null
-    if null not in (None, "") and np.issubdtype(values.dtype, np.integer):
-        place.refuse(values == int(null), "undefined (TNULL)", name, "fill or remove these rows")
-    return values
+    place.refuse(missing, "undefined (TNULL)", name, "fill or remove these rows")
+    return _shaped(values, name, column, place)
 
 
 def _shaped(values: np.ndarray, name: str, column: Column, place: Place) -> np.ndarray:
@@ -385,6 +405,12 @@ def converted(values: np.ndarray, unit: str, name: str, column: Column, place: P
     return values.astype(np.int64)
 
 
+def without_mask(values: Any) -> tuple[np.ndarray, Bool[np.ndarray, ...]]:
+    """The values of an array, column or masked quantity, and where they are masked, that is, missing."""
+    plain = np.asarray(np.ma.getdata(getattr(values, "unmasked", values)))
+    return plain, np.broadcast_to(np.asarray(getattr(values, "mask", False)), plain.shape)
+
+
 def in_unit(values: Any, unit: str, name: str) -> Float[np.ndarray, "*s"]:
     """Numbers that callers bring along (lists, scalars, quantities, columns) as native float64 in `unit`.
 
@@ -395,7 +421,8 @@ def in_unit(values: Any, unit: str, name: str) -> Float[np.ndarray, "*s"]:
     given = str(getattr(values, "unit", None) or "")
     plain = getattr(values, "value", values) if given and not hasattr(values, "colnames") else values
     try:
-        numbers = np.ma.filled(np.ma.asarray(plain, np.float64), np.nan)
+        raw, masked = without_mask(plain)
+        numbers = np.where(masked, np.nan, raw.astype(np.float64))
     except (TypeError, ValueError):
         raise place.fail("is not made of numbers", name, f"give numbers in {unit or 'fractions'}") from None
     flat = np.atleast_1d(numbers).astype(np.float64)
@@ -414,6 +441,14 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
     except (ValueError, TypeError) as error:
         raise place.fail(f"the unit {unit!r} is not known", name, f"use {wanted or 'no unit'}") from error
     target = units.Unit(wanted)
+    if _is_logarithmic(given):
+        advice = f"give the column in {wanted or 'fractions'}"
+        if wanted == "electron":
+            advice = (
+                "counts in electrons are needed: 10^(−0.4 (m − m₀)) of magnitudes m, m₀ that of one electron, and "
+                "N_ERR = 0.921 N · error of m; 10^d of dex"
+            )
+        raise place.fail(f"is logarithmic ({unit.strip()})", name, advice)
     if given == target:
         return values  # no arithmetic: what was written comes back bit for bit
     if wanted == "h" and given.is_equivalent(units.deg):
@@ -425,7 +460,13 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
     except units.UnitConversionError as error:
         advice = f"convert the column to {wanted or 'a fraction without unit'}"
         if wanted == "electron":
-            advice += " (multiply by the gain)"
+            per_time = given.is_equivalent(units.electron / units.s)
+            advice += f" (multiply by the {'exposure time' if per_time else 'gain'})"
         raise place.fail(
             f"the unit {unit!r} cannot be converted to {wanted or 'none'!r}", name, advice
         ) from error
+
+
+def _is_logarithmic(unit: Any) -> bool:
+    """True for mag, dex and dB, alone or of something: mag(electron)."""
+    return hasattr(unit, "physical_unit") or unit in (units.mag, units.dex, units.dB)

@@ -1,83 +1,110 @@
 """Tables that astronomers bring along (FITS, CSV, ECSV): columns by name, checked, with units taken care of.
 
 Column names know no upper and lower case. A cell that is empty or masked is NaN, or the value that the column
-has where it is absent.
+has where it is absent. Columns that nothing has asked for are named in a remark (`InputTable.about`).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import os
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from walop_jax.data.schema import Column, Place, converted, distinct
-from walop_jax.io.errors import DataError, fail, rows_text
-from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits
-from walop_jax.io.plain_tables import table_format
-from walop_jax.io.text import check_input, some
+from walop_jax.data.schema import Column, Place, converted, distinct, without_mask
+from walop_jax.data.table_files import read_table_file
+from walop_jax.io.errors import fail, rows_text
+from walop_jax.io.fits_reading import one_line
+from walop_jax.io.text import in_ascii, some
 
+MISSING = ("", "nan", "na", "n/a", "<na>", "none", "null", "--", "-", "...")
+"""Texts of a cell without a value, in small letters."""
 _TRUTH = dict.fromkeys(("true", "t", "1", "1.0", "yes"), 1.0) | dict.fromkeys(
-    ("false", "f", "0", "0.0", "no", ""), 0.0
+    ("false", "f", "0", "0.0", "no", *MISSING), 0.0
 )
 
 _LISTED = 12  # columns, in a message
+_LIKE = 0.7  # of names, for "did you mean"
 
 
 @dataclasses.dataclass(frozen=True)
 class InputTable:
-    """A table as it was read, to be handed back with columns added; `rows` is its length."""
+    """A table as it was read, to be handed back with columns added; `rows` is its length.
+
+    `used` are the columns that were asked for and are there, `lacking` those that are not; `remarks` say how the table
+    was read, and what is odd in it.
+    """
 
     path: Path
     rows: int
     table: Any
+    remarks: list[str] = dataclasses.field(default_factory=list)
+    used: set[str] = dataclasses.field(default_factory=set)
+    lacking: set[str] = dataclasses.field(default_factory=set)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of its columns in capitals."""
         return tuple(str(name).upper() for name in self.table.colnames)
 
+    def column(self, name: str) -> Any:
+        """A column, by its name in capitals; None if it is not there."""
+        if name not in self.names:
+            self.lacking.add(name)
+            return None
+        self.used.add(name)
+        return self.table.columns[self.names.index(name)]
 
-def read_input_table(path: str | os.PathLike[str]) -> InputTable:
-    """Read a table with whatever columns it has.
+    def about(self, added: Collection[str] = ()) -> tuple[str, ...]:
+        """Remarks, and sentences on columns that are not used, or are replaced by some of those `added`."""
+        replaced = [name for name in self.names if name in added]
+        unused = [name for name in self.names if name not in self.used and name not in replaced]
+        sentences = list(self.remarks)
+        kept = [name for name in replaced if name in self.used]
+        if kept:
+            sentences.append(f"{kept[0]} of the table is {self.new_name(kept[0])} in the result")
+        if gone := [name for name in replaced if name not in self.used]:
+            sentences.append(f"{_columns(gone)} replaced by the result")
+        if unused:
+            sentences.append(f"{_columns(unused)} not used{_hints(unused, self.lacking)}")
+        return tuple(sentences)
+
+    def new_name(self, name: str) -> str:
+        """The name of a column of the user's that is used and has the name of one that is added."""
+        return next(new for new in (f"N_{name}", f"OLD_{name}", f"OLDER_{name}") if new not in self.names)
+
+
+def _columns(names: Sequence[str]) -> str:
+    return f"column{'s' if len(names) > 1 else ''} {', '.join(names)} {'are' if len(names) > 1 else 'is'}"
+
+
+def _hints(names: Sequence[str], lacking: Collection[str]) -> str:
+    """What columns that are not used may have been meant to be."""
+    hints = []
+    for name in names:
+        if "FLAG" in name and "N_FLAG" in lacking:
+            hints.append(f"{name}: flags are read from N_FLAG or FLAG, any bit means not used")
+        elif like := difflib.get_close_matches(name, sorted(lacking), n=1, cutoff=_LIKE):
+            hints.append(f"{name}: did you mean {like[0]}?")
+    return f" ({some(hints, 3, '; ')})" if hints else ""
+
+
+def read_input_table(path: str | os.PathLike[str], needed: Collection[str] = ("X", "Y")) -> InputTable:
+    """Read a table with whatever columns it has; those `needed` (in capitals) tell it from others in its file.
 
     Raises `DataError` if the file is missing, damaged, no table, has no rows, or names a column twice.
     """
-    from astropy.table import Table  # imported here: it takes a third of a second
-
-    kind = table_format(path)
-    path = check_input(path)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            if kind == "fits":
-                with open_fits(path) as opened:
-                    number = next(
-                        (n for n, h in enumerate(opened.hdus) if type(h).__name__ == "BinTableHDU"), None
-                    )
-                    if number is None:
-                        raise fail("has no table", file=path, advice="write one, or use a CSV file")
-                    table: Any = Table.read(opened.hdus[number], character_as_bytes=False)
-            else:
-                table = Table.read(path, format=kind)
-    except DataError:
-        raise
-    except UNREADABLE as error:
-        what = f"cannot be read as a table: {one_line(error)}"
-        raise fail(what, file=path, advice="write it again") from error
-    if len(table) == 0:
-        raise fail("has no rows", file=path, advice="nothing to be done")
-    distinct((str(name).upper() for name in table.colnames), Place(path, ""))
-    return InputTable(path, len(table), table)
+    there, table, remarks = read_table_file(Path(path), needed)
+    return _input_table(there, table, remarks)
 
 
 def in_memory(columns: Any, name: str = "the table") -> InputTable:
-    """A table given in memory: an astropy table, or columns by name (arrays, lists, scalars, quantities).
+    """A table given in memory, copied: an astropy table or data frame, or columns by name (arrays, quantities, …).
 
     `name` is what errors call it. Raises `DataError` if it has no rows, or columns of different lengths.
     """
@@ -85,9 +112,14 @@ def in_memory(columns: Any, name: str = "the table") -> InputTable:
 
     try:
         if isinstance(columns, Table):
-            table = Table(columns, copy=False)  # quantities become columns with a unit
+            table = Table(columns)  # quantities become columns with a unit
+        elif hasattr(columns, "to_numpy") and hasattr(columns, "columns"):  # a data frame
+            table = Table.from_pandas(columns)
         else:
-            arrays = {str(key): np.atleast_1d(values) for key, values in dict(columns).items()}
+            arrays = {
+                str(key): values if np.ndim(values) and hasattr(values, "jd1") else np.atleast_1d(values)
+                for key, values in dict(columns).items()
+            }
             rows = max((len(values) for values in arrays.values()), default=0)
             single = {key for key, values in dict(columns).items() if np.ndim(values) == 0}
             table = Table({k: np.repeat(v, rows, axis=0) if k in single else v for k, v in arrays.items()})
@@ -95,9 +127,14 @@ def in_memory(columns: Any, name: str = "the table") -> InputTable:
         raise fail(
             f"is no table: {one_line(error)}", file=name, advice="give columns of one length"
         ) from error
+    return _input_table(Path(name), table)
+
+
+def _input_table(path: Path, table: Any, remarks: Sequence[str] = ()) -> InputTable:
     if len(table) == 0:
-        raise fail("has no rows", file=name, advice="nothing to be done")
-    return InputTable(Path(name), len(table), table)
+        raise fail("has no rows", file=path, advice="nothing to be done")
+    distinct((str(name).upper() for name in table.colnames), Place(path, ""))
+    return InputTable(path, len(table), table, list(remarks))
 
 
 def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
@@ -105,17 +142,18 @@ def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
 
     Raises `DataError` naming file, column and rows for what cannot be converted.
     """
-    place = Place(source.path, "")
-    if name not in source.names:
+    place, column = Place(source.path, ""), source.column(name)
+    if column is None:
         if rule.missing is None:
             advice = f"add it, or name it so; {_what_is_there(source)}"
             raise place.fail("the column is missing", name, advice)
         return np.full(source.rows, rule.missing)
-    column = source.table.columns[source.names.index(name)]
-    values = np.ma.getdata(np.ma.asarray(column))
+    values, empty, unit = plain_column(column, name, rule, place)
+    if values.ndim == 2 and values.shape[1] == 1:
+        values, empty = values[:, 0], empty[:, 0]
     if values.ndim != 1:
         raise place.fail(f"has shape {values.shape[1:]} in a row, one value is needed", name, "split it")
-    return _cells(column, name, rule, place)
+    return _cells(values, empty, unit, name, rule, place)
 
 
 def _what_is_there(source: InputTable) -> str:
@@ -137,34 +175,58 @@ def vector_column(source: InputTable, name: str, rule: Column, cameras: Sequence
         forms = (*spelled, [f"{name}{k}" for k in range(width)])
         parts = next((form for form in forms if any(part in source.names for part in form)), None)
         if parts is None:
+            source.lacking.update((name, *spelled[0], *spelled[1]))
             if rule.missing is not None:
                 return np.full((source.rows, width), rule.missing)
             listed = ", or ".join(f"{form[0]} … {form[-1]}" for form in spelled)
             raise place.fail("the column is missing", name, f"add it, or {listed}; {_what_is_there(source)}")
         single = dataclasses.replace(rule, width=1)
         return np.stack([numeric_column(source, part, single) for part in parts], axis=1)
-    column = source.table.columns[source.names.index(name)]
-    values = np.ma.getdata(np.ma.asarray(column))
+    values, empty, unit = plain_column(source.column(name), name, rule, place)
     if values.ndim != 2 or values.shape[1] != width:
         what = f"has shape {values.shape[1:] or '()'} in a row, {width} values are needed"
         raise place.fail(what, name, rule.shape_advice)
-    return _cells(column, name, rule, place)
+    return _cells(values, empty, unit, name, rule, place)
 
 
-def _cells(column: Any, name: str, rule: Column, place: Place) -> np.ndarray:
+def plain_column(
+    column: Any, name: str, rule: Column, place: Place
+) -> tuple[np.ndarray, Bool[np.ndarray, ...], str]:
+    """The values of a column, where they are masked, and its unit; times become MJD (UTC) where days are wanted."""
+    if hasattr(column, "jd1") or np.asarray(column).dtype.kind == "M":
+        from astropy.time import Time
+
+        if rule.unit != "d":
+            raise place.fail("holds times", name, f"give numbers in {rule.unit or 'plain'}")
+        masked = np.asarray(getattr(column, "mask", False))
+        if not hasattr(column, "jd1"):
+            days = np.asarray(column)
+            masked = masked | np.isnat(days)
+            column = Time(np.where(masked, np.datetime64("2000-01-01"), days), scale="utc")
+        if not hasattr(column, "utc"):
+            raise place.fail("holds differences of times", name, "give dates")
+        values = np.asarray(getattr(column.utc.mjd, "unmasked", column.utc.mjd), dtype=float)
+        return values, np.broadcast_to(masked, values.shape), ""
+    if not hasattr(column, "dtype") or column.dtype.names:
+        raise place.fail("is no plain column", name, "give a column of numbers or texts")
+    values, masked = without_mask(column)
+    return values, masked, str(getattr(column, "unit", None) or "")
+
+
+def _cells(
+    values: np.ndarray, empty: Bool[np.ndarray, ...], unit: str, name: str, rule: Column, place: Place
+) -> np.ndarray:
     """The values of a column as `rule` has them; a masked, empty or NaN cell is what it says of absent columns."""
-    values = np.ma.getdata(np.ma.asarray(column))
-    empty = np.broadcast_to(np.asarray(getattr(column, "mask", False)), values.shape)
     if rule.kind == "str":
         text = np.char.strip(values.astype(str))
-        return np.where(empty | (text == ""), str(rule.missing), text)
+        return np.where(empty | (text == "") | (text == "None"), str(rule.missing), text)
     if values.dtype.kind in "OSU":
         text = np.where(empty, "", np.char.strip(values.astype(str)))
         values = _from_text(text, rule.kind == "bool", name, place)
     if rule.kind == "bool":
         return converted(np.where(empty, False, values), "", name, rule, place)
     empty = empty | (values != values)
-    found = converted(values, str(column.unit or ""), name, rule, place)
+    found = converted(values, unit, name, rule, place)
     return np.where(empty, float("nan" if rule.missing is None else str(rule.missing)), found)
 
 
@@ -173,9 +235,12 @@ def _from_text(text: np.ndarray, truth: bool, name: str, place: Place) -> Float[
     numbers = np.empty(text.shape)
     for at, cell in np.ndenumerate(text):
         try:
-            numbers[at] = _TRUTH[cell.lower()] if truth else float(cell or "nan")
+            missing = cell.lower() in MISSING
+            numbers[at] = _TRUTH[cell.lower()] if truth else float("nan" if missing else cell)
         except (KeyError, ValueError):
             what, advice = ("neither true nor false", "write T or F") if truth else ("not a number", "")
+            if not truth and "," in cell:
+                advice = "write numbers with a decimal point and without separators of thousands"
             raise place.fail(
                 f"{str(cell)!r} is {what}, in {rows_text(at[:1])}",
                 name,
@@ -185,18 +250,22 @@ def _from_text(text: np.ndarray, truth: bool, name: str, place: Place) -> Float[
 
 
 def extended(source: InputTable, added: Mapping[str, Any], header: Mapping[str, Any] | None = None) -> Any:
-    """A copy of a table with columns added (an old column of that name is replaced), an astropy table.
+    """The table with columns added, an astropy table.
 
-    A value of `added` is an array, alone or with its description and its unit; `header` adds to the header of
-    the table (CSV has none).
+    An old column of that name is replaced, or gets a `new_name` if it was used. A value of `added` is an array, alone
+    or with its description and its unit; `header` adds to the header of the table, as do the remarks (CSV has none).
     """
     table = source.table.copy(copy_data=False)
-    for key in [key for key in table.meta if key.upper() in ("CHECKSUM", "DATASUM", "EXTNAME")]:
+    for key in [key for key in table.meta if key.upper() in ("CHECKSUM", "DATASUM", "EXTNAME", "REMARK")]:
         del table.meta[key]
     table.meta.update(header or {})
+    if remarks := source.about(added):
+        table.meta["REMARK"] = [in_ascii(text) for text in remarks]
     present = {str(name).upper(): name for name in table.colnames}
     for name, values in added.items():
-        if name in present:
+        if name in present and name in source.used:
+            table.rename_column(present[name], source.new_name(name))
+        elif name in present:
             table.remove_column(present[name])
         values, *about = values if isinstance(values, tuple) else (values,)
         table[name] = values

@@ -47,6 +47,9 @@ class Quality(enum.IntFlag):
     ERRORS_TOO_LARGE = 65536, "the stated errors are far larger than the scatter of the data"
     DISAGREES = 131072, "the intensities disagree with the calibration by more than noise"
     UNKNOWN_COLOUR = 262144, "no TEFF, and the colour is most of the error"
+    PLACE = 1048576, "stars of one place in the field disagree with the calibration together"
+    OTHER_FRAME = 2097152, "in the frame of the instrument, where other rows have a ROTATOR"
+    REPEATED = 4194304, "a row has the place and counts of another star or setting"
     CATALOGUE = 524288, "the stars of the catalogue together say that calibration or errors do not hold"
     NO_STOKES = (
         16384,

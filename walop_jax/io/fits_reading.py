@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import gzip
 import hashlib
 import io
+import lzma
 import math
 import os
 import struct
 import warnings
+import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,10 +31,11 @@ import numpy as np
 from astropy.io import fits
 
 from walop_jax.io.errors import DataError, fail
-from walop_jax.io.text import check_input
+from walop_jax.io.text import check_input, unpacking
 
 _CHUNK = 1 << 23  # a multiple of four, so that words never straddle two chunks
-_LARGEST_GZIP = 1 << 31
+LARGEST_UNPACKED = 1 << 31
+"""Bytes of the content of a packed file that are read at most: a small file may unpack to any size."""
 
 UNREADABLE = (
     OSError,
@@ -46,6 +48,8 @@ UNREADABLE = (
     OverflowError,
     struct.error,
     zlib.error,
+    lzma.LZMAError,
+    zipfile.BadZipFile,
     fits.VerifyError,
 )
 """Errors that astropy raises on a damaged file, some of it only when a header or a column is used."""
@@ -64,7 +68,7 @@ class OpenFile:
 
 @contextlib.contextmanager
 def open_fits(path: str | os.PathLike[str], advice: str | None = None) -> Iterator[OpenFile]:
-    """Open a FITS file (plain, or compressed with gzip) after checking that it is whole.
+    """Open a FITS file (plain, or packed with gzip, bzip2, xz or zip) after checking that it is whole.
 
     A file without checksums is remarked on: damage to it cannot be noticed. Raises `DataError` as `check_input` and
     `check_structure` do, and if a checksum that the file carries does not agree with its bytes; with `advice`, for
@@ -74,8 +78,8 @@ def open_fits(path: str | os.PathLike[str], advice: str | None = None) -> Iterat
     with contextlib.ExitStack() as stack:
         try:
             raw = stack.enter_context(path.open("rb"))
-            compressed = raw.read(2) == b"\x1f\x8b"
-            content = _decompressed(path) if compressed else raw
+            packed = unpacking(path)
+            content = raw if packed is None else unpacked(stack.enter_context(packed[0]), path, fits=True)
             check_structure(io.BytesIO(content) if isinstance(content, bytes) else raw, path)
             caught = stack.enter_context(warnings.catch_warnings(record=True))
             warnings.simplefilter("always")
@@ -100,10 +104,10 @@ def open_fits(path: str | os.PathLike[str], advice: str | None = None) -> Iterat
             raw.seek(0)
             sha256 = hashlib.file_digest(raw, "sha256").hexdigest()
         remarks = tuple(f"{path}: {one_line(entry.message)}" for entry in caught)
-        # A file packed with gzip carries a CRC-32 of all its bytes.
-        unprotected = [] if compressed else _unprotected(path, units)
+        # A packed file carries a checksum of all its bytes.
+        unprotected = _unprotected(path, units) if packed is None else []
         try:
-            yield OpenFile(path, sha256, units, compressed, (*remarks, *unprotected))
+            yield OpenFile(path, sha256, units, packed is not None, (*remarks, *unprotected))
         except UNREADABLE as error:
             if advice is None or isinstance(error, DataError):
                 raise
@@ -113,12 +117,9 @@ def open_fits(path: str | os.PathLike[str], advice: str | None = None) -> Iterat
 def primary_keywords(path: str | os.PathLike[str]) -> tuple[str, ...]:
     """Keywords of the primary header, unchecked, to see what a file is; none if it is no FITS file."""
     try:
-        with check_input(path).open("rb") as raw:
-            if raw.read(2) == b"\x1f\x8b":
-                with gzip.open(path) as content:
-                    return header_keywords(content, Path(path))
-            raw.seek(0)
-            return header_keywords(raw, Path(path))
+        packed = unpacking(check_input(path))
+        with Path(path).open("rb") if packed is None else packed[0] as content:
+            return header_keywords(content, Path(path))
     except UNREADABLE:
         return ()
 
@@ -140,14 +141,14 @@ def one_line(message: object) -> str:
     return " ".join(str(message).split())[:300] or type(message).__name__
 
 
-def _decompressed(path: Path) -> bytes:
-    """Unpack a gzip file into memory, with a limit: a small file may unpack to any size."""
-    with gzip.open(path) as stream:
+def unpacked(stream: io.BufferedIOBase, path: Path, *, fits: bool = False) -> bytes:
+    """Read the content of a packed file, `LARGEST_UNPACKED` at most; with `fits`, only if it begins as FITS does."""
+    if fits:
         header_keywords(stream, path)  # of what is no FITS file nothing more is unpacked
         stream.seek(0)
-        content = stream.read(_LARGEST_GZIP + 1)
-    if len(content) > _LARGEST_GZIP:
-        raise fail("unpacks to more than 2 GiB", file=path, advice="unpack it with gunzip")
+    content = stream.read(LARGEST_UNPACKED + 1)
+    if len(content) > LARGEST_UNPACKED:
+        raise fail("unpacks to more than 2 GiB", file=path, advice="unpack it first")
     return content
 
 

@@ -32,9 +32,13 @@ FORMATS = {
 
 
 class MatrixTable(Table):
-    """Field points with the instrument matrix; a few of them are printed as elements with their errors."""
+    """Field points with the instrument matrix; a few of them are printed as elements with their errors.
+
+    `meanings` are those of the bits of FLAG.
+    """
 
     FEW = 4
+    meanings: Mapping[int, str] = {}
 
     def __str__(self) -> str:
         whole = {"X", "Y"} <= set(self.colnames) and self._elements()
@@ -68,10 +72,9 @@ class MatrixTable(Table):
             "  " + "".join(f"{cell:<{width}}" for cell in cells[k : k + 3]) for k in range(0, len(cells), 3)
         ]
         if "P_ERR" in self.colnames:
-            known = f"{two_digits(100 * number('P_ERR'))} %"
-            lines.append(
-                f"  error of p of a star with p ≤ 5 %, calibration alone: {known}; FLAG {number('FLAG'):.0f}"
-            )
+            known, flag = f"{two_digits(100 * number('P_ERR'))} %", int(number("FLAG"))
+            lines.append(f"  error of p of a star with p ≤ 5 %, calibration alone: {known}; FLAG {flag}")
+            lines += [f"  FLAG {bit}: {meaning}" for bit, meaning in self.meanings.items() if flag & bit]
         return "\n".join(line.rstrip() for line in lines)
 
 

@@ -1,16 +1,21 @@
 """Text: numbers with errors (two digits of the error, and the value to match), and files of text.
 
-Files to be read are ordinary ones; text, TOML, and plain data as JSON without NaN and infinities.
+Files to be read are ordinary ones; text, TOML, plain data as JSON without NaN and infinities, and packed files.
 """
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import io
 import json
+import lzma
 import math
 import os
 import re
 import stat
 import tomllib
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -207,3 +212,29 @@ def check_input(path: str | os.PathLike[str]) -> Path:
         what = _OTHERS.get(stat.S_IFMT(mode), "no ordinary file")
         raise fail(f"is {what}", file=path, advice="copy its content to a file first")
     return path
+
+
+_PACKED = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ\x00": lzma.open}
+
+
+def unpacking(path: Path) -> tuple[io.BufferedIOBase, str] | None:
+    """A stream of the content of a packed file (gzip, bzip2, xz, zip) and the name of that; None if it is not packed.
+
+    Raises `DataError` for an archive that does not hold just one file.
+    """
+    with path.open("rb") as raw:
+        head = raw.read(6)
+    if head.startswith(b"PK\x03\x04"):
+        archive = zipfile.ZipFile(path)
+        entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+        names = [entry.filename for entry in entries if not entry.filename.startswith("__MACOSX/")]
+        if "[Content_Types].xml" in names:
+            raise fail("is a workbook of a spreadsheet program", file=path, advice="save the sheet as CSV")
+        if len(names) != 1:
+            what = f"holds {len(names)} files ({some(names, 5)})"
+            raise fail(what, file=path, advice="unpack it, and give one of them")
+        if entries[0].flag_bits & 1:
+            raise fail("is encrypted", file=path, advice="unpack it first")
+        return archive.open(names[0]), names[0]  # pyright: ignore[reportReturnType]
+    opener = next((opener for start, opener in _PACKED.items() if head.startswith(start)), None)
+    return None if opener is None else (opener(path, "rb"), path.stem)

@@ -242,7 +242,7 @@ def stack(
 
 def events_of(table: Any) -> list[tuple[float, str]]:
     """Events of a table with the columns MJD and WHAT, or of its file. Raises `DataError` where one is missing."""
-    read = read_input_table(table) if isinstance(table, str | os.PathLike) else in_memory(table)
+    read = read_input_table(table, ("MJD",)) if isinstance(table, str | os.PathLike) else in_memory(table)
     mjd = numeric_column(read, "MJD", Column("float", "d"))
     if "WHAT" not in read.names:
         raise fail(

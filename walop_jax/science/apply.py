@@ -37,6 +37,8 @@ ILL_POSED = 10.0  # ratio of the errors of the two principal directions from whi
 COOL, HOT = 3500.0, 10000.0
 """Colour temperatures (K) between which 95 % of the stars without TEFF are taken to lie, normal in 1/T."""
 _ROUNDS = 16
+_EXPANSIONS = 8  # of the counts, about the errors of the calibration that explain the stars best, …
+_STRAIGHT = 0.01  # … until second derivatives make less difference than this share of the noise, squared
 IMPROBABLE = 1e-6
 """Probability of a CHI2 as large below which FLAG 131072 is set, …"""
 ROUGH = 0.005
@@ -99,7 +101,7 @@ def apply(
             progress(done, len(catalogue))
     columns = [f.name for f in dataclasses.fields(Stars) if f.name != "check"]
     stars = Stars(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))  # pyright: ignore[reportArgumentType]
-    return work.together(stars, work.checked(watched))
+    return work.together(stars, work.checked(watched, chosen))
 
 
 def residuals_of(
@@ -141,6 +143,7 @@ class _Application:
         self.counts = linearised(calibration, catalogue.counts)
         self.offset, self.slope = _rotator_zero(self.vectors)
         self.order = np.argsort(catalogue.star, kind="stable")
+        self.on_sky = bool(np.isfinite(catalogue.rotator).any())
 
     def blocks(self) -> Iterator[tuple[int, Int[np.ndarray, " r"]]]:
         """Rows of whole stars, each with the number of rows done after it."""
@@ -224,7 +227,7 @@ class _Application:
             hidden=hidden,
             chi2=found.chi2,
             dof=found.dof,
-            rows=np.diff(first, append=len(rows)),
+            rows=np.add.reduceat((~catalogue.copy[rows]).astype(int), first),
             flag=flag,
         )
         return _Block(rows, star, stars, found, on_sky, sigma, plain, throughput, colour, derivative)
@@ -273,11 +276,13 @@ class _Application:
         points, sigma = self.catalogue.points, self.catalogue.sigma[rows]
         settings, calibration = points.settings[rows], self.vectors.calibration
         bits = calibration.flags(points.x[rows], points.y[rows], settings)
-        bits[bits & Quality.BEYOND_SETTINGS > 0] |= Quality.VALIDITY_FORCED
+        bits[calibration.beyond_settings(settings)] |= Quality.VALIDITY_FORCED
         bits[self.outside(rows)] |= Quality.BEYOND_FIELD
         bits[settings.teff < COOLEST] |= Quality.BEYOND_SETTINGS
-        bits[~np.isfinite(counts * sigma).all(axis=1)] |= Quality.CAMERA_MISSING
+        bits[~np.isfinite(counts * sigma).all(axis=1) & ~self.catalogue.copy[rows]] |= Quality.CAMERA_MISSING
         bits[self.catalogue.spoilt[rows]] |= Quality.SATURATED
+        bits[self.catalogue.repeated[rows]] |= Quality.REPEATED
+        bits[self.on_sky & ~np.isfinite(self.catalogue.rotator[rows])] |= Quality.OTHER_FRAME
         flag = np.bitwise_or.reduceat(bits, first) | calibration.verdict.quality
         flag[~(found.condition < ILL_POSED)] |= Quality.HIGH_CROSSTALK
         flag[~np.isfinite(found.qu).all(axis=1)] |= Quality.NO_STOKES
@@ -299,7 +304,7 @@ class _Application:
         catalogue, vectors, stars = self.catalogue, self.vectors, block.stars
         number = catalogue.star[block.rows]
         first = np.flatnonzero(np.diff(block.star, prepend=-1))
-        beyond = Quality.BEYOND_FIELD | Quality.BEYOND_SETTINGS | Quality.NO_STOKES
+        beyond = Quality.BEYOND_FIELD | Quality.BEYOND_SETTINGS | Quality.NO_STOKES | Quality.REPEATED
         good = chosen[number[first]] & (stars.flag & beyond == 0) & (stars.dof > 0)
         r = np.flatnonzero(good[block.star])
         if not r.size:
@@ -335,29 +340,58 @@ class _Application:
         )
         return [left]
 
-    def checked(self, watched: list[StarResiduals]) -> CatalogueCheck:
-        """Check of all stars together."""
+    def checked(self, watched: list[StarResiduals], chosen: Bool[np.ndarray, " s"]) -> CatalogueCheck:
+        """Check of all stars together; `chosen` are those whose residuals are `watched`.
+
+        Errors of the calibration move the stars in proportion only while they are small beside the scale on which the
+        optics change. Behind those that explain bright stars best half of δᵀ H δ is left, H the second derivatives
+        of the counts: nothing is said of stars that agree once the counts are computed with these errors.
+        """
         if not watched:
             return NOTHING_TO_SPARE
-        vectors = self.vectors
-        cameras = vectors.instrument.cameras.names
-        return CatalogueSearch(StarResiduals.joined(watched), cameras, vectors.named, vectors.root).answer()
+        vectors, names = self.vectors, self.vectors.instrument.cameras.names
+        search = CatalogueSearch(StarResiduals.joined(watched), names, vectors.named, vectors.root)
+        check = search.answer()
+        for _ in range(_EXPANSIONS):
+            errors = None if check.holds else search.errors_of_calibration()
+            if errors is None:
+                break
+            values = vectors.calibration.values.copy()
+            values[vectors.parameters] += vectors.root @ errors
+            moved = dataclasses.replace(vectors.calibration, values=values)
+            seen = self.catalogue.of_stars(chosen)
+            left = residuals_of(AnalysisVectors(moved), seen, len(seen), force=True)
+            there = StarResiduals.joined(left) if left else None
+            same = there is not None and there.residual.shape == search.stars.residual.shape
+            if there is None or (same and search.bend(errors, there.residual) < _STRAIGHT):
+                break
+            search = CatalogueSearch(there, names, vectors.named, vectors.root, errors)
+            check = search.answer()
+        return check
 
     def together(self, stars: Stars, check: CatalogueCheck) -> Stars:
         """The stars with errors, and a bit of FLAG, that hold what all of them say together."""
         if check.holds:
             return dataclasses.replace(stars, check=check)
-        changed = stars.changed
-        if check.changes:
+        changed, flag = stars.changed, stars.flag
+        if check.changes or check.places:
             found = [self._changed(self.block(rows), check) for _, rows in self.blocks()]
-            changed = np.concatenate(found)
+            changed = np.concatenate([part for part, _ in found])
+            flag = np.where(np.concatenate([near for _, near in found]), flag | Quality.PLACE, flag)
+        if check.holds_elsewhere:
+            return dataclasses.replace(stars, changed=changed, flag=flag, check=check)
         factor = np.where(stars.rows > 1, check.scale[1], check.scale[0])[:, None, None]
-        flag = stars.flag | Quality.CATALOGUE
+        flag |= Quality.CATALOGUE
         photon = stars.photon * factor
         return dataclasses.replace(stars, photon=photon, changed=changed, flag=flag, check=check)
 
-    def _changed(self, block: _Block, check: CatalogueCheck) -> Float[np.ndarray, "s 2 2"]:
-        """Effect of the changes on stars: the largest, in q and in u, of those that cannot be told apart."""
+    def _changed(
+        self, block: _Block, check: CatalogueCheck
+    ) -> tuple[Float[np.ndarray, "s 2 2"], Bool[np.ndarray, " s"]]:
+        """Effect of the changes on stars, and which of them lie at one of the places.
+
+        The largest, in q and in u, of the changes that cannot be told apart.
+        """
         points, found = self.catalogue.points, block.found
         counts = np.nan_to_num(self.counts[block.rows])
         lit = np.where(found.flux > 0, found.flux, np.inf)
@@ -375,7 +409,19 @@ class _Application:
                     shift = block.derivative[:, :, question.parameter]
                 largest = np.maximum(largest, np.abs(entry.size * np.nan_to_num(shift)))
             total += largest[:, :, None] ** 2 * np.eye(2)
-        return total
+        near = np.zeros(len(total), bool)
+        first = np.flatnonzero(np.diff(block.star, prepend=-1))
+        for spot in check.places:
+            g = spot.profile(*place[:2])
+            near |= np.maximum.reduceat(g, first) > 0
+            largest = np.zeros_like(block.stars.qu)
+            for camera in spot.alike:
+                grown = np.zeros_like(counts)
+                grown[:, camera.camera] = g * counts[:, camera.camera] / lit
+                shift = calibration_shift(found.gain, grown[..., None], block.star)[..., 0]
+                largest = np.maximum(largest, np.abs(camera.size * np.nan_to_num(shift)))
+            total += largest[:, :, None] ** 2 * np.eye(2)
+        return total, near
 
 
 def _slices_of_stars(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]:

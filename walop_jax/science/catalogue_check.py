@@ -4,6 +4,7 @@ Asked are, of the residuals of `star_residuals`:
 
 noise       Σ χ² against Σ ν, from both sides: N_ERR too small or too large
 rows        what the rows of one star have in common: rows that are there twice, noise that is correlated
+places      stars that disagree together at one place of the field (`places`)
 changes     the mean residual of every camera and how it grows with X, Y, time and flux, light that is added to every
             row, and all parameters of the optics; the strongest is fitted with the errors of the calibration and
             asked for again, until nothing is left
@@ -27,6 +28,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import some, with_error, with_minus_sign
 from walop_jax.likelihood.inverses import whitening
+from walop_jax.science.places import Place, places_of
 from walop_jax.science.star_residuals import (
     ABOUT_GAINS,
     CROWDED,
@@ -53,6 +55,7 @@ NOISE_MATTERS = 1.1
 _MOST_CHANGES = 6
 _ROUNDS = 8
 _SETTLED = 0.05  # standard errors
+_FARTHEST = 5.0  # standard errors in every direction: no calibration is so far off by chance
 _REFERENCE = 1e6  # electron
 _SEEN = 2.33  # one-sided 99 %
 
@@ -157,7 +160,7 @@ class CatalogueCheck(Displayed):
     one row, and `rows_p` its chance beside `noise`. `scale` are the factors on the photon covariance of stars of one
     row and of several: 1 unless errors are off. `tests` are the `asked` questions in their first answer; `smallest` is
     the gain change of the camera seen best that would be found in 99 % of cases (nan: none). `stars` and `rows_used`
-    count what was looked at; `growth` holds the units of X, Y and time.
+    count what was looked at; `growth` holds the units of X, Y and time; stars of `places` disagree together.
     """
 
     stars: int
@@ -172,6 +175,7 @@ class CatalogueCheck(Displayed):
     changes: tuple[InstrumentChange, ...]
     smallest: float
     growth: Growth = IN_UNITS
+    places: tuple[Place, ...] = ()
 
     @property
     def alarm(self) -> float:
@@ -194,11 +198,16 @@ class CatalogueCheck(Displayed):
     @property
     def holds(self) -> bool:
         """True if calibration and errors stand."""
+        return self.holds_elsewhere and not self.places
+
+    @property
+    def holds_elsewhere(self) -> bool:
+        """True if calibration and errors stand but for some places in the field."""
         return not (self.changes or self.noise_is_off or self.rows_agree)
 
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each thing that does not hold."""
-        said = [change.words() for change in self.changes]
+        said = [entry.words() for entry in (*self.changes, *self.places)]
         if self.rows_agree:
             assert self.rows is not None
             said.append(
@@ -235,6 +244,7 @@ class CatalogueCheck(Displayed):
             "shared_p_value": self.rows_p,
             "photon_error_factors": [float(np.sqrt(s)) for s in self.scale],
             "changes": [{"best": entry(c.best), "alike": [entry(e) for e in c.alike]} for c in self.changes],
+            "places": [place.document() for place in self.places],
             "tests": [entry(test) for test in self.tests],
             "smallest_gain_seen": self.smallest if np.isfinite(self.smallest) else None,
             "warnings": list(self.warnings()),
@@ -289,7 +299,8 @@ class CatalogueSearch:
     """The columns of all questions, then of the errors of the calibration; what has been found so far.
 
     `cameras` are names; `parameters` names and units of those of `stars.parameters()`, of which the first, as many as
-    `stars.plain` has, are asked as well; `root` is a square root of their covariance, C = root rootᵀ.
+    `stars.plain` has, are asked as well; `root` is a square root of their covariance, C = root rootᵀ. `at` are the
+    errors of the calibration, in units of `root`, with which `stars` were computed (None: none).
     """
 
     def __init__(
@@ -298,11 +309,13 @@ class CatalogueSearch:
         cameras: Sequence[str],
         parameters: Sequence[tuple[str, str]],
         root: Float[np.ndarray, "n n"],
+        at: Float[np.ndarray, " n"] | None = None,
     ) -> None:
         self.stars = stars
         self.variance = own_variance(stars)
         self.crowded = bool(np.median(self.variance) > CROWDED)
-        self.root = root[:, np.abs(root).max(axis=0, initial=0.0) > 0]
+        self.matters = np.abs(root).max(axis=0, initial=0.0) > 0
+        self.root = root[:, self.matters]
         self.growth = Growth(max(float(np.abs(np.concatenate([stars.x, stars.y])).max()), 1e-9))
         times = stars.time[np.isfinite(stars.time)]
         if times.size and np.ptp(times) > 0:
@@ -330,6 +343,9 @@ class CatalogueSearch:
         self.mixing[count : count + shown, asked : asked + known] = self.root
         self.mixing[-2:, -2:] = np.eye(2)
         self.prior = np.concatenate([np.zeros(asked), np.ones(known + 2)])
+        self.start = np.zeros(len(self.prior))
+        if at is not None:
+            self.start[asked : asked + known] = at[self.matters]
 
     def _columns(self, part: StarResiduals) -> Float[np.ndarray, "r k c"]:
         cameras = part.model.shape[1]
@@ -346,13 +362,13 @@ class CatalogueSearch:
 
     def _left(self, sizes: Float[np.ndarray, " c"]) -> Float[np.ndarray, "r k"]:
         """Residuals behind changes of all columns."""
-        if not sizes.any():
+        if np.array_equal(sizes, self.start):
             return self.stars.residual
-        amounts = self.mixing @ sizes
+        amounts = self.mixing @ (sizes - self.start)
         return self.stars.behind(self.stars.residual, lambda part, _: self._columns(part) @ amounts)
 
-    def _looked(self, sizes: Float[np.ndarray, " c"]) -> _Look:
-        """Scales, Q and g (priors included) with these changes taken away."""
+    def _looked(self, sizes: Float[np.ndarray, " c"], *, stated: bool = False) -> _Look:
+        """Scales, Q and g (priors included) with these changes taken away; with `stated` of N_ERR as it is."""
         stars, dof = self.stars, self.stars.dof.astype(float)
 
         def scale_of(residual: Float[np.ndarray, "r k"]) -> Scale:
@@ -365,13 +381,15 @@ class CatalogueSearch:
             off = is_off(scale, self._alarm) and not self.crowded
             single = heavier * (scale.value if scale.value > 1 or off else 1.0)
             several = single
-            if rows is not None and _chance_beside(rows, noise) < self._alarm:
+            if not stated and rows is not None and _chance_beside(rows, noise) < self._alarm:
                 several = max(single, rows.value)
             each = self.variance * np.where(stars.rows > 1, several, single)
             matrix, score = normal_matrix(stars, residual, self._columns, scale.kept / each, scale.share)
             matrix = self.mixing.T @ matrix @ self.mixing + np.diag(self.prior)
             return _Look(noise, rows, matrix, self.mixing.T @ score - self.prior * sizes)
 
+        if stated:
+            return look(noise._replace(value=1.0))
         found = look(noise)
         # What all stars have in common is no noise: weights come from the scatter about the gains that fit them best.
         for _ in range(ABOUT_GAINS if is_off(noise, self._alarm) else 0):
@@ -395,11 +413,16 @@ class CatalogueSearch:
 
     def answer(self) -> CatalogueCheck:
         """All questions, then again behind what was found."""
-        sizes = np.zeros(len(self.prior))
+        sizes = self.start
         chosen: list[int] = []
         look = self._looked(sizes)
         tests = self._beside(look.matrix, look.score, chosen)
         if self._suspicious(look, tests):  # else one linear step is all there is to do
+            explained = self._explained()
+            by_errors = None if explained is None else self._looked(explained)
+            # Scatter that errors of the calibration can explain is not held against N_ERR.
+            if explained is not None and by_errors is not None and not is_off(by_errors.noise, self._alarm):
+                look, sizes = by_errors, explained
             look, sizes = self._settled(look, sizes, chosen)
             tests = self._beside(look.matrix, look.score, chosen)
         smallest = self._smallest(tests)
@@ -431,7 +454,48 @@ class CatalogueSearch:
         # χ² of rows that repeat each other says nothing of N_ERR: what they share does.
         single = noise.value if found.noise_is_off else 1.0
         several = float(rows.value) if rows is not None and found.rows_agree else single
-        return dataclasses.replace(found, scale=(single, several))
+        found = dataclasses.replace(found, scale=(single, several))
+        return dataclasses.replace(found, places=self._places(found, look, sizes, chosen))
+
+    def _places(
+        self, found: CatalogueCheck, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int]
+    ) -> tuple[Place, ...]:
+        """Places where stars disagree together, behind the changes and the errors of the calibration."""
+        cameras = [question.name for question in self.questions if question.kind == "gain"]
+        single, several = (max(scale, found.noise, 1.0) for scale in found.scale)
+        variance = self.variance * np.where(self.stars.rows > 1, several, single)
+        for fitted in (False, True):  # the fit takes as long as all before it
+            if fitted:
+                sizes = self._settled(look, sizes, chosen)[1]
+            places = places_of(self.stars, cameras, self._left(sizes), variance)
+            if not places:
+                break
+        return places
+
+    def _explained(self) -> Float[np.ndarray, " c"] | None:
+        """Errors of the calibration that explain the stars best with N_ERR as stated; None if they cannot be."""
+        _, sizes = self._settled(self._looked(self.start, stated=True), self.start, [], stated=True)
+        errors = sizes[self.asked : -2]
+        return sizes if errors @ errors <= _FARTHEST**2 * len(errors) else None
+
+    def errors_of_calibration(self) -> Float[np.ndarray, " n"] | None:
+        """Errors of the calibration, in units of `root`, that explain the stars best; None if they cannot be.
+
+        With N_ERR as stated, else with errors as large as the scatter.
+        """
+        sizes = self._explained()
+        if sizes is None:
+            sizes = self._settled(self._looked(self.start), self.start, [])[1]
+        errors = np.zeros(len(self.matters))
+        errors[self.matters] = sizes[self.asked : -2]
+        return errors if errors @ errors <= _FARTHEST**2 * self.matters.sum() else None
+
+    def bend(self, errors: Float[np.ndarray, " n"], residual: Float[np.ndarray, "r k"]) -> float:
+        """Mean square, per degree of freedom, of the residuals with errors of the calibration less first order."""
+        sizes = self.start.copy()
+        sizes[self.asked : -2] = errors[self.matters]
+        off = self.stars.chi2(residual - self._left(sizes)) / self.variance
+        return float(np.median(off / np.maximum(self.stars.dof, 1)))
 
     @property
     def _alarm(self) -> float:
@@ -445,7 +509,7 @@ class CatalogueSearch:
         return min(rows, chance_of_scale(look.noise), _chance(strongest)) < near
 
     def _settled(
-        self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int]
+        self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], *, stated: bool = False
     ) -> tuple[_Look, Float[np.ndarray, " c"]]:
         """Changes `chosen` and errors of the calibration fitted together, with the stars that this keeps."""
         fitted = np.array([*chosen, *range(self.asked, len(sizes))])
@@ -457,7 +521,7 @@ class CatalogueSearch:
                 break
             sizes = sizes.copy()
             sizes[fitted] += step
-            look = self._looked(sizes)
+            look = self._looked(sizes, stated=stated)
         return look, sizes
 
     def _beside(

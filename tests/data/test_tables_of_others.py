@@ -1,0 +1,530 @@
+"""Tables as the programs of others write them: flags, identifiers, undefined values, times, masks, dialects of CSV."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import lzma
+import zipfile
+
+import numpy as np
+import pytest
+from astropy import units
+from astropy.io import fits
+from astropy.table import MaskedColumn, QTable, Table
+from astropy.time import Time
+from astropy.utils.masked import Masked
+
+from walop_jax.data import DataError
+from walop_jax.data.calset import from_arrays
+from walop_jax.data.catalogue import field_points, read_catalogue
+from walop_jax.data.user_tables import extended, in_memory, read_input_table
+from walop_jax.model.instrument import nominal_instrument
+
+SOUTH = nominal_instrument("WALOP-SOUTH")
+ROWS = 5
+pd = pytest.importorskip("pandas")
+
+
+def table(**columns):
+    rng = np.random.default_rng(2)
+    made = Table({"X": np.linspace(-0.2, 0.2, ROWS), "Y": np.linspace(0.1, -0.1, ROWS)})
+    made["N"] = rng.normal(1e6, 1e3, (ROWS, 4))
+    made["N_ERR"] = np.full((ROWS, 4), 1e3)
+    for name, values in columns.items():
+        made[name] = values
+    return made
+
+
+def read(given, **options):
+    return read_catalogue(in_memory(given), SOUTH, **options)
+
+
+def written(path, given):
+    given.write(path, overwrite=True)
+    return read_catalogue(read_input_table(path), SOUTH)
+
+
+def remarks(catalogue):
+    return "\n".join(catalogue.remarks)
+
+
+# -------------------------------------------------------------------------------------------------------------- flags
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        [0, 0, 1, 0, 0],
+        np.array([0, 0, 1, 0, 0], np.uint16),
+        [False, False, True, False, False],
+        [0.0, 0.0, 4.0, np.nan, 0.0],
+        ["0", "0", "1", "", "0"],
+        ["F", "F", "T", "F", "F"],
+        ["0000", "0000", "0100", "0000", "0b0"],
+        ["0x0", "0x0", "0x10", "0x00", "none"],
+        MaskedColumn([0, 7, 1, 0, 0], mask=[0, 1, 0, 0, 0]),
+        (np.arange(5) == 2)[:, None] * np.ones(4, int),
+    ],
+)
+@pytest.mark.parametrize("name", ["FLAG", "N_FLAG", "flag"])
+def test_any_bit_of_a_flag_leaves_the_counts_out(name, flags):
+    found = read(table(**{name: flags}))
+    assert found.spoilt.tolist() == [False, False, True, False, False]
+    assert np.isnan(found.counts[2]).all()
+    assert np.isfinite(np.delete(found.counts, 2, axis=0)).all()
+
+
+@pytest.mark.parametrize("name", ["O2_FLAG", "N2_FLAG", "N_FLAG2"])
+def test_a_camera_has_a_flag_of_its_own(name):
+    found = read(table(**{name: [0, 3, 0, 0, 0]}))
+    assert np.argwhere(np.isnan(found.counts)).tolist() == [[1, 2]]
+
+
+def test_bits_of_fits_are_flags(tmp_path):
+    columns = [
+        fits.Column(n, f, array=table()[n]) for n, f in (("X", "D"), ("Y", "D"), ("N", "4D"), ("N_ERR", "4D"))
+    ]
+    bits = np.zeros((ROWS, 16), bool)
+    bits[3, 9] = True
+    fits.BinTableHDU.from_columns([*columns, fits.Column("FLAG", "16X", array=bits)]).writeto(
+        tmp_path / "b.fits"
+    )
+    found = read_catalogue(read_input_table(tmp_path / "b.fits"), SOUTH)
+    assert found.spoilt.tolist() == [False, False, False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"), [(["good"] * 5, "'good' is neither"), ([0.5] * 5, "neither one integer")]
+)
+def test_what_is_no_flag_is_refused(flags, message):
+    with pytest.raises(DataError, match=message):
+        read(table(FLAG=flags))
+
+
+def test_the_flags_of_the_user_stay_and_those_of_an_earlier_result_are_no_flags():
+    source = in_memory(table(FLAG=[0, 0, 1, 0, 0], Q=1.0))
+    read_catalogue(source, SOUTH)
+    made = extended(source, {name: np.full(ROWS, 16) for name in ("Q", "QU_COV", "P_DEBIASED", "FLAG")})
+    assert made["N_FLAG"].tolist() == [0, 0, 1, 0, 0]
+    assert made["FLAG"].tolist() == [16] * 5
+    assert made.meta["REMARK"] == [
+        "FLAG of the table is N_FLAG in the result",
+        "column Q is replaced by the result",
+    ]
+    assert read(made).spoilt.tolist() == [False, False, True, False, False]
+
+
+def test_columns_that_are_not_used_are_named():
+    said = remarks(read(table(FLAGS=[0, 4, 0, 0, 0], note="a", ROTATR=3.0)))
+    assert "columns FLAGS, NOTE, ROTATR are not used" in said
+    assert "FLAGS: flags are read from N_FLAG" in said
+    assert "ROTATR: did you mean ROTATOR?" in said
+    points = in_memory(table())
+    field_points(points, SOUTH)
+    assert points.about() == ("columns N, N_ERR are not used",)
+
+
+# -------------------------------------------------------------------------------------------------------- identifiers
+
+GAIA = 4658219876543210000 + np.array([0, 64, 128, 192, 256])
+
+
+@pytest.mark.parametrize(
+    "ids",
+    [
+        GAIA,
+        GAIA.astype(np.uint64),
+        GAIA.astype(str),
+        [f"{n}  " for n in GAIA],
+        np.array([-1, -1, -1, 7, 8]),
+        [-1.0, np.nan, -99.0, 7.0, 8.0],
+        ["", " ", "nan", "a", "b"],
+        ["-1", "N/A", "None", "a", "b"],
+        MaskedColumn([5, 5, 5, 5, 6], mask=[1, 1, 1, 0, 0]),
+        np.array([np.iinfo(np.uint64).max] * 3 + [1, 2], np.uint64),
+        np.array([None, None, None, "a", "b"], object),
+        pd.array([None, None, None, 1, 2], dtype="Int64"),
+    ],
+)
+def test_rows_without_a_common_identifier_are_stars_of_their_own(ids):
+    columns = {name: list(values) for name, values in table().items()}
+    frame = pd.DataFrame(columns | {"ID": ids}) if isinstance(ids, pd.arrays.IntegerArray) else None
+    found = read(table(ID=ids)) if frame is None else None
+    if frame is not None:
+        for k in range(4):
+            frame[f"N{k}"], frame[f"N{k}_ERR"] = (np.asarray(table()[n])[:, k] for n in ("N", "N_ERR"))
+        found = read(frame.drop(columns=["N", "N_ERR"]))
+    assert found is not None
+    assert len(set(found.star.tolist())) == ROWS
+
+
+@pytest.mark.parametrize(
+    "ids",
+    [
+        ["a ", "a", "b", "c", "d"],
+        [1.0, 1.0, 2.0, 3.0, 4.0],
+        np.array([b"x", b"x ", b"y", b"z", b"w"]),
+        [0, 0, 1, 2, 3],
+    ],
+)
+def test_rows_of_one_identifier_are_one_star(ids):
+    star = read(table(ID=ids)).star.tolist()
+    assert star[0] == star[1]
+    assert len(set(star)) == 4
+
+
+def test_unknown_identifiers_are_said():
+    assert "ID is -1 in rows 0, 2" in remarks(read(table(ID=[-1, 4, -1, 5, 6])))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_floats_that_cannot_hold_an_identifier_are_refused(dtype):
+    with pytest.raises(DataError, match=r"ID: is a float beyond 2\*\*.*integers or as text"):
+        read(table(ID=GAIA.astype(dtype)))
+
+
+# ------------------------------------------------------------------------------------------------------------- copies
+
+
+def twice(row=0, **changes):
+    given = table(ID=np.arange(ROWS))
+    given.add_row(given[row])
+    for name, value in changes.items():
+        given[name][-1] = value
+    return given
+
+
+def test_a_row_that_is_there_twice_counts_once():
+    found = read(twice())
+    assert found.copy.tolist() == [False] * 5 + [True]
+    assert not found.spoilt.any()
+    assert not found.repeated.any()
+    assert "row 5 (counted from 0): copies of another row" in remarks(found)
+
+
+def test_a_copy_in_single_precision_is_a_copy():
+    given = twice()
+    given["N"][-1] = given["N"][-1].astype(np.float32)
+    assert read(given).copy.tolist() == [False] * 5 + [True]
+
+
+def test_the_same_counts_under_another_identifier_or_setting_are_flagged():
+    assert read(twice(ID=77)).repeated.tolist() == [True, False, False, False, False, True]
+    given = twice()
+    given["CHWP_ANGLE"] = np.where(np.arange(6) == 5, 45.0, 0.0)
+    found = read(given)
+    assert found.repeated.tolist() == [True, False, False, False, False, True]
+    assert not found.copy.any()
+
+
+def test_other_measurements_are_no_copies():
+    given = twice()
+    given["N"][-1, 3] += 1.0
+    found = read(given)
+    assert not found.copy.any()
+    assert not found.repeated.any()
+    empty = table()
+    empty["N"] = np.nan
+    assert not read(empty).copy.any()
+
+
+# ------------------------------------------------------------------------------------------------------------- angles
+
+
+def test_a_row_without_rotator_is_named_and_turns_are_turns():
+    found = read(table(ROTATOR=[370.0, 10.0, np.nan, 10.0, -350.0]))
+    assert "ROTATOR is missing in row 2" in remarks(found)
+    np.testing.assert_array_equal(found.rotator, [370.0, 10.0, np.nan, 10.0, -350.0])
+    with pytest.raises(DataError, match="ROTATOR: exceeds ±720 in row 1"):
+        read(table(ROTATOR=[0.0, -999.0, 0.0, 0.0, 0.0]))
+
+
+def test_radians_are_converted_where_they_say_so_and_refused_where_they_must_be():
+    angle = np.deg2rad([30.0, 30.0, 75.0, 120.0, 0.0])
+    np.testing.assert_allclose(
+        read(table(ROTATOR=angle * units.rad)).rotator, [30, 30, 75, 120, 0], atol=1e-12
+    )
+    for name in ("ROTATOR", "CHWP_ANGLE"):
+        with pytest.raises(
+            DataError, match=rf"{name}: has no unit and is a whole number of degrees in radians.*30°"
+        ):
+            read(table(**{name: angle}))
+    assert "are these radians?" in remarks(read(table(ROTATOR=[0.1234, 1.2, 3.3, 4.1, 6.2])))
+    for plain in (
+        [0.0, 1.0, 2.0, 3.0, 0.0],
+        [0.1, 22.5, 45.0, 0.0, 0.0],
+        [0.1, 0.2, 0.3, 0.4, 0.5] * units.deg,
+    ):
+        assert "radians" not in remarks(read(table(ROTATOR=plain)))
+
+
+def test_an_angle_alone_puts_no_plate_into_the_beam_that_was_never_there():
+    with pytest.raises(DataError, match=r"CHWP_ANGLE: has values, but no exposure.*add CHWP_IN"):
+        read(table(CHWP_ANGLE=0.0), never_in=("CHWP",))
+    assert np.isnan(
+        read(table(CHWP_ANGLE=0.0, CHWP_IN=False), never_in=("CHWP",)).points.settings.position("CHWP")
+    ).all()
+    assert np.isnan(read(table(CHWP_ANGLE=np.nan), never_in=("CHWP",)).points.settings.position("CHWP")).all()
+    assert (
+        read(table(CHWP_ANGLE=45.0, CHWP_IN=True), never_in=("CHWP",)).points.settings.position("CHWP")[0]
+        == 45.0
+    )
+
+
+# -------------------------------------------------------------------------------------------- undefined, masked, times
+
+
+def scaled(path, name, form, raw, *, scale=1.0, zero=0.0, null, given=None):
+    """The table with a column of scaled integers, TNULL where it is undefined."""
+    given = table() if given is None else given
+    columns = [
+        fits.Column(n, "D" if given[n].ndim == 1 else "4D", array=given[n])
+        for n in given.colnames
+        if n != name
+    ]
+    fits.BinTableHDU.from_columns([*columns, fits.Column(name, form, array=raw)]).writeto(
+        path, overwrite=True
+    )
+    with fits.open(path, mode="update") as hdus:
+        number = hdus[1].columns.names.index(name) + 1
+        hdus[1].header[f"TSCAL{number}"], hdus[1].header[f"TZERO{number}"] = scale, zero
+        hdus[1].header[f"TNULL{number}"] = null
+    return path
+
+
+@pytest.mark.parametrize(
+    ("form", "raw", "scale", "zero", "null"),
+    [
+        ("J", np.array([3000, -9999, 1000, 0, 500], "i4"), 0.01, 0.0, -9999),
+        ("I", np.array([3000, -32768, 1000, 0, 500], "i2"), 0.01, 0.0, -32768),
+        ("I", np.array([30 - 100, 32767, 10 - 100, -100, 5 - 100], "i2"), 1.0, 100.0, 32767),
+        ("B", np.array([30, 255, 10, 0, 5], "u1"), 1.0, 0.0, 255),
+    ],
+)
+def test_undefined_numbers_of_scaled_columns_are_missing(tmp_path, form, raw, scale, zero, null):
+    path = scaled(tmp_path / "s.fits", "ROTATOR", form, raw, scale=scale, zero=zero, null=null)
+    found = read_catalogue(read_input_table(path), SOUTH)
+    np.testing.assert_allclose(found.rotator, [30.0, np.nan, 10.0, 0.0, 5.0], atol=1e-9)
+
+
+def test_undefined_counts_of_a_camera_are_missing(tmp_path):
+    raw = np.full((ROWS, 4), 100000, "i4")
+    raw[1, 2] = -1
+    path = scaled(
+        tmp_path / "n.fits", "N", "4J", raw + np.arange(ROWS)[:, None] * 7 * (raw > 0), scale=10.0, null=-1
+    )
+    assert np.argwhere(np.isnan(read_catalogue(read_input_table(path), SOUTH).counts)).tolist() == [[1, 2]]
+
+
+def test_masked_values_are_missing():
+    given = table()
+    given["N"] = MaskedColumn(given["N"], mask=np.eye(5, 4, dtype=bool))
+    assert np.argwhere(np.isnan(read(given).counts)).tolist() == [[0, 0], [1, 1], [2, 2], [3, 3]]
+    turned = QTable(table())
+    turned["ROTATOR"] = Masked([1.0, 2.0, 3.0, 4.0, 99.0] * units.deg, mask=[0, 0, 0, 0, 1])
+    np.testing.assert_array_equal(read(turned).rotator, [1.0, 2.0, 3.0, 4.0, np.nan])
+    hidden = table(X=MaskedColumn(np.zeros(ROWS), mask=[0, 0, 0, 1, 0]))
+    with pytest.raises(DataError, match="X: is not finite in row 3"):
+        read(hidden)
+
+
+def test_masked_arrays_of_a_calibration_set_are_missing():
+    counts = np.random.default_rng(0).normal(1e5, 300, (3, 4, 4))
+    angles, x = np.arange(4) * 45.0, np.arange(3) / 10
+    masked = np.ma.masked_array(counts, mask=np.zeros(counts.shape, bool))
+    masked.mask[1, 2, 3] = True
+    made = from_arrays(masked, np.sqrt(counts), x, 0 * x, angles)
+    assert made.intensities.counts.shape == (11, 4)
+    with pytest.raises(DataError, match="kind"):
+        from_arrays(
+            counts,
+            np.sqrt(counts),
+            x,
+            0 * x,
+            angles,
+            kinds=np.ma.masked_array(["clp"] * 4, mask=[0, 1, 0, 0]),
+        )
+    temp = from_arrays(
+        counts, np.sqrt(counts), x, 0 * x, angles, temp=np.ma.masked_array([1.0, 2, 3, 99], mask=[0, 0, 0, 1])
+    )
+    np.testing.assert_array_equal(temp.exposures.temp, [1.0, 2.0, 3.0, np.nan])
+
+
+def test_arrays_of_the_user_are_copied():
+    counts = np.random.default_rng(0).normal(1e5, 300, (3, 4, 4))
+    x = np.arange(3) / 10
+    made = from_arrays(counts, np.sqrt(counts), x, 0 * x, np.arange(4) * 45.0)
+    before = made.intensities.counts.copy()
+    counts *= 2.0
+    x += 1.0
+    np.testing.assert_array_equal(made.intensities.counts, before)
+    assert made.points.x.max() < 0.5
+    given = table()
+    result = extended(in_memory(given), {"Q": np.zeros(ROWS)})
+    for name in given.colnames:
+        assert not np.shares_memory(np.asarray(given[name]), np.asarray(result[name]))
+
+
+TIME = Time(np.linspace(61220.5, 61220.7, ROWS), format="mjd", scale="tai")
+
+
+@pytest.mark.parametrize("suffix", ["", ".ecsv", ".fits"])
+def test_times_become_dates(tmp_path, suffix):
+    given = table(MJD=TIME)
+    found = written(tmp_path / f"t{suffix}", given) if suffix else read(given)
+    np.testing.assert_allclose(found.time, TIME.utc.mjd, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.time + 37 / 86400, TIME.mjd, rtol=0, atol=1e-9)  # TAI − UTC since 2017
+
+
+def test_dates_of_pandas_and_of_numpy_are_times():
+    dates = np.array(["2026-07-01T12:00", "2026-07-02", "NaT", "2026-07-01", "2026-07-01"], "datetime64[ns]")
+    expected = [61222.5, 61223.0, np.nan, 61222.0, 61222.0]
+    np.testing.assert_allclose(read(table(MJD=dates)).time, expected, atol=1e-9)
+    with pytest.raises(DataError, match=r"MJD: is not a Modified Julian Date.*Julian Date"):
+        read(table(MJD=np.full(ROWS, 2461221.5)))
+    with pytest.raises(DataError, match="X: holds times"):
+        read(table(X=TIME))
+
+
+# ------------------------------------------------------------------------------------------------------ units, shapes
+
+
+@pytest.mark.parametrize(
+    ("unit", "message"),
+    [
+        ("mag", "logarithmic.*counts in electrons are needed"),
+        ("dex", "logarithmic.*counts in electrons are needed"),
+        (units.mag(units.electron), "logarithmic"),
+        ("adu", "multiply by the gain"),
+        ("electron/s", "multiply by the exposure time"),
+    ],
+)
+def test_units_that_are_no_counts_are_refused_with_advice(unit, message):
+    given = table()
+    given["N"].unit = unit
+    with pytest.raises(DataError, match=f"N: .*{message}"):
+        read(given)
+
+
+def test_columns_of_one_value_are_numbers_and_structures_are_refused():
+    given = table()
+    given["X"] = np.asarray(given["X"])[:, None]
+    np.testing.assert_array_equal(read(given).points.x, np.linspace(-0.2, 0.2, ROWS))
+    given["Y"] = np.zeros(ROWS, [("a", float), ("b", float)])
+    with pytest.raises(DataError, match="Y: is no plain column"):
+        read(given)
+
+
+# ----------------------------------------------------------------------------------------------------------------- CSV
+
+PLAIN = """X,Y,N0,N1,N2,N3,N0_ERR,N1_ERR,N2_ERR,N3_ERR,ID,TEFF
+0.1,-0.05,1000.5,1e3,990.25,1010,32,31.5,31,32,a b,5500
+-0.2,0.1,2000,2001,2002.5,2003,44,45,46,47,c,
+"""
+
+
+def commas_to(separator, text=PLAIN):
+    return text.replace(",", separator)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        commas_to(";").encode(),
+        commas_to("\t").encode(),
+        commas_to("|").encode(),
+        commas_to(";").replace(".", ",").encode(),
+        commas_to("\t").replace(".", ",").encode(),
+        b"# stars of field 12\n# r band\n" + PLAIN.encode(),
+        b"sep=,\n" + PLAIN.encode(),
+        b'"sep=;"\n' + commas_to(";").encode(),
+        b"\n\n" + PLAIN.encode(),
+        PLAIN.encode("utf-16"),
+        PLAIN.encode("utf-8-sig"),
+        PLAIN.replace("\n", "\r\n").encode("utf-16"),
+        PLAIN.replace("\n", "\r").encode(),
+        PLAIN.replace("\n-0.2", "\n# the second star\n-0.2").encode(),
+        (commas_to(" ", PLAIN.replace("a b", "a").replace("47,c,\n", "47,c,nan\n"))).encode(),
+        ("# " + PLAIN).encode(),
+    ],
+)
+def test_dialects_of_csv_are_read(tmp_path, content):
+    (tmp_path / "d.csv").write_bytes(content)
+    found = read_catalogue(read_input_table(tmp_path / "d.csv"), SOUTH)
+    np.testing.assert_array_equal(found.points.x, [0.1, -0.2])
+    np.testing.assert_array_equal(found.points.settings.teff, [5500.0, np.nan])
+    np.testing.assert_array_equal(found.counts, [[1000.5, 1000, 990.25, 1010], [2000, 2001, 2002.5, 2003]])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"X;Y;N0\n0.1;0,2;1.234,5\n", "with points.*decimal point"),
+        (b"X;Y;N0\n0,1;0,2;1,234,567\n", "several commas.*separators of thousands"),
+        (b"X,Y\n0,1,0,2\n", "decimal commas need semicolons"),
+        (b'X,Y\n"0,1","0,2"\n', "decimal point"),
+        (b"X,Y\n0\xe9,1\n", "save it as UTF-8"),
+        (b"X\0,\0Y\0\n\0", "NUL"),
+        (b"PK\x03\x04 broken", "write it again"),
+    ],
+)
+def test_what_is_not_clear_is_refused_with_advice(tmp_path, content, message):
+    (tmp_path / "d.csv").write_bytes(content)
+    with pytest.raises(DataError, match=message) as caught:
+        field_points(read_input_table(tmp_path / "d.csv"), SOUTH)
+    assert "d.csv" in str(caught.value)
+
+
+# -------------------------------------------------------------------------------------------- packed files, extensions
+
+
+@pytest.mark.parametrize(
+    ("suffix", "packed"), [(".gz", gzip.compress), (".bz2", bz2.compress), (".xz", lzma.compress)]
+)
+@pytest.mark.parametrize("name", ["t.fits", "t.ecsv", "t.vot"])
+def test_packed_tables_are_read(tmp_path, name, suffix, packed):
+    table().write(tmp_path / name, format="votable" if name.endswith("vot") else None)
+    (tmp_path / f"{name}{suffix}").write_bytes(packed((tmp_path / name).read_bytes()))
+    found = read_catalogue(read_input_table(tmp_path / f"{name}{suffix}"), SOUTH)
+    np.testing.assert_array_equal(found.counts, table()["N"])
+
+
+def test_an_archive_holds_one_table(tmp_path):
+    table().write(tmp_path / "t.fits")
+    path = tmp_path / "t.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.write(tmp_path / "t.fits", "inner/t.fits")
+    np.testing.assert_array_equal(read_catalogue(read_input_table(path), SOUTH).counts, table()["N"])
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("other.csv", "X,Y\n0,0\n")
+    with pytest.raises(DataError, match=r"holds 2 files \(inner/t.fits, other.csv\); unpack it"):
+        read_input_table(path)
+    with zipfile.ZipFile(tmp_path / "w.zip", "w") as archive:
+        archive.writestr("[Content_Types].xml", "")
+    with pytest.raises(DataError, match=r"spreadsheet.*save the sheet as CSV"):
+        read_input_table(tmp_path / "w.zip")
+
+
+def test_the_table_that_fits_is_taken_or_can_be_named(tmp_path):
+    path = tmp_path / "two.fits"
+    log = fits.BinTableHDU(Table({"A": [1, 2]}), name="LOG")
+    stars = fits.BinTableHDU(table(), name="STARS")
+    fits.HDUList([fits.PrimaryHDU(), log, stars]).writeto(path)
+    found = read_catalogue(read_input_table(path), SOUTH)
+    np.testing.assert_array_equal(found.counts, table()["N"])
+    assert "the table STARS is read, not LOG" in remarks(found)
+    fits.HDUList([fits.PrimaryHDU(), log, stars, fits.BinTableHDU(table()[:2], name="MORE")]).writeto(
+        path, overwrite=True
+    )
+    with pytest.raises(
+        DataError, match=r"several tables that could be meant \(STARS, MORE\); name one: two.fits\[STARS\]"
+    ):
+        read_input_table(path)
+    assert read_input_table(f"{path}[more]").rows == 2
+    assert read_input_table(f"{path}[2]").rows == ROWS
+    with pytest.raises(DataError, match="has no table 'none'; there is LOG, STARS, MORE"):
+        read_input_table(f"{path}[none]")
+    fits.HDUList([fits.PrimaryHDU(), log, log.copy()]).writeto(path, overwrite=True)
+    with pytest.raises(DataError, match="none of the tables LOG, LOG has X and Y"):
+        read_input_table(path)

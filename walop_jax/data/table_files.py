@@ -1,0 +1,239 @@
+"""Files of tables as other programs write them: packed, FITS with several extensions, dialects of CSV."""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from walop_jax.data.schema import undefined
+from walop_jax.io.errors import DataError, fail
+from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits, unpacked
+from walop_jax.io.plain_tables import table_format
+from walop_jax.io.text import check_input, some, unpacking
+
+_PACKED = (".gz", ".bz2", ".xz")
+_SEPARATORS = (",", ";", "\t", "|")
+_NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
+_LOOKED_AT = 200  # lines, for their separators of decimals
+_NUMBER = re.compile(r"[+-]?\d[\d.,]*([eE][+-]?\d+)?")
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
+_SCALES = ("UTC", "TAI", "TT", "TDB", "TCB", "TCG", "UT1")
+
+
+def read_table_file(path: Path, needed: Collection[str]) -> tuple[Path, Any, tuple[str, ...]]:
+    """The file, the astropy table in it, and remarks on how it was read.
+
+    `needed` are columns, in capitals, that decide between several tables of a FITS file (`file.fits[NAME]` is one of
+    them by name or number) and between separators of a text. Raises `DataError` if the file is missing, damaged or no
+    table.
+    """
+    path, extension = _extension_of(path)
+    kind = "" if path.suffix.lower() == ".zip" else _format(path)
+    path = check_input(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if kind == "fits" or _begins(path, b"SIMPLE  ="):
+                return path, *_from_fits(path, extension, needed)
+            content, inside = _content(path)
+            kind = kind or _format(Path(inside))
+            if kind == "ascii.csv":
+                return path, *_from_csv(_decoded(content, path), path, needed)
+            return path, _astropy_table(content, kind), ()
+    except DataError:
+        raise
+    except UNREADABLE as error:
+        what = f"cannot be read as a table: {one_line(error)}"
+        raise fail(what, file=path, advice="write it again") from error
+
+
+def _extension_of(path: Path) -> tuple[Path, str]:
+    """The file, and the extension that is named in brackets behind it."""
+    match = re.fullmatch(r"(.+)\[([^\[\]]+)\]", str(path))
+    return (path, "") if match is None or path.exists() else (Path(match[1]), match[2].strip())
+
+
+def _format(path: Path) -> str:
+    plain = path.with_suffix("") if path.suffix.lower() in _PACKED else path
+    return "ascii.csv" if plain.suffix.lower() == ".tsv" else table_format(plain)
+
+
+def _content(path: Path) -> tuple[bytes, str]:
+    """The bytes of a file, unpacked, and the name of what they are."""
+    packed = unpacking(path)
+    if packed is None:
+        return path.read_bytes(), path.name
+    with packed[0] as stream:
+        return unpacked(stream, path), packed[1]
+
+
+def _begins(path: Path, start: bytes) -> bool:
+    packed = unpacking(path)
+    with path.open("rb") if packed is None else packed[0] as stream:
+        return stream.read(len(start)) == start
+
+
+def _astropy_table(content: bytes | str, kind: str, **options: Any) -> Any:
+    from astropy.table import Table  # imported here: it takes a third of a second
+
+    if isinstance(content, bytes):
+        return Table.read(io.BytesIO(content) if kind == "votable" else content.decode(), format=kind)
+    return Table.read(content, format=kind, **options)
+
+
+# ------------------------------------------------------------------------------------------------------------- FITS
+
+
+def _from_fits(path: Path, extension: str, needed: Collection[str]) -> tuple[Any, tuple[str, ...]]:
+    """The table of a FITS file that is named, or the only one that has the columns that are needed."""
+    from astropy.table import Table
+
+    with open_fits(path) as opened:
+        tables = {n: hdu for n, hdu in enumerate(opened.hdus) if type(hdu).__name__ == "BinTableHDU"}
+        labels = {n: hdu.name or str(n) for n, hdu in tables.items()}
+        listed = ", ".join(labels.values())
+        if not tables:
+            raise fail("has no table", file=path, advice="write one, or use a CSV file")
+        chosen = list(tables)
+        if extension:
+            chosen = [n for n in tables if extension.upper() in (labels[n].upper(), str(n))]
+            if not chosen:
+                raise fail(f"has no table {extension!r}", file=path, advice=f"there is {listed}")
+        elif len(tables) > 1:
+            chosen = [n for n in tables if set(needed) <= {name.upper() for name in tables[n].columns.names}]
+            if not chosen:
+                what = f"none of the tables {listed} has {' and '.join(needed)}"
+                raise fail(what, file=path, advice=f"name one: {path.name}[{labels[next(iter(tables))]}]")
+        if len(chosen) > 1:
+            several = ", ".join(labels[n] for n in chosen)
+            what = f"has several tables that could be meant ({several})"
+            raise fail(what, file=path, advice=f"name one: {path.name}[{labels[chosen[0]]}]")
+        hdu = tables[chosen[0]]
+        table = Table.read(hdu, character_as_bytes=False)
+        _hide_undefined(table, hdu)
+        _times(table, hdu)
+    others = [label for n, label in labels.items() if n != chosen[0]]
+    remark = f"the table {labels[chosen[0]]} is read, not {some(others, 5)}"
+    return table, (remark,) if others and not extension else ()
+
+
+def _hide_undefined(table: Any, hdu: Any) -> None:
+    """Mask what is undefined; astropy compares TNULL with scaled values."""
+    from astropy.table import MaskedColumn
+
+    for index, name in enumerate(hdu.columns.names):
+        missing = undefined(hdu, index)
+        if hdu.columns[index].null not in (None, "") or missing.any():
+            old = table[name]
+            values = np.ma.getdata(np.ma.asarray(old))
+            table[name] = MaskedColumn(values, mask=missing, unit=old.unit, description=old.description)
+
+
+def _times(table: Any, hdu: Any) -> None:
+    """Make times of what astropy writes of them: two parts of a Julian date, with its scale in the header."""
+    from astropy.time import Time
+
+    for column in hdu.columns:
+        scale = str(column.coord_type or "").upper()
+        if scale in _SCALES and np.shape(table[column.name])[1:] == (2,):
+            whole, part = np.moveaxis(np.ma.filled(np.ma.asarray(table[column.name]), np.nan), -1, 0)
+            table[column.name] = Time(whole, part, format="jd", scale=scale.lower())
+
+
+# -------------------------------------------------------------------------------------------------------------- CSV
+
+
+def _decoded(content: bytes, path: Path) -> str:
+    """The text of a file in UTF-8, or in UTF-16 with its mark; line ends are made those of Unix."""
+    encoding = "utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
+    try:
+        text = content.decode(encoding)
+    except UnicodeDecodeError as error:
+        raise fail(
+            f"is not text in UTF-8 (byte {error.start})", file=path, advice="save it as UTF-8"
+        ) from None
+    if "\0" in text:
+        raise fail("holds NUL characters", file=path, advice="is it text? Save it as CSV in UTF-8")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _from_csv(text: str, path: Path, needed: Collection[str]) -> tuple[Any, tuple[str, ...]]:
+    """The table of a text with a line of names, whatever stands between its columns."""
+    if text.startswith("# %ECSV"):
+        return _astropy_table(text, "ascii.ecsv"), ()
+    remarks = []
+    text, comments, separator = _body(text)
+    header, _, rest = text.partition("\n")
+    if comments and _NUMBER.fullmatch(re.split(r"[,;\t| ]", header.strip())[0]):
+        header, rest = comments[-1], text  # the line of names is a comment, as numpy writes it
+        text = f"{header}\n{rest}"
+    separator = separator or _separator_of(header, needed)
+    if separator != ",":
+        rest, decimals = _with_points(rest, separator, path)
+        remarks.append(f"columns are separated by {_NAMES.get(separator, separator)}{decimals}")
+        text = f"{header}\n{rest}"
+    options: dict[str, Any] = {"delimiter": separator} if separator != "," else {}
+    try:
+        table = _astropy_table(text + "\n", "ascii.basic" if separator == " " else "ascii.csv", **options)
+    except UNREADABLE as error:
+        advice = (
+            f"line 1 should name the columns, separated as the values are; it is {header[:60]!r}; decimal commas need "
+            "semicolons between columns"
+        )
+        raise fail(f"cannot be read as a table: {one_line(error)}", file=path, advice=advice) from error
+    return table, tuple(remarks)
+
+
+def _body(text: str) -> tuple[str, list[str], str]:
+    """The text without comments and empty lines ahead of it; the comments; the separator that a spreadsheet states."""
+    comments, separator = [], ""
+    while text:
+        line, _, rest = text.partition("\n")
+        stated = re.fullmatch(r'"?sep=(.|\\t)"?,*', line.strip(" \n"), re.IGNORECASE)
+        if stated:
+            separator = stated[1].replace("\\t", "\t")
+        elif line.startswith("#"):
+            comments.append(line.lstrip("# "))
+        elif line.strip(' ,;\t"'):
+            break
+        text = rest
+    if "\n#" in text:
+        text = re.sub(r"(?m)^#.*\n?", "", text)
+    return text, comments, separator
+
+
+def _separator_of(header: str, needed: Collection[str]) -> str:
+    """What separates the names in a line so that those needed are among them; else what occurs, a comma first."""
+    for separator in _SEPARATORS:
+        if set(needed) <= {name.strip(" \"'").upper() for name in header.split(separator)}:
+            return separator
+    there = [separator for separator in _SEPARATORS if separator in header]
+    blank = not there and set(needed) <= {name.upper() for name in header.split()}
+    return " " if blank else (there or [","])[0]
+
+
+def _with_points(rest: str, separator: str, path: Path) -> tuple[str, str]:
+    """Lines with decimal commas as such with points, and words for that; `DataError` where both are there."""
+    lines = rest.split("\n", _LOOKED_AT)[:_LOOKED_AT]
+    cells = [cell.strip(' "') for line in lines for cell in _cells(line, separator)]
+    numbers = [cell for cell in cells if _NUMBER.fullmatch(cell)]
+    if not any("," in cell for cell in numbers):
+        return rest, ""
+    odd = [c for c in numbers if "." in c or ("," in c and not _DECIMAL_COMMA.fullmatch(c))]
+    if odd:
+        what = f"holds numbers with commas and {'with points' if '.' in odd[0] else 'several commas'}: {odd[0]!r}"
+        advice = "write them with a decimal point and without separators of thousands"
+        raise fail(what, file=path, advice=advice)
+    between = re.escape(separator) if separator != " " else r"\s"
+    comma = re.compile(rf'(?m)(^|[{between}" ])([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)(?=$|[{between}" ])')
+    return comma.sub(r"\1\2.\3", rest), ", decimals by commas"
+
+
+def _cells(line: str, separator: str) -> Sequence[str]:
+    return line.split(separator) if separator != " " else line.split()
