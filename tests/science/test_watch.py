@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from studies import watch as study
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.reports.survey_figures import watch_figure
-from walop_jax.science.star_residuals import noise_scale
-from walop_jax.science.watch import grouped, with_rivals
+from walop_jax.science.star_residuals import noise_scale, normal_matrix
+from walop_jax.science.watch import Watching, grouped, with_rivals
 
 
 @pytest.fixture(scope="module")
@@ -140,3 +142,75 @@ def test_optics_that_may_have_changed_are_added_at_neutral(calibration):
     kept = [there.model.index(name) for name in calibration.model.names]
     np.testing.assert_array_equal(there.values[kept], calibration.values)
     assert np.all(there.sigma[np.setdiff1d(np.arange(len(there.values)), kept)] < 1e-8)
+
+
+BOTH = (0, 1)  # O1 and E1: the cameras of an arm
+WAYS = {
+    "arm": study.step(-0.01, BOTH),
+    "gradient": study.gradient(0.01, BOTH, 50.0),
+    "spot": study.spot(-0.02, BOTH, 0.1, 0.05, 0.1),
+}
+
+
+@pytest.mark.parametrize("kind", WAYS)
+def test_an_arm_a_gradient_and_a_spot_are_told_as_that(kind, vectors):
+    """Where a plate of the optics described the stars better than single cameras, by amounts that none can have."""
+    (change,) = study.watched(400, 4, WAYS[kind]).changes
+    best = change.best
+    assert (best.kind, best.name, change.camera) == (kind, "O1+E1", None)
+    assert change.between[0] <= 60000.0 + study.START <= change.between[1]
+    if kind == "arm":
+        assert best.size == pytest.approx(-0.01, abs=5 * best.error)
+    elif kind == "gradient":
+        # 1 % at 0.28 degrees; sizes are those at the star that lies farthest out along X or Y.
+        assert best.size == pytest.approx(0.01, abs=5 * best.error + 1e-4)
+        assert best.place[0] == pytest.approx(50.0, abs=4.0)
+    else:
+        assert np.hypot(best.place[0] - 0.1, best.place[1] - 0.05) < 0.03
+        assert best.size == pytest.approx(-0.02, rel=0.25)
+    for entry in change.alike:
+        if entry.kind == "optics":
+            _, width = vectors.calibration.model[entry.name].prior
+            assert abs(entry.size) <= 10.0 * width
+
+
+def test_three_stars_that_lie_off_are_no_spot_and_no_optics():
+    def odd(night, x, y):
+        change = np.zeros((len(x), 4))
+        change[[3, 17, 30]] = 0.1 * np.random.default_rng(5).standard_normal((3, 4))
+        return change
+
+    watch = study.watched(100, 2, odd)
+    assert watch.holds
+    assert not watch.changes
+
+
+def test_a_change_that_nothing_within_its_range_describes_has_no_name(monkeypatch):
+    """The plate that has changed may do so by a thousandth of the width of its prior only."""
+    monkeypatch.setattr("walop_jax.science.watch_readings.FARTHEST", 1e-3)
+    watch = study.watched(400, 7, turned=("half2.plate.mgf2", 3.0))
+    assert not watch.holds
+    assert any(change.best.kind == "unnamed" and change.camera is None for change in watch.changes)
+    assert not any(entry.kind == "optics" for change in watch.changes for entry in change.alike)
+    assert any("no camera, arm or place of the field" in sentence for sentence in watch.warnings)
+
+
+def test_what_single_exposures_cannot_see_is_nothing_and_not_rounding(vectors):
+    """q and u of the stars are free: whatever does to all counts what q does has no information, of either sign."""
+    stars = study.watching(120, 3, study.step(0.01), plates=(None,)).stars
+    ones, like_q = np.ones(len(stars.photon)), stars.tangent[:, 0]
+    matrix, score = normal_matrix(
+        stars, stars.residual, lambda part, _: part.tangent.swapaxes(1, 2), ones, ones
+    )
+    assert not matrix.any()
+    assert not score.any()
+    # The same as a number of the optics: it is not seen, in no group, and no history of it is a change.
+    plain = stars.plain.copy()
+    number = int(np.flatnonzero(np.abs(plain).max(axis=(0, 1)) > 0)[0])
+    plain[..., number] = 1e-3 * like_q
+    watching = Watching(dataclasses.replace(stars, plain=plain), vectors)
+    size, error, _ = watching.answers(*watching.scan(stars.residual, ones, ones))
+    column = [reading.name for reading in watching.readings.listed].index(vectors.named[number][0])
+    assert np.isinf(error[:, column]).all()
+    assert not size[:, column].any()
+    assert (error > 0).all()

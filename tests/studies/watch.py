@@ -17,6 +17,7 @@ import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -62,15 +63,15 @@ def _true_vectors(x: np.ndarray, y: np.ndarray, plate: float | None, change: np.
     return v.coloured(setting, x, y, teff) + slopes @ change
 
 
-def watched(
+def watching(
     stars: int,
     seed: int,
     gains: Gains | None = None,
     turned: tuple[str, float] | None = None,
     plates: tuple[float | None, ...] = PLATES,
     scatter: float = 1.0,
-) -> Watch:
-    """The watch of one catalogue: `gains` of the cameras by night, or a parameter `turned` from `START` on.
+) -> Watching:
+    """One catalogue, ready to be asked: `gains` of the cameras by night, or a parameter `turned` from `START` on.
 
     `scatter` is the noise over what N_ERR says.
     """
@@ -104,7 +105,13 @@ def watched(
     calibration = v.calibration
     catalogue = read_catalogue(table, calibration.model.template.patched(), always_in=calibration.always_in)
     left = StarResiduals.joined(residuals_of(v, catalogue, 10**9))
-    return Watching(left, v).watch()
+    return Watching(left, v)
+
+
+@functools.wraps(watching)
+def watched(*given: Any, **options: Any) -> Watch:
+    """The watch of one catalogue."""
+    return watching(*given, **options).watch()
 
 
 def _of(cameras: int | tuple[int, ...], change: np.ndarray) -> np.ndarray:

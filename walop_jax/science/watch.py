@@ -365,7 +365,7 @@ class Watching:
         weight, share, whole = self.weights(residual)
         matrix, score = self.scan(residual, weight, share)
         while len(changes) < _MOST_CHANGES:
-            found = self._answers(matrix, score)
+            found = self.answers(matrix, score)
             ways = [self.spotted(residual, weight, share)]
             if np.abs(found.size / found.error).max() > self.alarm:
                 ways.append(self.settled(residual, found))
@@ -389,12 +389,14 @@ class Watching:
         scale = max(1.0, min(noise_scale(chi2, dof).value for chi2 in each))
         cut = special.chdtri(np.maximum(dof, 1e-12), TRIMMED)
         cost = [float(np.minimum(chi2 / scale, cut)[dof > 0].sum()) for chi2 in each]
-        (change, left), (other, _) = (ways[n] for n in np.argsort(cost))
-        if abs(cost[1] - cost[0]) < RIVAL and other.best.kind != UNNAMED:
+        near = abs(cost[1] - cost[0]) < RIVAL and ways[1][0].best.kind != UNNAMED
+        # The simpler one, if both are as good: spots are the first.
+        (change, left), (other, _) = ways[::-1] if near else (ways[n] for n in np.argsort(cost))
+        if near:
             change = dataclasses.replace(change, alike=change.alike + other.alike)
         return change, left
 
-    def _answers(self, matrix: Any, score: Any) -> Answers:
+    def answers(self, matrix: Any, score: Any) -> Answers:
         """Every history of every reading, each alone."""
         return self.readings.answers(*self._by_group(matrix, score), self.shapes)
 
@@ -409,7 +411,7 @@ class Watching:
         for _ in range(_ROUNDS):
             if best is not None:
                 weight, share, _ = self.weights(left)
-                found = self._answers(*self.scan(self.without(left, best, -total), weight, share))
+                found = self.answers(*self.scan(self.without(left, best, -total), weight, share))
             ranked = self.suspects(found)
             if abs(ranked[0].sigma) < self.alarm or not self.readings.possible(ranked[0]):
                 ranked.sort(key=lambda entry: -abs(entry.sigma))

@@ -4,8 +4,8 @@
 
 over the stars near the place, z the gain of a camera (or an arm) that each star has by itself, in standard errors and
 no more than `CLIPPED`: a star that lies off for reasons of its own is no spot, nor are three of them. Without a spot
-T is normal. Places lie on a grid of R/2, for every R of `RADII` and m = 2. Place, R and m (of `EDGES`, a blurred spot or
-a sharp one) are then those of the least Σ min((z − β f/σ)², c), c the square at which stars are no longer used.
+T is normal. Places lie on a grid of R/2, for every R of `RADII` and m = 2. Place, R and m (of `EDGES`: a blurred spot
+or a sharp one) are then those of the least Σ min((z − β f/σ)², c), c the square at which stars are no longer used.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from scipy import optimize, sparse, spatial, special
 from walop_jax.science.star_residuals import FEW, ROUNDING, TRIMMED, StarResiduals
 
 RADII = (0.5, 0.25, 0.125)  # of the distance of the edge of the field
+WIDEST = 0.7  # the same, of any spot
 CLIPPED = float(-special.ndtri(0.5 * TRIMMED))  # 3.3 standard errors
 Place = tuple[float, ...]
 
@@ -45,6 +46,7 @@ class Spots:
     """Places at which the stars of a list could see a spot."""
 
     def __init__(self, stars: StarResiduals, edge: float) -> None:
+        self.edge = edge
         self.x, self.y = x, y = stars.x[stars.first], stars.y[stars.first]
         tree, blocks, places = spatial.KDTree(np.column_stack([x, y])), [], []
         for radius in (share * edge for share in RADII):
@@ -92,7 +94,11 @@ class Spots:
             place = (unit * values[0], unit * values[1], unit * abs(values[2]), edge)
             return (z - start * values[3] * root * profile(x, y, place)) ** 2
 
+        widest = WIDEST * self.edge / unit
+
         def cost(values: Float[np.ndarray, " v"], edge: float) -> float:
+            if abs(values[2]) > widest or np.abs(values[:2] * unit).max() > self.edge:
+                return np.inf  # what covers the field is no spot
             return float(np.minimum(off(values, edge), CLIPPED**2).sum())
 
         begin = [spot.place[0] / unit, spot.place[1] / unit]
@@ -116,9 +122,10 @@ def of_stars(
     weight: Float[np.ndarray, " s"],
     share: Float[np.ndarray, " s"],
 ) -> Iterator[tuple[Float[np.ndarray, "s c"], Float[np.ndarray, "s c"]]]:
-    """For every exposure group the gain of cameras from it on, by each star alone, in standard errors, and 1/σ of it.
+    """For every exposure group the gain of cameras from it on, by each star alone, in standard errors; and 1/σ of it.
 
-    Both are 0 where a star does not see it. `members` are 1 for the cameras that are taken together; weights are those of `normal_matrix`.
+    Both are 0 where a star does not see it. `members` are 1 for the cameras that are taken together; weights are those
+    of `normal_matrix`.
     """
     parts: list[list[np.ndarray]] = [[], [], [], []]
     for here, rows, part in stars.blocks():
