@@ -354,7 +354,9 @@ def _of_limits(folder: Path, document: Mapping[str, Any]) -> Pictures:
 
 
 def _of_epoch(folder: Path, document: Mapping[str, Any]) -> Pictures:
-    """Maps of what has changed of the instrument matrix, if both calibrations are there."""
+    """Maps of what has changed of the instrument matrix, if both calibrations are there and worth comparing."""
+    if document["fits"] is None or document.get("same"):
+        return [], ()
     try:
         old, new = (
             read_calibration(Path(path), rebuild=False).maps for path in (document["old_file"], folder)
