@@ -260,7 +260,7 @@ class Survey(Displayed):
         context = effect_context(model.template, like.exposures)
         candidates = [
             p for p, law, has in zip(self.data.parameters, self.laws, self.data.has_value, strict=True)
-            if law is not None and not has
+            if law is not None and not has and p.name not in model.names
         ]  # fmt: skip
         taken: dict[str, str] = {}
         for p in candidates:
