@@ -9,9 +9,11 @@ import pytest
 from studies import watch as study
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.data.catalogue import read_catalogue
+from walop_jax.data.user_tables import in_memory
 from walop_jax.reports.survey_figures import watch_figure
 from walop_jax.science.star_residuals import noise_scale, normal_matrix
-from walop_jax.science.watch import Watching, grouped, with_rivals
+from walop_jax.science.watch import Watching, dated, grouped, with_rivals
 
 
 @pytest.fixture(scope="module")
@@ -127,13 +129,37 @@ def test_scale_of_noise_is_that_of_the_many():
 
 
 def test_exposure_groups_are_joined_where_there_are_many():
-    time = np.array([3.0, 1.0, np.nan, 2.0, 2.0])
+    time = np.array([3.0, 1.0, 2.0, 2.0])
     times, group = grouped(time)
     assert times.tolist() == [1.0, 2.0, 3.0]
-    assert group.tolist() == [2, 0, 0, 1, 1]
+    assert group.tolist() == [2, 0, 1, 1]
     times, group = grouped(np.arange(10.0), most=4)
     assert times.tolist() == [0.0, 3.0, 6.0, 9.0]
     assert group.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3]
+
+
+def test_dates_that_are_there_stay_and_what_has_none_is_left_out_by_name(vectors):
+    def catalogue(*mjd):
+        counts = np.full((len(mjd), 4), 1e6)
+        rows = {"ID": np.arange(len(mjd)) // 2, "X": np.zeros(len(mjd)), "Y": 0.01 * np.arange(len(mjd))}
+        rows |= {"N": counts, "N_ERR": np.sqrt(counts), "MJD": np.array(mjd)}
+        return read_catalogue(in_memory(rows), vectors.calibration.model.template.patched())
+
+    nan = np.nan
+    given = catalogue(60000.1, 60000.1, 60001.2), catalogue(nan, nan), catalogue(nan, 60003.0, 60004.0)
+    kept, remarks = dated(given, ["a.fits", "b.csv", "c.fits"])
+    assert [one.time.tolist() for one in kept] == [[60000.1, 60000.1, 60001.2], [60003.0, 60004.0]]
+    assert kept[1].star.tolist() == [0, 1]
+    assert kept[1].points.y.tolist() == [0.01, 0.02]
+    assert len(kept[1].points.settings) == len(kept[1].counts) == 2
+    assert remarks[0].startswith("b.csv, MJD: no row has a time")
+    assert remarks[1].startswith("c.fits, MJD: 1 of 3 rows have no time")
+    # Where none has, each is a group of its own, in their order.
+    kept, remarks = dated([given[1], given[1]], [])
+    assert [one.time.tolist() for one in kept] == [[0.0, 0.0], [1.0, 1.0]]
+    assert remarks == ()
+    watch = study.watched(100, 4)
+    assert "b.csv" in " ".join(dataclasses.replace(watch, remarks=("b.csv, MJD: none",)).warnings)
 
 
 def test_optics_that_may_have_changed_are_added_at_neutral(calibration):

@@ -182,6 +182,16 @@ class Catalogue:
     def __len__(self) -> int:
         return len(self.star)
 
+    def of_rows(self, keep: Bool[np.ndarray, " n"]) -> Catalogue:
+        """Some of the rows; stars are numbered anew."""
+        if keep.all():
+            return self
+        whole = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "points"}
+        p = self.points
+        points = FieldPoints(p.x[keep], p.y[keep], p.settings[np.flatnonzero(keep)], p.outside[keep])
+        some = Catalogue(points=points, **{name: values[keep] for name, values in whole.items()})
+        return dataclasses.replace(some, star=np.unique(some.star, return_inverse=True)[1].reshape(-1))
+
 
 def read_catalogue(
     source: InputTable,

@@ -50,7 +50,7 @@ from walop_jax.reports.wording import (
     verdict_of_diagnosis,
     verdict_of_fit,
 )
-from walop_jax.science.field_accuracy import FieldAccuracy
+from walop_jax.science.field_accuracy import FieldAccuracy, judged
 
 TEMPLATES = Path(__file__).parent / "templates"
 MOST_PULLS = 8
@@ -84,6 +84,7 @@ def environment() -> jinja2.Environment:
         effect_in_words=effect_in_words,
         names_in_words=names_in_words,
         value_and_error=value_and_error,
+        judged=judged,
         rounded=rounded,
         probability=probability,
     )

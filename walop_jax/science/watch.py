@@ -89,27 +89,48 @@ def watch(
     calibration: Calibration,
     catalogues: Sequence[Catalogue],
     *,
+    names: Sequence[str] = (),
     rows: int = limits.WATCHED_ROWS,
     force: bool = False,
 ) -> Watch:
     """Look for changes of the instrument since it was calibrated in the stars of catalogues.
 
-    Rows of one MJD are an exposure group; catalogues without it are a group each, in their order. Of more than `rows`
-    rows as many are looked at, spread over the stars. Raises `DataError` as `science.apply.apply` does, and where no
-    row has a camera to spare.
+    Rows of one MJD are an exposure group; catalogues without it are a group each, in their order. Where some rows have
+    an MJD those without one are left out, and told by the `names` of their catalogues. Of more than `rows` rows as many
+    are looked at, spread over the stars. Raises `DataError` as `science.apply.apply` does, and where no row has a
+    camera to spare.
     """
-    dated = [np.isfinite(catalogue.time).any() for catalogue in catalogues]
+    catalogues, remarks = dated(catalogues, names)
     vectors = AnalysisVectors(with_rivals(calibration))
     total, parts = sum(map(len, catalogues)), []
-    for number, catalogue in enumerate(catalogues):
-        if not all(dated):
-            catalogue = dataclasses.replace(catalogue, time=np.full(len(catalogue), float(number)))
+    for catalogue in catalogues:
         share = -(-rows * len(catalogue) // total)
         parts += residuals_of(vectors, catalogue, share, force=force)
     if not parts:
         raise DataError("N: no star has a camera to spare beside flux, q and u; add rows at other settings")
     stars = StarResiduals.joined(parts)
-    return Watching(stars, vectors).watch()
+    return dataclasses.replace(Watching(stars, vectors).watch(), remarks=remarks)
+
+
+def _dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[Catalogue], tuple[str, ...]]:
+    """Catalogues with a time in every row, the number of the catalogue where none has any; what was left out."""
+    known = [np.isfinite(catalogue.time) for catalogue in catalogues]
+    if not any(map(np.any, known)):
+        numbered = enumerate(catalogues)
+        return [dataclasses.replace(c, time=np.full(len(c), float(n))) for n, c in numbered], ()
+    remarks = []
+    for number, timed in enumerate(known):
+        if not timed.all():
+            name = names[number] if number < len(names) else f"catalogue {number + 1}"
+            rows = (
+                "no row has a time"
+                if not dated.any()
+                else f"{np.sum(~timed)} of {len(timed)} rows have no time"
+            )
+            remarks.append(f"{name}, MJD: {rows}, others do: left out, as nobody knows when they were taken")
+    return [c.of_rows(timed) for c, timed in zip(catalogues, known, strict=True) if timed.any()], tuple(
+        remarks
+    )
 
 
 def with_rivals(calibration: Calibration) -> Calibration:
@@ -136,12 +157,8 @@ def with_rivals(calibration: Calibration) -> Calibration:
 def grouped(
     time: Float[np.ndarray, " r"], most: int = MOST_GROUPS
 ) -> tuple[Float[np.ndarray, " g"], Int[np.ndarray, " r"]]:
-    """Times of exposure groups and the group of every row; a time that is not known is as the earliest.
-
-    Neighbours of more than `most` groups are joined.
-    """
-    known = np.where(np.isfinite(time), time, np.nanmin(time) if np.isfinite(time).any() else 0.0)
-    times, group = np.unique(known, return_inverse=True)
+    """Times of exposure groups and the group of every row; neighbours of more than `most` groups are joined."""
+    times, group = np.unique(time, return_inverse=True)
     if len(times) > most:
         step = -(-len(times) // most)
         group = group // step

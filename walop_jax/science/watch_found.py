@@ -137,7 +137,7 @@ class Watch(Displayed):
     By exposure group: `time` (MJD, or its number), `stars`, `chi2` per degree of freedom, `gain` of every camera
     (change since the calibration, that camera alone) with `error`, and `smallest`: the step of each camera from that
     group on that would be found in 99 % of cases. `tests` histories were asked; the alarm is at `alarm` standard
-    errors.
+    errors. `remarks` are about rows that were left out.
     """
 
     cameras: tuple[str, ...]
@@ -151,6 +151,7 @@ class Watch(Displayed):
     noise: float
     tests: int
     alarm: float
+    remarks: tuple[str, ...] = ()
 
     @property
     def holds(self) -> bool:
@@ -160,7 +161,7 @@ class Watch(Displayed):
     @property
     def warnings(self) -> tuple[str, ...]:
         """A sentence for every change, and one if N_ERR is not what the counts scatter by."""
-        said = tuple(change.words() for change in self.changes)
+        said = (*(change.words() for change in self.changes), *self.remarks)
         if 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS:
             return said
         return (
