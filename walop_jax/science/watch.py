@@ -124,7 +124,7 @@ def _dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[
             name = names[number] if number < len(names) else f"catalogue {number + 1}"
             rows = (
                 "no row has a time"
-                if not dated.any()
+                if not timed.any()
                 else f"{np.sum(~timed)} of {len(timed)} rows have no time"
             )
             remarks.append(f"{name}, MJD: {rows}, others do: left out, as nobody knows when they were taken")
