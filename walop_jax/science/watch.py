@@ -112,7 +112,7 @@ def watch(
     return dataclasses.replace(Watching(stars, vectors).watch(), remarks=remarks)
 
 
-def _dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[Catalogue], tuple[str, ...]]:
+def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[Catalogue], tuple[str, ...]]:
     """Catalogues with a time in every row, the number of the catalogue where none has any; what was left out."""
     known = [np.isfinite(catalogue.time) for catalogue in catalogues]
     if not any(map(np.any, known)):
