@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from walop_jax.model.effects.change import Change
 from walop_jax.model.laws import Law
 from walop_jax.model.parameters import Parameter
 from walop_jax.nights import breaks
@@ -92,6 +93,39 @@ def test_a_step_a_bad_night_and_a_drift():
     assert drift.nights_needed > NIGHTS
     assert breaks.find(data, laws, ())[0] == ()
     assert solution.chi2 == pytest.approx(breaks.solved(data, laws).chi2)
+
+
+def test_of_names_that_explain_a_break_alike_one_that_stars_can_be_corrected_for_is_its_law():
+    change = np.zeros((NIGHTS, N))
+    change[:, 3] = 12.0 * np.linspace(-0.15, 0.15, NIGHTS)
+    data = series(7, change)
+    (first,) = breaks.find(data, LAWS, ())[0]
+    assert first.alike
+    (second,), laws, _ = breaks.find(data, LAWS, (), lambda name: name != first.name)
+    assert second.name in first.alike
+    assert first.name in second.alike
+    assert second.z**2 > first.z**2 - breaks.RIVAL
+    assert laws[data.names.index(second.name)].per != laws[data.names.index(first.name)].per
+    # Without one that is, the best keeps it.
+    (third,) = breaks.find(data, LAWS, (), lambda name: False)[0]
+    assert third.name == first.name
+
+
+@pytest.mark.parametrize(
+    ("text", "known"),
+    [
+        ("gain in O1", True),
+        ("axis of half1.plate", True),
+        ("axis of half1.plate * kelvin", True),
+        ("light of O2 in O1", True),
+        ("light in O1", False),
+        ("afterglow in O1", False),
+        ("gain in O1 * hours", False),
+    ],
+)
+def test_what_a_change_does_to_a_star_is_known_or_not(text, known):
+    """Not from the median of a field, the exposure before, or hours since a first one: a star has none of these."""
+    assert Change.parsed(text).of_stars is known
 
 
 def test_a_model_holds_one_shape_of_an_effect():

@@ -8,14 +8,24 @@ from small_run import SMALL
 
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import Site
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.variance_components import groupings
 from walop_jax.fit.model_file import base_model
+from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights import equations, night_file
-from walop_jax.nights.equations import night_equations, night_numbers, together, with_candidates_of
+from walop_jax.nights.equations import (
+    model_hash,
+    night_equations,
+    night_numbers,
+    together,
+    with_candidates_of,
+)
 from walop_jax.simulation.simulate import simulate
+from walop_jax.sky.nights import night_of
 
 SAAO = Site("SAAO", -32.4, 20.8, 1798.0)
 
@@ -40,6 +50,55 @@ def test_a_night_lasts_from_noon_to_noon():
     assert night_numbers(mjd, SAAO).tolist() == [60999, 61000, 61000, 61000, 61000, 61001]
     nowhere = dataclasses.replace(SAAO, longitude=np.nan)
     assert night_numbers(mjd, nowhere).tolist() == [61000, 61000, 61000 + 0, 61000, 61001, 61001]
+
+
+def test_nights_without_a_longitude_are_asked_for_too(monkeypatch):
+    """Two nights of a set without a site are a component of the noise, told apart by the gap between them."""
+    run = simulate(dataclasses.replace(SMALL, moon_patches=0, standards=0), seed=3)
+    e = run.calset.exposures
+    later = np.where(np.arange(len(e)) < len(e) // 2, e.mjd, e.mjd + 1.0)
+    calset = dataclasses.replace(
+        run.calset,
+        exposures=dataclasses.replace(e, mjd=later),
+        site=dataclasses.replace(run.calset.site, longitude=np.nan),
+    )
+    design = Design.of(fit(Likelihood.of(calset, base_model(calset))))
+    (nights,) = (one for one in groupings(design) if one.name == "nights")
+    assert [len(np.unique(row)) for row in nights.place] == [2] * len(calset.points)
+
+
+def test_exposures_whose_time_is_not_known_are_of_no_night():
+    found = night_of(np.array([np.nan, 10.2, 11.2, 10.3]), np.nan)
+    assert np.isnan(found[0])
+    assert found[1:].tolist() == [10.0, 11.0, 10.0]
+    assert night_of(np.array([10.2, np.nan]), 90.0)[0] == 9.0
+
+
+def test_the_gauge_of_the_throughputs_is_a_candidate_with_the_slope_of_its_camera(nights):
+    """All throughputs by the same factor are flux: Σ t ∂r/∂t = 0, the one that is held among them."""
+    night = nights[0]
+    gauge = night.names.index("throughput.n0.p00")
+    assert gauge >= len(night.names) - night.candidates
+    assert night.reference[gauge] == night.parameters[gauge].start == 0.5
+    along = np.array(
+        [v if n.startswith("throughput.") else 0.0 for n, v in zip(night.names, night.reference, strict=True)]
+    )
+    assert np.count_nonzero(along) > 3
+    one = along[gauge] * np.sqrt(night.matrix[gauge, gauge])
+    assert np.sqrt(max(along @ night.matrix @ along, 0.0)) < 1e-5 * one
+    assert together(nights).gauge.nonzero()[0].size == 1
+
+
+def test_a_model_that_holds_an_outlier_of_a_standard_elsewhere_is_another_model(two):
+    """What belongs to sky and stars does so by its part, not by the beginning of its name."""
+    context = effect_context(base_model(two[0]).template, two[0].exposures)
+    model = with_effects(base_model(two[0]), [effect_by_name("standard_outlier").neutral(context)], context)
+    name = next(n for n in model.names if n.startswith("standard_outlier."))
+    held = [model.change(name, free=False, start=value) for value in (0.0, 0.01)]
+    assert model_hash(held[0]) != model_hash(held[1])
+    name = next(n for n in model.names if n.startswith("standard."))
+    held = [model.change(name, free=False, start=value) for value in (0.0, 0.01)]
+    assert model_hash(held[0]) == model_hash(held[1])
 
 
 def test_equations_are_those_of_the_fit(two, nights):

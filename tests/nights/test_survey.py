@@ -13,6 +13,7 @@ from small_run import SMALL
 
 import walop_jax as walop
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.fit.model_file import base_model, model_for
 from walop_jax.fit.refit import fit
@@ -196,6 +197,34 @@ def test_data_that_are_there_twice_are_known_by_their_noise(quiet, single, sets)
         stack([one, dataclasses.replace(two, parameters=others)])
 
 
+def test_a_camera_that_drifts_is_the_law_even_if_its_throughput_is_the_gauge_of_the_fluxes():
+    """O1 brighter by 0.4 % a month: no pedestal, which stars could not be corrected for, and errors stay small."""
+    truth, found = simulate(SMALL, seed=1).truth, []
+    for k in range(4):
+        throughput = truth.throughput
+        brighter = throughput.coefficients.at[0, 0].add(0.002 * k)
+        instrument = dataclasses.replace(
+            truth, throughput=dataclasses.replace(throughput, coefficients=brighter)
+        )
+        plan = dataclasses.replace(SMALL, mjd=SMALL.start + 30.0 * k)
+        found.append(simulate(plan, seed=1 + k, instrument=instrument, catalogue_seed=1).calset)
+    survey = stack(found, like=fitted(found[0]))
+    (drift,) = survey.breaks
+    assert (drift.kind, drift.name) == ("drift", "throughput.n0.p00")
+    assert drift.size == pytest.approx(0.002 * 365.25 / 30.0, abs=5 * drift.error)
+    assert survey.trusted
+    product = survey.at(survey.last)
+    assert "pedestal" not in product.model.effect_names
+    # Ratios of cameras as they are: those to the one that drifts fall, the others stay.
+    first = survey.at(survey.span[0] + 0.6)
+    ratio = [p["throughput.n1.p00"].value / p["throughput.n0.p00"].value for p in (first, product)]
+    assert ratio[0] / ratio[1] == pytest.approx(1.0 + 0.006 / 0.5, abs=1e-3)
+    still = [p["throughput.n1.p00"].value / p["throughput.n2.p00"].value for p in (first, product)]
+    assert still[0] == pytest.approx(still[1], rel=1e-6)
+    one = first.covariance[first.model.index("throughput.n1.p00")].max() ** 0.5
+    assert product.covariance[product.model.index("throughput.n1.p00")].max() ** 0.5 < 3.0 * one
+
+
 def test_bad_input(quiet, single):
     one, two, three = quiet.data.nights
     with pytest.raises(DataError, match=r"there is twice|is there twice"):
@@ -219,8 +248,13 @@ def test_bad_input(quiet, single):
     free = next(p.name for p in one.parameters if p.prior is None and p.loose is None)
     with pytest.raises(DataError, match=r"says nothing of .*, which has a value of its own there"):
         stack([one, deaf, three], {free: {"per": "night"}})
+    scattered = dataclasses.replace(single, errors_from="residuals")
     with pytest.raises(DataError, match="do not explain its scatter"):
-        stack([dataclasses.replace(single, errors_from="residuals")])
+        stack([scattered])
+    # The file to leave out is named, not what was typed into it.
+    kept = dataclasses.replace(Calibration.from_fit(scattered), path="RUN7/calibration.fits")
+    with pytest.raises(DataError, match=r"errors of RUN7/calibration\.fits do not explain"):
+        stack([one, two], like=kept)
 
 
 @pytest.fixture(scope="module")

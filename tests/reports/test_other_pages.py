@@ -76,6 +76,51 @@ def test_an_epoch_whose_own_fit_is_not_trusted_says_so(tmp_path):
     assert "cannot distinguish it from pedestal" in text
 
 
+def test_an_epoch_that_cannot_be_compared_shows_no_numbers_and_one_of_the_same_data_no_zeros(tmp_path):
+    numbers = dict.fromkeys(
+        ("p_value", "test", "directions", "largest", "visible", "chi2_old", "star_errors")
+    )
+    document = {
+        "verdict": "The new data are not explained", "fits": None, "moved": [], "new_trusted": False,
+        "warnings": ["χ²/dof = 5.99"], "diagnosis": None,
+    } | numbers  # fmt: skip
+    (tmp_path / "epoch.json").write_text(json.dumps(document))
+    text = Page(render_other(tmp_path, "epoch")[0]).text
+    assert "The new data are not explained" in text
+    assert "significant" not in text
+    assert "would bias" not in text
+    assert "What has moved" not in text
+    moved = {"name": "half1.wedge", "unit": "rad", "old": -0.23, "new": -0.23, "error": 1e-9, "z": 0.0}
+    document = {
+        "fits": True, "p_value": 1.0, "moved": [moved], "same": True,
+        "star_errors": {"p": {"median": 9.5e-15, "max": 1e-13}},
+    }  # fmt: skip
+    (tmp_path / "epoch.json").write_text(json.dumps(document))
+    page = Page(render_other(tmp_path, "epoch")[0])
+    assert "nothing can have moved" in page.text
+    assert "e-15" not in page.text
+    assert "What has moved" not in page.text
+
+
+def test_the_change_and_its_size_stand_at_the_head_of_the_page_of_an_epoch(tmp_path):
+    largest = {
+        "name": "hwp1_axis.angle",
+        "size": 0.0507,
+        "error": 0.0006,
+        "unit": "deg",
+        "z": 83.5,
+        "alone": True,
+    }
+    document = {
+        "fits": False, "p_value": 0.0, "moved": [], "new_trusted": True, "added": ["hwp1_axis"], "largest": largest,
+        "star_errors": {"p": {"median": 0.013, "max": 0.2}},
+    }  # fmt: skip
+    (tmp_path / "epoch.json").write_text(json.dumps(document))
+    text = Page(render_other(tmp_path, "epoch")[0]).text
+    assert "The new data need hwp1_axis, which the old model lacks." in text
+    assert "hwp1_axis.angle by 0.05070 ± 0.00060 deg, if it alone has changed" in " ".join(text.split())
+
+
 def test_page_of_a_survey(tmp_path):
     """How good tonight, what has changed and what was done in the order of time, each night with its own trust."""
     found = {

@@ -20,9 +20,11 @@ from walop_jax.calibration.certify import certify, validity
 from walop_jax.commands.program import app
 from walop_jax.data import write_calibration_set
 from walop_jax.fit.model_file import model_for
-from walop_jax.fit.refit import refit
+from walop_jax.fit.refit import fit, refit, with_honest_errors
 from walop_jax.fit.verdict import Doubt, Quality
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import effect_by_name
+from walop_jax.model.specification import with_effects
 from walop_jax.science.epoch import MeasuredChange, epoch, fit_like
 from walop_jax.simulation.simulate import simulate
 
@@ -133,6 +135,10 @@ def test_an_instrument_that_has_not_changed_still_fits(first):
         for k in range(6)
     ]
     assert all(entry.fits for entry in found)
+    for entry in found:  # the smaller of two p-values, as the smallest of two
+        smaller = min(stats.chi2.sf(entry.test, entry.directions), entry.largest.p_value)
+        assert entry.p_value == pytest.approx(1.0 - (1.0 - smaller) ** 2)
+        assert entry.p_value < 1.0
     k = found[0].directions
     # The old calibration is one and the same: half of the variance of T is common to the six.
     assert np.mean([entry.test for entry in found]) == pytest.approx(
@@ -152,6 +158,48 @@ def test_a_change_is_found_and_named(first):
     assert found.moved[0].new - found.moved[0].old == pytest.approx(5e-4, abs=4 * found.moved[0].error)
     assert found.chi2_old > found.chi2_new + 100
     assert found.star_errors["u"]["max"] > 0.05
+
+
+def test_a_camera_that_has_become_fainter_is_found_with_its_size(first):
+    truth, old = first
+    throughput = truth.throughput
+    fainter = throughput.coefficients.at[1, 0].add(-0.01)
+    dim = dataclasses.replace(truth, throughput=dataclasses.replace(throughput, coefficients=fainter))
+    found = epoch(old, fit_like(old, simulate(SMALL, seed=210, instrument=dim).calset).judged())
+    assert found.fits is False
+    moved = {entry.name: entry for entry in found.moved}["throughput.n1.p00"]
+    assert moved.new - moved.old == pytest.approx(-0.01, abs=4 * moved.error)
+
+
+def test_a_plate_that_has_turned_is_a_change_and_not_errors_that_became_large(first):
+    """The old model lacks an axis: its fit of the new data is nothing to compare with, that of a larger one is."""
+    truth, old = first
+    turned = dataclasses.replace(effect_by_name("hwp1_axis").neutral(SMALL.context()), angle=np.asarray(0.05))
+    calset = simulate(SMALL, seed=220, instrument=truth, effects=[turned]).calset
+    unlike = fit_like(old, calset).judged()
+    assert not unlike.trusted
+    found = epoch(old, unlike)
+    assert found.fits is None
+    assert not found.holds
+    document = found.document()
+    numbers = ("p_value", "test", "largest", "visible", "chi2_old", "chi2_new", "star_errors")
+    assert [document[name] for name in numbers] == [None] * len(numbers)
+    assert document["moved"] == ()
+    assert document["verdict"] == "The new data are not explained"
+    assert document["verdict"] in found.display().text()
+    assert len(found.to_table()) == 0
+
+    larger = with_effects(unlike.model, [turned], SMALL.context())
+    found = epoch(old, with_honest_errors(fit(Likelihood.of(calset, larger))).judged())
+    assert found.fits is False
+    assert found.added == ("hwp1_axis",)
+    assert found.largest.name == "hwp1_axis.angle"
+    assert found.largest.unit == "deg"
+    assert found.largest.size == pytest.approx(0.05, abs=4 * found.largest.error)
+    assert found.largest.z == pytest.approx(found.largest.size / found.largest.error)
+    assert found.chi2_old > found.chi2_new + 100
+    assert "HAS CHANGED" in found.display().text()
+    assert "hwp1_axis.angle by 0.0" in found.display().text()
 
 
 def test_one_number_that_has_changed_by_five_standard_errors_is_not_hidden_by_all_others(first):

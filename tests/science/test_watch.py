@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from studies import watch as study
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.data.catalogue import read_catalogue
+from walop_jax.data.user_tables import in_memory
 from walop_jax.reports.survey_figures import watch_figure
-from walop_jax.science.star_residuals import noise_scale
-from walop_jax.science.watch import grouped, with_rivals
+from walop_jax.science.star_residuals import noise_scale, normal_matrix
+from walop_jax.science.watch import Watching, dated, grouped, with_rivals
 
 
 @pytest.fixture(scope="module")
@@ -125,13 +129,37 @@ def test_scale_of_noise_is_that_of_the_many():
 
 
 def test_exposure_groups_are_joined_where_there_are_many():
-    time = np.array([3.0, 1.0, np.nan, 2.0, 2.0])
+    time = np.array([3.0, 1.0, 2.0, 2.0])
     times, group = grouped(time)
     assert times.tolist() == [1.0, 2.0, 3.0]
-    assert group.tolist() == [2, 0, 0, 1, 1]
+    assert group.tolist() == [2, 0, 1, 1]
     times, group = grouped(np.arange(10.0), most=4)
     assert times.tolist() == [0.0, 3.0, 6.0, 9.0]
     assert group.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3]
+
+
+def test_dates_that_are_there_stay_and_what_has_none_is_left_out_by_name(vectors):
+    def catalogue(*mjd):
+        counts = np.full((len(mjd), 4), 1e6)
+        rows = {"ID": np.arange(len(mjd)) // 2, "X": np.zeros(len(mjd)), "Y": 0.01 * np.arange(len(mjd))}
+        rows |= {"N": counts, "N_ERR": np.sqrt(counts), "MJD": np.array(mjd)}
+        return read_catalogue(in_memory(rows), vectors.calibration.model.template.patched())
+
+    nan = np.nan
+    given = catalogue(60000.1, 60000.1, 60001.2), catalogue(nan, nan), catalogue(nan, 60003.0, 60004.0)
+    kept, remarks = dated(given, ["a.fits", "b.csv", "c.fits"])
+    assert [one.time.tolist() for one in kept] == [[60000.1, 60000.1, 60001.2], [60003.0, 60004.0]]
+    assert kept[1].star.tolist() == [0, 1]
+    assert kept[1].points.y.tolist() == [0.01, 0.02]
+    assert len(kept[1].points.settings) == len(kept[1].counts) == 2
+    assert remarks[0].startswith("b.csv, MJD: no row has a time")
+    assert remarks[1].startswith("c.fits, MJD: 1 of 3 rows have no time")
+    # Where none has, each is a group of its own, in their order.
+    kept, remarks = dated([given[1], given[1]], [])
+    assert [one.time.tolist() for one in kept] == [[0.0, 0.0], [1.0, 1.0]]
+    assert remarks == ()
+    watch = study.watched(100, 4)
+    assert "b.csv" in " ".join(dataclasses.replace(watch, remarks=("b.csv, MJD: none",)).warnings)
 
 
 def test_optics_that_may_have_changed_are_added_at_neutral(calibration):
@@ -140,3 +168,75 @@ def test_optics_that_may_have_changed_are_added_at_neutral(calibration):
     kept = [there.model.index(name) for name in calibration.model.names]
     np.testing.assert_array_equal(there.values[kept], calibration.values)
     assert np.all(there.sigma[np.setdiff1d(np.arange(len(there.values)), kept)] < 1e-8)
+
+
+BOTH = (0, 1)  # O1 and E1: the cameras of an arm
+WAYS = {
+    "arm": study.step(-0.01, BOTH),
+    "gradient": study.gradient(0.01, BOTH, 50.0),
+    "spot": study.spot(-0.02, BOTH, 0.1, 0.05, 0.1),
+}
+
+
+@pytest.mark.parametrize("kind", WAYS)
+def test_an_arm_a_gradient_and_a_spot_are_told_as_that(kind, vectors):
+    """Where a plate of the optics described the stars better than single cameras, by amounts that none can have."""
+    (change,) = study.watched(400, 4, WAYS[kind]).changes
+    best = change.best
+    assert (best.kind, best.name, change.camera) == (kind, "O1+E1", None)
+    assert change.between[0] <= 60000.0 + study.START <= change.between[1]
+    if kind == "arm":
+        assert best.size == pytest.approx(-0.01, abs=5 * best.error)
+    elif kind == "gradient":
+        # 1 % at 0.28 degrees; sizes are those at the star that lies farthest out along X or Y.
+        assert best.size == pytest.approx(0.01, abs=5 * best.error + 1e-4)
+        assert best.place[0] == pytest.approx(50.0, abs=4.0)
+    else:
+        assert np.hypot(best.place[0] - 0.1, best.place[1] - 0.05) < 0.03
+        assert best.size == pytest.approx(-0.02, rel=0.25)
+    for entry in change.alike:
+        if entry.kind == "optics":
+            _, width = vectors.calibration.model[entry.name].prior
+            assert abs(entry.size) <= 10.0 * width
+
+
+def test_three_stars_that_lie_off_are_no_spot_and_no_optics():
+    def odd(night, x, y):
+        change = np.zeros((len(x), 4))
+        change[[3, 17, 30]] = 0.1 * np.random.default_rng(5).standard_normal((3, 4))
+        return change
+
+    watch = study.watched(100, 2, odd)
+    assert watch.holds
+    assert not watch.changes
+
+
+def test_a_change_that_nothing_within_its_range_describes_has_no_name(monkeypatch):
+    """The plate that has changed may do so by a thousandth of the width of its prior only."""
+    monkeypatch.setattr("walop_jax.science.watch_readings.FARTHEST", 1e-3)
+    watch = study.watched(400, 7, turned=("half2.plate.mgf2", 3.0))
+    assert not watch.holds
+    assert any(change.best.kind == "unnamed" and change.camera is None for change in watch.changes)
+    assert not any(entry.kind == "optics" for change in watch.changes for entry in change.alike)
+    assert any("no camera, arm or place of the field" in sentence for sentence in watch.warnings)
+
+
+def test_what_single_exposures_cannot_see_is_nothing_and_not_rounding(vectors):
+    """q and u of the stars are free: whatever does to all counts what q does has no information, of either sign."""
+    stars = study.watching(120, 3, study.step(0.01), plates=(None,)).stars
+    ones, like_q = np.ones(len(stars.photon)), stars.tangent[:, 0]
+    matrix, score = normal_matrix(
+        stars, stars.residual, lambda part, _: part.tangent.swapaxes(1, 2), ones, ones
+    )
+    assert not matrix.any()
+    assert not score.any()
+    # The same as a number of the optics: it is not seen, in no group, and no history of it is a change.
+    plain = stars.plain.copy()
+    number = int(np.flatnonzero(np.abs(plain).max(axis=(0, 1)) > 0)[0])
+    plain[..., number] = 1e-3 * like_q
+    watching = Watching(dataclasses.replace(stars, plain=plain), vectors)
+    size, error, _ = watching.answers(*watching.scan(stars.residual, ones, ones))
+    column = [reading.name for reading in watching.readings.listed].index(vectors.named[number][0])
+    assert np.isinf(error[:, column]).all()
+    assert not size[:, column].any()
+    assert (error > 0).all()

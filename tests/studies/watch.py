@@ -17,6 +17,7 @@ import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -42,7 +43,8 @@ SIZES = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
 STARS = (100, 600, 5000)
 DATED = 1.8
 """Times the bound: from there on a step is dated to one night, and told from a drift, as often as it is found there."""
-Gains = Callable[[int], np.ndarray]
+Gains = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""Change of the four cameras (star, camera) in nights, and at X and Y (deg)."""
 
 
 @functools.cache
@@ -61,15 +63,15 @@ def _true_vectors(x: np.ndarray, y: np.ndarray, plate: float | None, change: np.
     return v.coloured(setting, x, y, teff) + slopes @ change
 
 
-def watched(
+def watching(
     stars: int,
     seed: int,
     gains: Gains | None = None,
     turned: tuple[str, float] | None = None,
     plates: tuple[float | None, ...] = PLATES,
     scatter: float = 1.0,
-) -> Watch:
-    """The watch of one catalogue: `gains` of the cameras by night, or a parameter `turned` from `START` on.
+) -> Watching:
+    """One catalogue, ready to be asked: `gains` of the cameras by night, or a parameter `turned` from `START` on.
 
     `scatter` is the noise over what N_ERR says.
     """
@@ -88,7 +90,7 @@ def watched(
             a = np.where((night >= START)[:, None, None], _true_vectors(x, y, plate, moved), a)
         counts = 4e6 * 10 ** rng.uniform(-0.5, 0.5, stars)[:, None] * np.einsum("pks,ps->pk", a, s)
         if gains is not None:
-            counts *= 1.0 + np.stack([gains(n) for n in range(NIGHTS)])[night]
+            counts *= 1.0 + gains(night, x, y)
         error = np.sqrt(counts + 100.0)
         there = {
             "ID": np.arange(stars),
@@ -103,17 +105,40 @@ def watched(
     calibration = v.calibration
     catalogue = read_catalogue(table, calibration.model.template.patched(), always_in=calibration.always_in)
     left = StarResiduals.joined(residuals_of(v, catalogue, 10**9))
-    return Watching(left, v.instrument.cameras.names, v.named, v.root).watch()
+    return Watching(left, v)
 
 
-def step(size: float, camera: int = 0) -> Gains:
-    """One camera brighter from `START` on."""
-    return lambda night: np.where(np.arange(4) == camera, size * (night >= START), 0.0)
+@functools.wraps(watching)
+def watched(*given: Any, **options: Any) -> Watch:
+    """The watch of one catalogue."""
+    return watching(*given, **options).watch()
+
+
+def _of(cameras: int | tuple[int, ...], change: np.ndarray) -> np.ndarray:
+    return change[:, None] * np.isin(np.arange(4), cameras)
+
+
+def step(size: float, camera: int | tuple[int, ...] = 0) -> Gains:
+    """Cameras brighter from `START` on."""
+    return lambda night, x, y: _of(camera, size * (night >= START))
 
 
 def drift(size: float, camera: int = 0) -> Gains:
     """One camera brighter by `size` in the last night, evenly since the first."""
-    return lambda night: np.where(np.arange(4) == camera, size * night / (NIGHTS - 1), 0.0)
+    return lambda night, x, y: _of(camera, size * night / (NIGHTS - 1))
+
+
+def gradient(size: float, camera: int | tuple[int, ...], angle: float) -> Gains:
+    """Cameras brighter from `START` on by `size` at 0.28 degrees from the middle, at an angle (deg) from X to Y."""
+    way = np.deg2rad(angle)
+    return lambda night, x, y: _of(
+        camera, size * (night >= START) * (x * np.cos(way) + y * np.sin(way)) / 0.28
+    )
+
+
+def spot(size: float, camera: int | tuple[int, ...], x0: float, y0: float, radius: float) -> Gains:
+    """Cameras brighter from `START` on within a disc of the field (deg)."""
+    return lambda night, x, y: _of(camera, size * (night >= START) * (np.hypot(x - x0, y - y0) < radius))
 
 
 @dataclasses.dataclass

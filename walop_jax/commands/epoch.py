@@ -37,15 +37,15 @@ def epoch(
 ) -> Outcome[Epoch]:
     """Fit new calibration sets and compare with an old calibration: is the instrument still the same?
 
-    Lists the parameters by how far they have moved, tests all of them together, and says how far off stars would be if
-    the old calibration were still used. The new fit is that of the old model: plates, effects, priors and what is
-    held. Where that does not explain the new data and did explain the old ones, what is missing is looked for as
-    walop-jax diagnose does.
+    Says what has changed by how much, and how far off stars would be if the old calibration were still used; lists the
+    parameters by how far they have moved, and tests all of them together. The new fit is that of the old model: plates,
+    effects, priors and what is held. Where that does not explain the new data and did explain the old ones, what is
+    missing is looked for as walop-jax diagnose does, and the old calibration is compared with the model found.
 
-    Exit code 0 only where the old calibration still holds; 3 where something has moved, or where the new fit is not
-    to be trusted.
+    Exit code 0 only where the old calibration still holds; 3 where something has moved, or where the new data are not
+    explained.
 
-    In Python: an `Epoch`; what is missing is looked for only with `output`.
+    In Python: an `Epoch`.
 
     >>> walop.epoch("RUN", "new.fits").holds  # doctest: +SKIP
     """
@@ -64,7 +64,7 @@ def epoch(
         result = examined(fit_like(held, calset))
         found = compared(held, result)
     lacking = None
-    if not found.new_trusted and held.verdict.trusted and (output is not None or job.typed):
+    if found.fits is None:
         job.tell("looking for what the new fit lacks", "lacking")
         # Other readings of the data have been tried when its fit was examined.
         lacking = diagnose(
@@ -75,15 +75,16 @@ def epoch(
             seed=job.seed,
             progress=job.progress,
         )
-
-    same = {entry.sha256 for entry in calset.inputs} == {entry.sha256 for entry in held.inputs}
+        if lacking is not None and lacking.after.trusted:
+            result = lacking.after
+            found = compared(held, result)
 
     def text() -> str:
         shown = found.display().text()
         if lacking is None:
             return shown
         named = ", ".join(step.effect for step in lacking.steps) or "nothing that has a name"
-        return f"{shown}\nwhat the new fit lacks: {named} ({lacking.verdict})"
+        return f"{shown}\nwhat the old model lacks: {named} ({lacking.verdict})"
 
     def files() -> Writers:
         product = Calibration.from_fit(result)
@@ -105,13 +106,6 @@ def epoch(
         text,
         files,
         saved_as=OUTPUTS[1],
-        warnings=(
-            *(
-                ["these are the data from which the old calibration was made: nothing can have moved"]
-                if same
-                else []
-            ),
-            *(f"the new fit: {sentence}" for sentence in found.warnings),
-        ),
+        warnings=[f"the new fit: {w}" if w in result.warnings else w for w in found.warnings],
         trusted=found.holds,
     )

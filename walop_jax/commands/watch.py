@@ -31,9 +31,10 @@ def watch(
     """Say when a calibration ceased to hold, from the stars of many nights: no calibration exposures are needed.
 
     Four cameras have three unknowns: one number of every row is left. Rows of one MJD are an exposure group; catalogues
-    without MJD are a group each, in their order. Steps, drifts and single exposures of every camera are looked for,
-    with their size, date, and the smallest that would have been seen. Stars that are seen at several settings of the
-    plate or the rotator tell which camera it is; others hardly can. What the optics may have done as well is told.
+    without MJD are a group each, in their order. Steps, drifts and single exposures of cameras and arms are looked for,
+    as a whole, growing over the field, or in a spot of it, with their size, date, and the smallest that would have been
+    seen. Stars that are seen at several settings of the plate or the rotator tell which camera it is; others hardly
+    can. What the optics may have done as well is told.
 
     Exit code 0 only where the calibration still holds, 3 where it does not.
 
@@ -52,11 +53,15 @@ def watch(
     instrument, always_in = held.model.template.patched(), held.always_in
     rows = [read_catalogue(table_of(entry, {}), instrument, always_in=always_in) for entry in given]
     job.tell("tabulating the analysis vectors", "tabulating")
-    names = ", ".join(str(entry) for entry in given if isinstance(entry, str | os.PathLike))
-    with errors_naming(names or None):
-        found = watched(held, rows, force=force)
+    names = [
+        str(entry) if isinstance(entry, str | os.PathLike) else f"catalogue {number}"
+        for number, entry in enumerate(given, start=1)
+    ]
+    files = [name for name, entry in zip(names, given, strict=True) if isinstance(entry, str | os.PathLike)]
+    with errors_naming(", ".join(files) or None):
+        found = watched(held, rows, names=names, force=force)
 
-    def files() -> Writers:
+    def written() -> Writers:
         table = found.to_table()
         return {
             OUTPUTS[1]: lambda path: table.write(path, format="fits"),
@@ -66,7 +71,7 @@ def watch(
     return Outcome(
         found,
         lambda: {"product": held.content_hash()} | found.document(),
-        files=files,
+        files=written,
         saved_as=OUTPUTS[0],
         warnings=held.warnings,
         trusted=found.holds,

@@ -224,18 +224,15 @@ class Catalogue:
     def __len__(self) -> int:
         return len(self.star)
 
-    def of_stars(self, chosen: Bool[np.ndarray, " s"]) -> Catalogue:
-        """The rows of some of the stars."""
-        rows, points = np.flatnonzero(chosen[self.star]), self.points
-        there = FieldPoints(points.x[rows], points.y[rows], points.settings[rows], points.outside[rows])
-        others = {
-            f.name: getattr(self, f.name)
-            for f in dataclasses.fields(self)
-            if f.name not in ("points", "remarks")
-        }
-        cut = {name: values[rows] for name, values in others.items()}
-        cut["star"] = np.unique(cut["star"], return_inverse=True)[1].reshape(-1)
-        return Catalogue(points=there, **cut)
+    def of_rows(self, keep: Bool[np.ndarray, " n"]) -> Catalogue:
+        """Some of the rows; stars are numbered anew."""
+        if keep.all():
+            return self
+        whole = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("points", "remarks")}
+        p = self.points
+        points = FieldPoints(p.x[keep], p.y[keep], p.settings[np.flatnonzero(keep)], p.outside[keep])
+        some = Catalogue(points=points, **{name: values[keep] for name, values in whole.items()})
+        return dataclasses.replace(some, star=np.unique(some.star, return_inverse=True)[1].reshape(-1))
 
 
 def read_catalogue(

@@ -52,6 +52,7 @@ from walop_jax.model.parameters import field_declarations
 from walop_jax.model.plan import hours_of
 from walop_jax.model.ray import CONDITIONS
 from walop_jax.model.responses import acts
+from walop_jax.sky.nights import first_of_nights
 
 DEFAULT_WIDTH = 1.0
 FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median
@@ -179,7 +180,6 @@ def fringes_of(change: Change) -> Iterator[Sentence]:
 
 LINEAR = ("diattenuation", "retardance")
 ALONE = ("diattenuation v", "retardance v", "depolarisation")
-NIGHT = 8.0  # hours without an exposure that part two nights
 STEPS, FEW = 16, 18  # times of a step that are looked at first; times of which all spells are
 AFTER = 0.5  # hours behind the last exposure that a step ends
 ROUNDED = 1e-4  # hours, of times that are written into a description
@@ -357,7 +357,7 @@ class _Asked:
         if not self.hours:
             return
         hours = np.sort(hours_of(self.exposures))
-        first = np.flatnonzero(np.diff(hours, prepend=-np.inf) > NIGHT)
+        first = first_of_nights(hours / 24.0)
         if len(first) < 2:
             return
         for start, stop in itertools.pairwise([*first, len(hours)]):

@@ -41,6 +41,7 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.score import local_p
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import STATED, Structure
+from walop_jax.sky.nights import night_of
 
 ALARM = 1e-3
 """Probability that noise alone raises a doubt, all groupings together."""
@@ -160,7 +161,7 @@ def groupings(design: Design, *, pixels: bool = False) -> Iterator[_Grouping]:
     positions = [
         np.where(at.inside, at.angle, np.nan) for at in map(e.position, design.fit.likelihood.plan.moving)
     ]
-    night = np.floor(e.mjd + calset.site.longitude / 360.0 - 0.5)
+    night = night_of(e.mjd, calset.site.longitude)
     source = calset.intensities.block(0, len(points)).source
     seen = [np.zeros(used.shape, int)]
     for name, words, place, features in (

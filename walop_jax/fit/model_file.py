@@ -239,7 +239,7 @@ def base_model(
     for i in model.positions(THROUGHPUT):
         p = model.parameters[i]
         model = model.change(p.name, scale=p.scale * level / LEVEL, loose=level)
-    for name in _gauges(model, has_known_flux(calset)):
+    for name in gauges(model, has_known_flux(calset)):
         model = model.change(name, free=False)
     if not ((calset.exposures.kind == "moon") & ~calset.exposures.clp_in).any():
         model = model.change("sky.depolarisation", free=False)
@@ -261,7 +261,7 @@ def _level(calset: CalibrationSet) -> float:
     return LEVEL
 
 
-def _gauges(model: Model, flux_known: bool) -> list[str]:
+def gauges(model: Model, flux_known: bool) -> list[str]:
     """Parameters that fluxes take up: the scale of the throughput, or all that the cameras of an arm have in common."""
     cameras = model.template.cameras
     if flux_known and not cameras.split:

@@ -23,7 +23,7 @@ import dataclasses
 import fnmatch
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -178,8 +178,12 @@ def _law(entry: Mapping[str, Any]) -> Law:
     return Law(words, at=dates, bad=bad, **numbers)
 
 
-def resolved(laws: Laws, names: Sequence[str], candidates: Sequence[str]) -> tuple[Law | None, ...]:
+def resolved(
+    laws: Laws, names: Sequence[str], candidates: Sequence[str], alone: Collection[str] = ()
+) -> tuple[Law | None, ...]:
     """A law for every parameter, then for every candidate (None: absent); an exact name wins over a group.
+
+    Candidates that stand `alone` are in no group.
 
     Raises ValueError for a name or group that nothing bears.
     """
@@ -188,7 +192,7 @@ def resolved(laws: Laws, names: Sequence[str], candidates: Sequence[str]) -> tup
         for key, law in laws.items():
             if (key in found) != exact:
                 continue
-            some = [key] if exact else fnmatch.filter(found, key)
+            some = [key] if exact else [n for n in fnmatch.filter(found, key) if n not in alone]
             if not some:
                 raise ValueError(f"[law]: there is no parameter {key!r}; {nearest(key, found)}")
             found |= dict.fromkeys(some, law)

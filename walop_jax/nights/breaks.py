@@ -10,14 +10,15 @@ over any forest of pairs (Hunter 1976; Worsley 1982, Biometrika 69, 297). Steps 
 boundaries are pairs, and each bad night with a step beside it: a step less the next one is the night between, and
 the informations give the correlations, ρ = (I_b + I_(b+1) − I_night)/2√(I_b I_(b+1)). z is normal, as the equations are
 linear. Then the break becomes a law, and the search goes on. Its date is that of the largest z² of its parameter; dates
-within `DATES` of that may be it as well. Others whose z² stays within `RIVAL` look alike.
+within `DATES` of that may be it as well. Others whose z² stays within `RIVAL` look alike; the break becomes a law of
+the best of them that stars can be corrected for.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +38,8 @@ SURE = 5.0  # standard errors that keep one name from another
 MOST = 40  # breaks that are looked for
 ROUNDS = 3  # in which all are named again
 KINDS = ("step", "bad night", "drift")
+Carried = Callable[[str], bool]
+"""Whether stars can be corrected for a candidate."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 _FARTHEST = 40.0  # of the tail in units of 1/u, beyond which nothing is left of it
 
@@ -85,11 +88,11 @@ class Break:
                 known[name] = tuple(value)
         return cls(**known)
 
-    def law(self, law: Law | None) -> Law:
-        """A law with the break; None is that of a candidate, which is 0 without it."""
+    def law(self, law: Law | None, *, gauge: bool = False) -> Law:
+        """A law with the break; None is that of a candidate, which is 0 without it, or a gauge, which has a value."""
         if self.kind == "drift":
             # A candidate that drifts has a value as well.
-            return (law or Law()).adding("linear")
+            return (law or Law(() if gauge else ("shared",))).adding("linear")
         law = law or Law(())
         return (
             law.adding("step", self.date)
@@ -180,13 +183,19 @@ def solved(data: Together, laws: Sequence[Law | None]) -> Solution:
 
 
 def find(
-    data: Together, laws: Sequence[Law | None], catalogue: Sequence[type[Effect]] = EFFECTS
+    data: Together,
+    laws: Sequence[Law | None],
+    catalogue: Sequence[type[Effect]] = EFFECTS,
+    carried: Carried | None = None,
 ) -> tuple[tuple[Break, ...], tuple[Law | None, ...], Solution]:
-    """The breaks of a series, the laws with them, and the solution under these."""
+    """The breaks of a series, the laws with them, and the solution under these.
+
+    Of names that explain a break as well as each other the first that is `carried` to stars is its law (None: all are).
+    """
     found: list[Break] = []
     while True:
         solution = solved(data, with_breaks(data, laws, found))
-        one = _largest(data, solution, CHANCE, catalogue)
+        one = _largest(data, solution, CHANCE, catalogue, carried)
         if one is None or len(found) == MOST:
             break
         found.append(one)
@@ -195,7 +204,7 @@ def find(
         before = [(one.kind, one.name, one.night) for one in found]
         for k in range(len(found)):
             rest = with_breaks(data, laws, found[:k] + found[k + 1 :])
-            found[k] = _largest(data, solved(data, rest), 1.1, catalogue) or found[k]
+            found[k] = _largest(data, solved(data, rest), 1.1, catalogue, carried) or found[k]
         if [(one.kind, one.name, one.night) for one in found] == before:
             break
     for k, one in enumerate(found):
@@ -223,38 +232,48 @@ def with_breaks(data: Together, laws: Sequence[Law | None], found: Sequence[Brea
     changed = list(laws)
     for one in found:
         i = data.names.index(one.name)
-        changed[i] = one.law(changed[i])
+        changed[i] = one.law(changed[i], gauge=bool(data.gauge[i]))
     return tuple(changed)
 
 
 def _other_shapes(data: Together, laws: Sequence[Law | None]) -> list[int]:
     """Candidates that are another shape of an effect that the model or a law has: a model holds one shape alone."""
     taken: dict[str, str | None] = {}
-    for name, law, has in zip(data.names, laws, data.has_value, strict=True):
+    beyond = data.has_value | data.gauge
+    for name, law, has in zip(data.names, laws, beyond, strict=True):
         if has:
             taken[part_of(name)] = None
         elif law is not None:
             taken.setdefault(part_of(name), shape_of(name))
     return [
-        i for i, (name, has) in enumerate(zip(data.names, data.has_value, strict=True))
+        i for i, (name, has) in enumerate(zip(data.names, beyond, strict=True))
         if not has and taken.get(part_of(name), shape_of(name)) != shape_of(name)
     ]  # fmt: skip
 
 
 def _largest(
-    data: Together, solution: Solution, chance: float, catalogue: Sequence[type[Effect]]
+    data: Together,
+    solution: Solution,
+    chance: float,
+    catalogue: Sequence[type[Effect]],
+    carried: Carried | None,
 ) -> Break | None:
-    """The change that stands out most; None where chance does as well."""
+    """The change that stands out most, of those alike the first that is carried; None where chance does as well."""
     tried = Tried.of(solution).without(_other_shapes(data, solution.system.laws))
-    kind, cell, i = at = tried.largest()
-    z, scale = tried.z(kind), float(data.equations.scale[i])
+    kind, cell, i = tried.largest()
+    z = tried.z(kind)
     p_value = tried.chance(abs(float(z[cell, i])))
     if p_value >= chance:
         return None
-    best, p = float(z[cell, i] ** 2), data.parameters[i]
+    low = 0 if kind == 2 else max(cell - 1, 0)
+    near = z[low : None if kind == 2 else cell + 2] ** 2
+    alike = [int(j) for j in np.argsort(-near.max(axis=0)) if near[:, j].max() > z[cell, i] ** 2 - RIVAL]
+    chosen = next((j for j in alike if carried is None or carried(data.names[j])), i)
+    if chosen != i:
+        i, cell = chosen, low + int(near[:, chosen].argmax())
+    at, rivals = (kind, cell, i), [j for j in alike if j != i]
+    best, p, scale = float(z[cell, i] ** 2), data.parameters[i], float(data.equations.scale[i])
     first, span, before, after = _dates(data, solution, kind, cell, z[:, i] ** 2 > best - DATES)
-    near = (z if kind == 2 else z[max(cell - 1, 0) : cell + 2]) ** 2
-    rivals = [int(j) for j in np.argsort(-near.max(axis=0)) if j != i and near[:, j].max() > best - RIVAL]
     members = {part_of(data.names[j]) for j in (i, *rivals)}
     said = [effect.separated_by for effect in catalogue if effect.name in members and effect.separated_by]
     information = float(tried.information[kind][cell, i])

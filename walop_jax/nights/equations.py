@@ -4,10 +4,12 @@
 
 of the data alone: priors are laid on when nights are stacked, once. J holds the derivatives of the normalised residuals
 r, fluxes eliminated, with respect to the free parameters and to the amplitudes of effects that the model lacks (at 0):
-what is not in the model can be asked for afterwards without the data.
+what is not in the model can be asked for afterwards without the data. So can the throughput that is held because the
+fluxes take it up: held in every night it is no gauge of what changes between them, as its camera may be the one that
+does.
 
-Nights follow from the exposures: from noon to noon of the mean Sun at the site; where the longitude is not known, a gap
-of eight hours parts two nights. A set of several nights is taken apart; each file and night is a unit of its own.
+Nights follow from the exposures (`sky.nights`). A set of several nights is taken apart; each file and night is a unit
+of its own.
 """
 
 from __future__ import annotations
@@ -20,9 +22,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet, Exposures, Site
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.model_file import SKY_AND_STARS, header_of
+from walop_jax.fit.model_file import SKY_AND_STARS, gauges, header_of
 from walop_jax.fit.search import nearer
 from walop_jax.io.errors import DataError, fail
 from walop_jax.likelihood import engine
@@ -35,8 +38,8 @@ from walop_jax.model.parameters import Parameter, leaves
 from walop_jax.model.specification import Model, effect_context
 from walop_jax.nights.algebra import Equations
 from walop_jax.sky.moon import local_sidereal_time
+from walop_jax.sky.nights import night_of
 
-GAP = 8.0  # hours without an exposure that part two nights where the longitude of the site is not known
 OF_ONE_SET = ("moon_patch", "standard_outlier")
 """Effects that belong to single exposures, or are parameters of the base model already: no candidates."""
 MOST_SHAPES = (
@@ -99,13 +102,7 @@ def night_numbers(mjd: Float[np.ndarray, " e"], site: Site) -> Int[np.ndarray, "
             f"[EXPOSURES] MJD: not given in {int(bad.sum())} of {len(mjd)} exposures, so that they belong to no night; "
             "add the times (UTC)"
         )
-    if np.isfinite(site.longitude):
-        return np.floor(mjd + site.longitude / 360.0 - 0.5).astype(int)
-    order = np.argsort(mjd, kind="stable")
-    first = np.flatnonzero(np.diff(mjd[order], prepend=-np.inf) > GAP / 24.0)
-    label = np.empty(len(mjd), int)
-    label[order] = np.repeat(np.floor(mjd[order][first]), np.diff(np.append(first, len(mjd))))
-    return label
+    return night_of(mjd, site.longitude).astype(int)
 
 
 def check_clock(exposures: Exposures, site: Site) -> None:
@@ -150,13 +147,13 @@ def split(calset: CalibrationSet) -> Iterator[tuple[int, CalibrationSet]]:
 
 Change = tuple[tuple[float, Any], ...]
 Candidates = dict[str, tuple[Parameter, Change]]
-"""Amplitudes beyond a model by name, each with the change that it is to first order."""
+"""Amplitudes beyond a model by name, each with the change that it is to first order; a gauge has none."""
 
 
 def candidates_of(
     model: Model, exposures: Exposures, catalogue: Sequence[type[Effect]] = EFFECTS
 ) -> Candidates:
-    """Amplitudes of the effects that a model lacks, by name, each with the change that it is to first order."""
+    """Amplitudes of the effects that a model lacks, and its gauges, with the change that each is to first order."""
     context, found = effect_context(model.template, exposures), {}
     for kind in catalogue:
         if kind.is_structural() or kind.name in (*OF_ONE_SET, *model.effect_names):
@@ -175,14 +172,21 @@ def candidates_of(
                         f"#{m}" if m else ""
                     )
                     found[name] = dataclasses.replace(leaf, name=name, part=kind.name, start=0.0), change
-    return found
+    held = [model[name] for name in gauges(model, flux_known=False) if not model[name].free]
+    return found | {p.name: (p, ()) for p in held}
 
 
 def with_candidates(
-    likelihood: Likelihood, values: Vector, changes: Sequence[Change], *, once: bool = True
+    likelihood: Likelihood, values: Vector, candidates: Candidates, *, once: bool = True
 ) -> tuple[float, Vector, Float[np.ndarray, "_ _"]]:
     """χ², gradient and matrix of the data of a table in free parameters and candidates (0: cannot be computed)."""
-    instrument, select = likelihood.model.instrument(values), likelihood.model.selection()
+    model = likelihood.model
+    changes = [change for _, change in candidates.values()]
+    held = [k for k, change in enumerate(changes) if not change]
+    instrument = model.instrument(values)
+    select = np.hstack(
+        [model.selection(), np.eye(len(model.names))[:, [model.index(list(candidates)[k]) for k in held]]]
+    )
     residuals, slopes = [], []
     for chunk in likelihood.points:
         residual, slope = engine.linearised_residuals(
@@ -192,11 +196,13 @@ def with_candidates(
         slopes.append(used_rows(slope, chunk) @ select)
     r, jacobian = np.concatenate(residuals), np.concatenate(slopes)
     if changes:
+        cut = len(model.free)
         columns = Columns(likelihood, values, once=once)
-        there = [k for k, change in enumerate(changes) if columns.has(change)]
+        there = [k for k, change in enumerate(changes) if change and columns.has(change)]
         added = np.zeros((len(r), len(changes)))
         added[:, there] = columns.of([changes[k] for k in there])
-        jacobian = np.hstack([jacobian, added])
+        added[:, held] = jacobian[:, cut:]
+        jacobian = np.hstack([jacobian[:, :cut], added])
     return float(r @ r), jacobian.T @ r, jacobian.T @ jacobian
 
 
@@ -209,7 +215,7 @@ def model_hash(model: Model) -> str:
     held = [
         f"{p.name} {p.tie or repr(p.start)}"
         for p in model.parameters
-        if (p.tie or not p.free) and not p.name.startswith(SKY_AND_STARS)
+        if (p.tie or not p.free) and p.part not in SKY_AND_STARS
     ]
     text = "\n".join([repr(header), model.template.description, *held])
     return hashlib.sha256(text.encode()).hexdigest()
@@ -234,7 +240,7 @@ def night_equations(
     """
     if isinstance(values, Mapping):
         values = np.array([values.get(p.name, p.start) for p in model.parameters])
-    source = ", ".join(str(entry.path) for entry in calset.inputs) or calset.origin
+    source = source_of(calset)
     found = []
     for evening, some in split(calset):
         if number not in (None, evening):
@@ -249,8 +255,7 @@ def night_equations(
             known, census = {}, terms.census
         else:
             known = candidates_of(model, some.exposures, model.catalogue) if changes is None else changes
-            every = [change for _, change in known.values()]
-            chi2, gradient, matrix = with_candidates(likelihood, there, every, once=once)
+            chi2, gradient, matrix = with_candidates(likelihood, there, known, once=once)
             census = likelihood.census
         e = some.exposures
         found.append(
@@ -269,7 +274,12 @@ def night_equations(
                 chi2=chi2,
                 parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in known.values())),
                 candidates=len(known),
-                reference=np.concatenate([there[model.free], np.zeros(len(known))]),
+                reference=np.concatenate(
+                    [
+                        there[model.free],
+                        [0.0 if change else there[model.index(name)] for name, (_, change) in known.items()],
+                    ]
+                ),
                 gradient=gradient,
                 matrix=matrix,
             )
@@ -298,6 +308,11 @@ def with_candidates_of(night: Night, before: Night) -> Night:
         gradient=np.append(night.gradient, along @ night.gradient + pull),
         matrix=np.block([[night.matrix, slope.T], [slope, slope @ along.T + beyond]]),
     )
+
+
+def source_of(data: CalibrationSet | Calibration) -> str:
+    """The files of a set, or of the data of a calibration; its origin if it comes from none."""
+    return ", ".join(str(entry.path) for entry in data.inputs) or data.origin
 
 
 def data_hash(calset: CalibrationSet) -> str:
@@ -354,6 +369,11 @@ class Together:
     def has_value(self) -> Bool[np.ndarray, " n"]:
         """True for parameters of the model, False for candidates."""
         return np.arange(len(self.parameters)) < len(self.parameters) - self.candidates
+
+    @property
+    def gauge(self) -> Bool[np.ndarray, " n"]:
+        """True for candidates that are held in the model, at a value: only changes of them can be seen."""
+        return ~self.has_value & np.array([p.start != 0.0 for p in self.parameters], bool)
 
 
 def together(nights: Sequence[Night]) -> Together:

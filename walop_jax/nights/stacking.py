@@ -6,6 +6,7 @@ The files of a survey: docs, files. Nights that are made lie in its folder `part
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import math
 import os
@@ -32,9 +33,9 @@ from walop_jax.io.fits_reading import primary_keywords
 from walop_jax.io.text import check_input, parse_toml, read_json, read_text
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.laws import Law, laws_of, resolved
-from walop_jax.model.specification import Model
+from walop_jax.model.specification import Model, effect_context
 from walop_jax.nights.algebra import Solution, UndeterminedError
-from walop_jax.nights.breaks import Break, at_solution, solved
+from walop_jax.nights.breaks import Break, at_solution, part_of, solved
 from walop_jax.nights.breaks import find as breaks_of
 from walop_jax.nights.equations import (
     Candidates,
@@ -44,6 +45,7 @@ from walop_jax.nights.equations import (
     data_hash,
     model_hash,
     night_equations,
+    source_of,
     together,
     with_candidates_of,
 )
@@ -102,7 +104,7 @@ class _Maker:
         """The nights of data, as they are kept or linearised near their own minimum, from the values of `like` on."""
         if self.like is None:
             raise fail(
-                f"{data.read().origin} is a set, and nothing says at which values to linearise it",
+                f"{source_of(data.read())} is a set, and nothing says at which values to linearise it",
                 advice="give --like RUN, a fit of the same model (like= in Python)",
             )
         place = None
@@ -126,6 +128,9 @@ class _Maker:
         """A night linearised at other values; its candidates as well, or they follow (`with_candidates_of`)."""
         calset, model = self._set_and_model(data)
         known = self._candidates(model, calset) if candidates else {}
+        if not candidates:  # a gauge stays where its column was made
+            cut = len(night.names) - night.candidates
+            values = {**values, **dict(zip(night.names[cut:], night.reference[cut:].tolist(), strict=True))}
         (made,) = night_equations(calset, model, values, known, number=night.number, once=self.few)
         return with_candidates_of(made, night)
 
@@ -154,7 +159,7 @@ class _Maker:
             hashes = (hashes ^ bits) * np.uint64(0x9E3779B97F4A7C15)
             hashes ^= hashes >> np.uint64(29)
         smallest = np.unique(hashes)[:SKETCH].tolist()
-        here = str(calset.inputs[0].path) if calset.inputs else calset.origin
+        here = source_of(calset)
         seen = Counter(self.noise[one] for one in smallest if one in self.noise)
         if seen and (number := seen.most_common(1)[0])[1] > COPIED * len(smallest):
             share = f"{100 * number[1] / len(smallest):.0f} % of its measurements are in {number[0]} as well"
@@ -218,7 +223,8 @@ def stack(
     try:
         if find and len({night.number for night in data.nights}) > 2:
             # Ahead of linearising again: with breaks that are no law yet the common solution is one of no night.
-            found, chosen, _ = breaks_of(data, chosen, catalogue)
+            carried = functools.partial(_carried, maker.like, catalogue) if maker.like is not None else None
+            found, chosen, _ = breaks_of(data, chosen, catalogue, carried)
             breaks += found
         data, solution, settled = _settled(data, chosen, at_hand, maker)
         if at_hand and any(law is not None for law in chosen[len(chosen) - data.candidates :]):
@@ -256,7 +262,8 @@ def laws_of_all(data: Together, laws: Mapping[str, Law | Mapping[str, Any]]) -> 
     """A law for every parameter and candidate of nights (None: absent). ValueError for what is wrong in `laws`."""
     tables = {name: law.document() if isinstance(law, Law) else law for name, law in laws.items()}
     cut = len(data.names) - data.candidates
-    return resolved(laws_of(tables), data.names[:cut], data.names[cut:])
+    alone = [name for name, gauge in zip(data.names, data.gauge, strict=True) if gauge]
+    return resolved(laws_of(tables), data.names[:cut], data.names[cut:], alone)
 
 
 def writers(survey: Survey) -> dict[str, Callable[[Path], object]]:
@@ -398,11 +405,24 @@ def _in_units(
     return data.origin + solution.values * scale, np.maximum(solution.errors() * scale, 1e-12 * scale)
 
 
+def _carried(like: Calibration, catalogue: Sequence[type[Effect]], name: str) -> bool:
+    """True unless a candidate is an effect of which a star at another time and flux says nothing.
+
+    Such are the median counts of a field, the exposure before, the time since the first exposure of a night.
+    """
+    kind = next((one for one in catalogue if one.name == part_of(name)), None)
+    if kind is None:
+        return True
+    template = like.model.template
+    changes = kind.neutral(effect_context(template, like.exposures)).first_order(template)
+    return all(change.of_stars for each in changes for _, change in each)
+
+
 def _about_fits(fits: Sequence[Calibration | FitResult]) -> list[Doubt]:
     doubts = []
     for one in fits:
         verdict = one.verdict if isinstance(one, Calibration) else one.checked_verdict()
-        where = one.calset.origin if isinstance(one, FitResult) else one.origin
+        where = str(one.path or source_of(one)) if isinstance(one, Calibration) else source_of(one.calset)
         if (one.errors_from if isinstance(one, FitResult) else verdict.errors_from) != STATED:
             raise fail(
                 f"the errors of {where} do not explain its scatter, and nights are weighed by them",

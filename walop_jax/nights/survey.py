@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.calibration import HIGH_CROSSTALK, Calibration
-from walop_jax.calibration.matrix import matrix_slopes, p_forms, sample_stars
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import p_errors, sample_stars
 from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, fail
@@ -36,15 +36,13 @@ from walop_jax.nights.algebra import Solution
 from walop_jax.nights.breaks import Break, part_of, shape_of
 from walop_jax.nights.changes import scan
 from walop_jax.nights.equations import Together, night_numbers
+from walop_jax.science.field_accuracy import NODES, SIZE, TOLERANCE, judged, measures_u, reached
 from walop_jax.science.star_errors import GOAL
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]
 
 HALF_A_DAY = 0.5
-SHARE = 0.95  # of the field that must know p to half of the goal
-GRID = 13  # points along each axis of the field at which that is asked
-STARS = 20
 SUSPECT = 5.0  # excess of χ² of a night over its expectation, in its own standard deviations
 
 
@@ -133,7 +131,7 @@ class Survey(Displayed):
         """The end of the validity (MJD): see the head of this file."""
         begin, end = min(night.begin for night in self.data.nights), self.last
         most = end + max(end - begin, HALF_A_DAY)
-        if self._slopes is None or self.error_of_p(most) <= GOAL / 2:
+        if self._matrix is None or self.error_of_p(most) <= GOAL / 2:
             return most
         low, high = end, most
         while high - low > 0.01:
@@ -142,28 +140,30 @@ class Survey(Displayed):
         return max(low, end + HALF_A_DAY)
 
     def error_of_p(self, mjd: float) -> float:
-        """Error of p (a fraction) that 95 % of the field with q and u stays below at a moment, by calibration alone."""
-        assert self._slopes is not None
-        form = self._slopes
-        variance = np.mean((form @ self._product(mjd).covariance * form).sum(axis=-1), axis=1)
-        return float(np.sqrt(np.quantile(variance, SHARE)))
+        """Error of p (a fraction) that 95 % of the field where one exposure measures u stays below at a moment."""
+        assert self._matrix is not None
+        matrix, slopes, structure, _ = self._matrix
+        covariance = slopes @ self._product(mjd).covariance @ slopes.swapaxes(1, 2) + structure
+        return reached(p_errors(matrix, covariance, sample_stars()))
 
     @functools.cached_property
-    def _slopes(self) -> Float[np.ndarray, "p n k"] | None:
-        """Derivatives of p to the parameters, at points of the field, for some stars; None where p is not measured."""
+    def _matrix(self) -> tuple[Matrix, Float[np.ndarray, "p 6 k"], Float[np.ndarray, "p 6 6"], float] | None:
+        """Matrix, derivatives and covariance of structure where one exposure measures u; the share where it does not.
+
+        None where p is not measured.
+        """
         if self.like is None or len(self.like.model.template.cameras.pairs) != 2:
             return None
         try:
             product = self._product(self.last)
         except DataError:  # `at` says why there is none
             return None
-        x, y = product.raster(GRID)
-        name = str(np.unique(product.exposures.filter)[0])
-        instrument, curves = product.model.instrument(product.values), {name: product.filter_curve(name)}
-        matrix, slopes = matrix_slopes(instrument, product.usual_settings(1, name), curves, x, y)
-        seen = np.linalg.cond(matrix[:, :, 1:]) < HIGH_CROSSTALK
-        matrix, slopes = matrix[seen].reshape(-1, 6), slopes[seen].reshape(seen.sum(), 6, -1)
-        return p_forms(matrix, sample_stars(STARS)) @ slopes if seen.any() else None
+        settings = product.usual_settings(filter_name=product.usual_filter)
+        x, y = product.raster(SIZE)
+        matrix, covariance, slopes = product.over_field(x, y, settings, NODES, TOLERANCE)
+        structure = covariance - slopes @ product.covariance @ slopes.swapaxes(1, 2)
+        seen = measures_u(matrix)
+        return (matrix[seen], slopes[seen], structure[seen], float(np.mean(~seen))) if seen.any() else None
 
     @property
     def last(self) -> float:
@@ -258,7 +258,7 @@ class Survey(Displayed):
         context = effect_context(model.template, like.exposures)
         candidates = [
             p for p, law, has in zip(self.data.parameters, self.laws, self.data.has_value, strict=True)
-            if law is not None and not has
+            if law is not None and not has and p.name not in model.names
         ]  # fmt: skip
         taken: dict[str, str] = {}
         for p in candidates:
@@ -341,7 +341,8 @@ class Survey(Displayed):
             "n_data": verdict.n_data, "nights": len({night.number for night in self.data.nights}),
             "first": min(night.begin for night in self.data.nights), "last": self.last,
             "valid_from": start, "valid_until": stop, "validity": self.validity,
-            "error_of_p": None if self._slopes is None else self.error_of_p(self.last),
+            "error_of_p": None if self._matrix is None else self.error_of_p(self.last),
+            "without_u": None if self._matrix is None else self._matrix[3],
             "breaks": [dataclasses.asdict(one) | {"date": one.date} for one in self.breaks],
             "events": [{"mjd": mjd, "what": what} for mjd, what in self.events],
             "by_night": [
@@ -384,9 +385,9 @@ class Survey(Displayed):
             "nights": f"{len({night.number for night in nights})}, MJD {start + HALF_A_DAY:.2f} to {self.last:.2f}",
             "valid": f"from MJD {start:.2f} until {stop:.2f}",
         }
-        if self._slopes is not None:
+        if self._matrix is not None:
             error = two_digits(100.0 * self.error_of_p(self.last))
-            facts["p of a star"] = f"{error} % or better in 95 % of the field on the last night"
+            facts["p of a star"] = f"{error} % or better in {judged(self._matrix[3])}, on the last night"
         if not self.breaks:
             facts["changes"] = "none found beyond the laws"
         rows = tuple(

@@ -188,7 +188,7 @@ class ExposurePlan(Displayed):
             without, middle = (100.0 * np.median(errors[:, seen]) for errors in (self.before, self.after))
             facts["over the field"] = (
                 f"error of p {middle:.3g} % in the median ({without:.3g} % without them), below 0.1 % in "
-                f"{100 * self.share:.0f} % of the field that holds u in one exposure"
+                f"{100 * self.share:.0f} % of the field where one exposure measures u"
             )
         if self.needed is not None:
             facts[f"{digits(self.goal, '.3g')}{unit} takes"] = (

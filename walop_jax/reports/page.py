@@ -49,7 +49,7 @@ from walop_jax.reports.wording import (
     verdict_of_diagnosis,
     verdict_of_fit,
 )
-from walop_jax.science.field_accuracy import FieldAccuracy
+from walop_jax.science.field_accuracy import FieldAccuracy, judged
 
 TEMPLATES = Path(__file__).parent / "templates"
 MOST_PULLS = 8
@@ -83,6 +83,7 @@ def environment() -> jinja2.Environment:
         effect_in_words=effect_in_words,
         names_in_words=names_in_words,
         value_and_error=value_and_error,
+        judged=judged,
         rounded=rounded,
         probability=probability,
     )
@@ -353,7 +354,9 @@ def _of_limits(folder: Path, document: Mapping[str, Any]) -> Pictures:
 
 
 def _of_epoch(folder: Path, document: Mapping[str, Any]) -> Pictures:
-    """Maps of what has changed of the instrument matrix, if both calibrations are there."""
+    """Maps of what has changed of the instrument matrix, if both calibrations are there and worth comparing."""
+    if document["fits"] is None or document.get("same"):
+        return [], ()
     try:
         old, new = (
             read_calibration(Path(path), rebuild=False).maps for path in (document["old_file"], folder)

@@ -21,6 +21,7 @@ from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import probability, rounded, some, value_and_error, with_error, with_minus_sign
 from walop_jax.model.effects import EFFECTS
 from walop_jax.reports.posterior_figures import LABELS
+from walop_jax.sky.nights import night_of
 
 MOST_PARAMETERS = 6  # of an effect, in a sentence
 _PROPER = ("Wollaston", "Moon", "Stokes")
@@ -138,7 +139,7 @@ def data_in_words(product: Calibration) -> list[tuple[str, str]]:
     )
     low_x, high_x, low_y, high_y = product.field
     rows = [
-        ("Nights", _nights(e.mjd)),
+        ("Nights", _nights(e.mjd, product.site.longitude)),
         ("Exposures", f"{len(e)} ({kinds})"),
         ("Field", with_minus_sign(f"X {low_x:+.2f} to {high_x:+.2f}°, Y {low_y:+.2f} to {high_y:+.2f}°")),
         ("Polariser angles", _angles(e.clp_angle[e.clp_in])),
@@ -159,9 +160,8 @@ def data_in_words(product: Calibration) -> list[tuple[str, str]]:
     return rows
 
 
-def _nights(mjd: Float[np.ndarray, " e"]) -> str:
-    # Noon UTC divides nights: right from Chile to South Africa.
-    known = np.unique(np.floor(mjd[np.isfinite(mjd)] - 0.5))
+def _nights(mjd: Float[np.ndarray, " e"], longitude: float) -> str:
+    known = np.unique(night_of(mjd[np.isfinite(mjd)], longitude))
     days = [(_MJD_0 + datetime.timedelta(days=float(day))).date().isoformat() for day in known]
     if not days:
         return "not recorded"

@@ -359,7 +359,7 @@ class _Application:
             values = vectors.calibration.values.copy()
             values[vectors.parameters] += vectors.root @ errors
             moved = dataclasses.replace(vectors.calibration, values=values)
-            seen = self.catalogue.of_stars(chosen)
+            seen = self.catalogue.of_rows(chosen[self.catalogue.star])
             left = residuals_of(AnalysisVectors(moved), seen, len(seen), force=True)
             there = StarResiduals.joined(left) if left else None
             same = there is not None and there.residual.shape == search.stars.residual.shape

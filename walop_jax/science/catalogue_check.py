@@ -384,7 +384,9 @@ class CatalogueSearch:
             if not stated and rows is not None and _chance_beside(rows, noise) < self._alarm:
                 several = max(single, rows.value)
             each = self.variance * np.where(stars.rows > 1, several, single)
-            matrix, score = normal_matrix(stars, residual, self._columns, scale.kept / each, scale.share)
+            matrix, score = normal_matrix(
+                stars, residual, lambda part, _: self._columns(part), scale.kept / each, scale.share
+            )
             matrix = self.mixing.T @ matrix @ self.mixing + np.diag(self.prior)
             return _Look(noise, rows, matrix, self.mixing.T @ score - self.prior * sizes)
 

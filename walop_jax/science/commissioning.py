@@ -5,17 +5,14 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import numpy as np
-
 from walop_jax.calibration.could_hide import off_by, unmeasured
 from walop_jax.data.inspection import inspect
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import two_digits
-from walop_jax.science.field_accuracy import FieldAccuracy
+from walop_jax.science.field_accuracy import SHARE, FieldAccuracy
 from walop_jax.science.star_errors import GOAL
 
-SHARE = 0.95  # of the field: the rest is where a single exposure carries almost no information on u
 MOST = GOAL / 2  # error of p that the calibration may make
 
 
@@ -79,18 +76,20 @@ def commissioning(result: FitResult, accuracy: FieldAccuracy | None) -> Commissi
     ]  # fmt: skip
     if accuracy is not None:
         limit = accuracy.limited_by.split(" (")[0]
-        for share, needed in ((0.5, True), (SHARE, False)):
-            reached = float(np.quantile(accuracy.error, share))
+        for where, reached, needed in (
+            ("50 % of the field", accuracy.median, True),
+            (accuracy.judged, accuracy.reached, False),
+        ):
             cause = f", most of it from {limit}" if limit else ""
             advice = (
                 f"{two_digits((reached / MOST) ** 2)} times the light, over several nights (walop-jax stack); "
                 "walop-jax plan says which exposures"
             )
-            if accuracy.without_u > 1.0 - share:
+            if not needed and accuracy.without_u > 1.0 - SHARE:
                 strip = f"{100 * accuracy.without_u:.0f} % of the field"
-                cause = f", because of {strip}, where one exposure carries almost no information on u"
+                cause = f", worst beside the {strip} where one exposure carries almost no information on u"
                 advice = "observe the stars there with the calibration plate at 22.5° as well"
-            asked = f"p known to {two_digits(100 * MOST)} % in {100 * share:.0f} % of the field"
+            asked = f"p known to {two_digits(100 * MOST)} % in {where}"
             said = f"{two_digits(100 * reached)} %{cause}"
             found.append(Requirement(asked, reached <= MOST, said, advice, needed))
         for name, one in unmeasured(accuracy.not_measured).items():

@@ -9,8 +9,13 @@ instrument's parameters, is compared: Δ = new − old with the covariance V.
     a = (V⁻¹Δ)_i/√(V⁻¹)_ii              one parameter, if it alone has changed
 
 T of seventy directions hides one that has changed by five standard errors. So the largest |z| or |a| is asked as well,
-corrected for as many as there are (Šidák 1967, JASA 62, 626); the verdict is that of the smaller p, taken twice. What
+corrected for as many as there are (Šidák 1967, JASA 62, 626), and the smaller of both p again as one of two. What
 could have been missed is said for the matrix: five standard errors of its change, √(J V Jᵀ).
+
+Where the old model explains the new data no longer, the errors of its fit are those of the residuals that the change
+itself has left, and Δ is nothing beside them. Then the comparison is with the fit of the model that does explain the
+new data (`diagnosis`): the amplitudes of effects that it has and the old one lacks have changed from zero, which the
+old calibration holds them at. Without such a model there is nothing to compare with.
 
 P is the inverse covariance of the priors: both fits lean on the same ones, which makes them more alike than two
 independent measurements; where neither has measured anything V vanishes, and such directions are left out.
@@ -70,11 +75,14 @@ class MovedParameter:
 class LargestChange:
     """The parameter whose change stands out most, `z` standard errors of it, of so many changes that were `asked` for.
 
-    `alone` says that the change is that of this parameter with all others as they were. `p_value` is corrected for the
-    number of changes.
+    `alone` says that `size` is the change of this parameter with all others as they were. `p_value` is corrected for
+    the number of changes.
     """
 
     name: str
+    size: float
+    error: float
+    unit: str
     z: float
     alone: bool
     asked: int
@@ -85,36 +93,49 @@ class LargestChange:
 class Epoch(Displayed):
     """The verdict: `fits` unless the change is one that chance makes in less than 1 % of cases.
 
-    `largest` is the change that stands out most by itself, `p_value` the chance of it and of the sum taken together.
-    `visible` is the smallest change of each element of the matrix (per cent, median over the field) that would have
-    been seen with certainty, five standard errors of it. `moved` sorts parameters by |z|; `chi2_old` is of the new data
-    with the old instrument; `star_errors` are statistics (per cent) of what stars would be off, outside the zone
-    without u, if the old calibration were used and the new one true. `new_trusted` and `warnings` are what the fit of
-    the new set is worth: where it is not to be trusted, neither are the parameters that seem to have moved.
+    `largest` is the change that stands out most by itself, `p_value` the chance of it and of the sum (`test`, χ² in
+    `directions`) taken together. `visible` is the smallest change of each element of the matrix (per cent, median over
+    the field) that would have been seen with certainty, five standard errors of it. `moved` sorts parameters by |z|;
+    `chi2_old` is of the new data with the old instrument; `star_errors` are statistics (per cent) of what stars would
+    be off, outside the zone without u, if the old calibration were used and the new one true. `added` are the effects
+    without which the new data are not explained, `same` says that old and new data are the same files. `new_trusted`
+    and `warnings` are what the new fit is worth.
+
+    `fits` and all numbers of a comparison are None, and its lists empty, where the model of the old calibration
+    explained its own data and not the new ones, nor is it known what does.
     """
 
-    fits: bool
-    p_value: float
-    test: float
-    directions: int
-    largest: LargestChange
-    visible: dict[str, float]
-    chi2_old: float
-    chi2_new: float
-    dof: int
-    moved: tuple[MovedParameter, ...]
-    star_errors: dict[str, dict[str, float]]
+    fits: bool | None
     new_trusted: bool
     warnings: tuple[str, ...]
+    added: tuple[str, ...] = ()
+    same: bool = False
+    p_value: float | None = None
+    test: float | None = None
+    directions: int | None = None
+    largest: LargestChange | None = None
+    visible: dict[str, float] | None = None
+    chi2_old: float | None = None
+    chi2_new: float | None = None
+    dof: int | None = None
+    moved: tuple[MovedParameter, ...] = ()
+    star_errors: dict[str, dict[str, float]] | None = None
 
     @property
     def holds(self) -> bool:
         """True if the old calibration may be used on: nothing has moved, and a fit to be trusted says so."""
-        return self.fits and self.new_trusted
+        return bool(self.fits and self.new_trusted)
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in words."""
+        if self.fits is None:
+            return "The new data are not explained"
+        return "The old calibration still fits" if self.fits else "The instrument has changed"
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
-        return dataclasses.asdict(self)
+        return {"verdict": self.verdict} | dataclasses.asdict(self)
 
     def to_table(self) -> Any:
         """The parameters, farthest moved first, as an astropy table."""
@@ -126,39 +147,40 @@ class Epoch(Displayed):
 
     def display(self) -> Display:
         """The verdict, and the parameters that have moved farthest."""
+        title, largest = self.verdict.replace("has changed", "HAS CHANGED"), self.largest
+        if largest is None or self.star_errors is None or self.visible is None or self.p_value is None:
+            words = (
+                "not compared: the model of the old calibration, fitted to the new data, is not to be trusted"
+            )
+            return Display(title, (("old and new", words),))
         rows = []
         for entry in self.moved[:_SHOWN]:
             error = max(entry.error, 1e-6 * abs(entry.new))  # of the same data it is rounding alone
             old, new = (value_and_error(value, error)[0] for value in (entry.old, entry.new))
             rows.append((entry.name, old, new, with_minus_sign(f"{entry.z:+.1f}"), entry.unit))
         errors = self.star_errors["p"]
+        size = " ± ".join(value_and_error(largest.size, max(largest.error, 1e-12)))
+        facts = {
+            "largest change": f"{largest.name} by {size} {largest.unit}".rstrip()
+            + f", {with_minus_sign(f'{largest.z:+.1f}')} standard errors"
+            + (" if it alone has changed" if largest.alone else "")
+            + f": p {probability(largest.p_value)} for the largest of {largest.asked}",
+            "stars with the old one": f"off by {two_digits(errors['median'])} % in p (median), "
+            f"{two_digits(errors['max'])} % at most",
+            "chance": f"p {probability(self.p_value)} (χ² = {self.test:.1f} in {self.directions} directions, and "
+            "the largest change)",
+            "would be seen": f"a change of {', '.join(f'{n} {two_digits(v)} %' for n, v in self.visible.items())} "
+            "(5 standard errors, median over the field)",
+        }
+        if self.added:
+            facts = {"not in the old model": ", ".join(self.added)} | facts
+        more = len(self.moved) - _SHOWN
         return Display(
-            title="The old calibration still fits" if self.fits else "The instrument HAS CHANGED",
-            facts=(
-                (
-                    "chance",
-                    f"p {probability(self.p_value)} (χ² = {self.test:.1f} in {self.directions} directions, and the "
-                    "largest change)",
-                ),
-                (
-                    "largest change",
-                    f"{self.largest.name} by {with_minus_sign(f'{self.largest.z:+.1f}')} standard errors"
-                    f"{' if it alone has changed' if self.largest.alone else ''}: "
-                    f"p {probability(self.largest.p_value)} for the largest of {self.largest.asked}",
-                ),
-                (
-                    "would be seen",
-                    f"a change of {', '.join(f'{n} {two_digits(v)} %' for n, v in self.visible.items())} "
-                    "(5 standard errors, median over the field)",
-                ),
-                (
-                    "stars with the old one",
-                    f"off by {two_digits(errors['median'])} % in p (median), {two_digits(errors['max'])} % at most",
-                ),
-            ),
+            title,
+            tuple(facts.items()),
             head=("parameter", ">old", ">new", ">change / σ", "unit"),
             rows=tuple(rows),
-            notes=(f"{len(self.moved) - _SHOWN} more in to_table()",) if len(self.moved) > _SHOWN else (),
+            notes=(f"{more} more in to_table()",) if more > 0 else (),
         )
 
 
@@ -176,35 +198,48 @@ def fit_like(old: Calibration, calset: CalibrationSet) -> FitResult:
 
 
 def epoch(old: Calibration, result: FitResult) -> Epoch:
-    """Compare an old calibration with the fit of a new set (`fit_like`, examined)."""
+    """Compare an old calibration with an examined fit of a new set, by its own model (`fit_like`) or a larger one."""
+    added = tuple(name for name in result.model.effect_names if name not in old.model.effect_names)
+    files, before = ({entry.sha256 for entry in entries} for entries in (result.calset.inputs, old.inputs))
+    same = bool(files) and files == before
+    if old.verdict.trusted and not result.trusted:
+        return Epoch(None, False, result.warnings, added, same)
     new, model = Calibration.from_fit(result), result.model
-    names = shared_parameters(old.model, model)
-    a = np.array([old.model.index(name) for name in names])
+    shared, beyond = shared_parameters(old.model, model), added_amplitudes(old.model, model)
+    names = [*shared, *beyond]
+    a = np.array([old.model.index(name) for name in shared])
     b = np.array([model.index(name) for name in names])
-    change = new.values[b] - old.values[a]
-    before, after = old.covariance[np.ix_(a, a)], new.covariance[np.ix_(b, b)]
+    was = np.append(old.values[a], np.zeros(len(beyond)))
+    before, after = np.zeros((len(b), len(b))), new.covariance[np.ix_(b, b)]
+    before[: len(a), : len(a)] = old.covariance[np.ix_(a, a)]
+    change = new.values[b] - was
     width = np.array([(model[name].prior or (0.0, np.inf))[1] for name in names])
     both = before @ (after / width[:, None] ** 2)
     covariance = before + after - both - both.T
     sigma = np.sqrt(np.diag(before + after))
-    measured = MeasuredChange.of(names, change, covariance, sigma)
-    test, directions, largest = measured.chi2, measured.directions, measured.largest()
+    units = [model[name].unit for name in names]
+    measured = MeasuredChange.of(names, change, covariance, sigma, units)
+    largest = measured.largest()
     values = new.values.copy()
-    values[b] = old.values[a]
+    values[b] = was
     error = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     moved = [
-        MovedParameter(n, model[n].unit, float(old.values[i]), float(new.values[j]), float(s), float(d / s))
-        for n, i, j, d, s in zip(names, a, b, change, error, strict=True)
+        MovedParameter(n, unit, float(w), float(new.values[j]), float(s), float(d / s))
+        for n, unit, w, j, d, s in zip(names, units, was, b, change, error, strict=True)
         if s > 0
     ]
-    p_value = min(1.0, 2.0 * min(float(special.chdtrc(directions, test)), largest.p_value))
+    p_value = _of_several(min(float(special.chdtrc(measured.directions, measured.chi2)), largest.p_value), 2)
     of_all = np.zeros_like(new.covariance)
     of_all[np.ix_(b, b)] = covariance
     return Epoch(
         fits=p_value > CHANCE,
+        new_trusted=result.trusted,
+        warnings=(*result.warnings, *_too_alike(measured.chi2, measured.directions, same)),
+        added=added,
+        same=same,
         p_value=p_value,
-        test=test,
-        directions=directions,
+        test=measured.chi2,
+        directions=measured.directions,
         largest=largest,
         visible=_visible(dataclasses.replace(new, covariance=of_all)),
         chi2_old=result.likelihood.expand(values, near=result.posterior).chi2,
@@ -212,13 +247,19 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
         dof=result.dof,
         moved=tuple(sorted(moved, key=lambda entry: -abs(entry.z))),
         star_errors=_star_errors(old, new),
-        new_trusted=result.trusted,
-        warnings=(*result.warnings, *_too_alike(test, directions)),
     )
 
 
-def _too_alike(test: float, directions: int) -> Iterator[str]:
-    """A sentence where two sets agree better than independent ones ever do."""
+def _of_several(p: float, number: int) -> float:
+    """Chance that the smallest of several p-values is as small (Šidák)."""
+    return float(-np.expm1(number * np.log1p(-p))) if p < 1.0 else 1.0
+
+
+def _too_alike(test: float, directions: int, same: bool) -> Iterator[str]:
+    """A sentence where two sets are one, or agree better than independent ones ever do."""
+    if same:
+        yield "these are the data from which the old calibration was made: nothing can have moved"
+        return
     if special.chdtr(directions, test) < COPIES:
         yield (
             f"old and new agree better than independent data do (χ² = {test:.2g} in {directions} directions): are they "
@@ -232,6 +273,18 @@ def shared_parameters(old: Model, new: Model) -> list[str]:
     return [name for name in new.names if name in free[0] & free[1] and new[name].part not in SKY_AND_STARS]
 
 
+def added_amplitudes(old: Model, new: Model) -> list[str]:
+    """Names of free parameters in which effects of the new model that the old one lacks are linear at zero."""
+    parts = set(new.effect_names) - set(old.effect_names)
+    shapes = {kind.name: kind.shape for kind in new.catalogue}
+    free = [new.parameters[i] for i in new.free]
+    return [
+        p.name
+        for p in free
+        if p.part in parts and p.name.removeprefix(f"{p.part}.").split(".")[0] not in shapes.get(p.part, ())
+    ]
+
+
 class MeasuredChange(NamedTuple):
     """A change in units of `sigma`, for the parameters that were known at all, and V⁻¹ over what was measured of it.
 
@@ -243,9 +296,18 @@ class MeasuredChange(NamedTuple):
     covariance: Float[np.ndarray, "k k"]
     inverse: Float[np.ndarray, "k k"]
     directions: int
+    sigma: Float[np.ndarray, " k"]
+    units: tuple[str, ...]
 
     @classmethod
-    def of(cls, names: Sequence[str], change: Vector, covariance: Matrix, sigma: Vector) -> MeasuredChange:
+    def of(
+        cls,
+        names: Sequence[str],
+        change: Vector,
+        covariance: Matrix,
+        sigma: Vector,
+        units: Sequence[str] = (),
+    ) -> MeasuredChange:
         """The change of parameters, each in units of its `sigma`; those with none are not known."""
         known = np.flatnonzero(sigma > 0)
         unit = sigma[known]
@@ -254,7 +316,13 @@ class MeasuredChange(NamedTuple):
         good = value > _KNOWN * value[-1]
         inverse = (vector[:, good] / value[good]) @ vector[:, good].T
         return cls(
-            tuple(names[k] for k in known.tolist()), change[known] / unit, scaled, inverse, int(good.sum())
+            tuple(names[k] for k in known.tolist()),
+            change[known] / unit,
+            scaled,
+            inverse,
+            int(good.sum()),
+            unit,
+            tuple(units[k] for k in known.tolist()) if units else ("",) * len(known),
         )
 
     @property
@@ -270,8 +338,18 @@ class MeasuredChange(NamedTuple):
         way, i = np.unravel_index(np.abs(z).argmax(), z.shape)
         asked = int(np.isfinite(width).sum())
         p = float(special.chdtrc(1, z[way, i] ** 2))
-        corrected = float(-np.expm1(asked * np.log1p(-p))) if p < 1.0 else 1.0
-        return LargestChange(self.names[int(i)], float(z[way, i]), bool(way), asked, corrected)
+        # Of one alone: a/√(V⁻¹)_ii, with the error 1/√(V⁻¹)_ii.
+        error = self.sigma[i] * (width[0, i] if way == 0 else 1.0 / width[1, i])
+        return LargestChange(
+            self.names[int(i)],
+            float(z[way, i] * error),
+            float(error),
+            self.units[int(i)],
+            float(z[way, i]),
+            bool(way),
+            asked,
+            _of_several(p, asked),
+        )
 
 
 def _visible(changed: Calibration) -> dict[str, float]:

@@ -12,7 +12,7 @@ import dataclasses
 import functools
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import CouldHide, could_hide, off_by, unmeasured
@@ -27,6 +27,7 @@ from walop_jax.io.text import two_digits
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.science.star_errors import GOAL
 
+SHARE = 0.95  # of the field where one exposure measures u: what a calibration is judged by
 SIZE = 21  # points along each axis of the map
 COARSE = 8  # the same where the question is what limits it
 FEW_STARS = 20
@@ -54,7 +55,8 @@ class FieldAccuracy:
     mistake that the data would not have shown, the worst of them `hidden_by`, can make q or u wrong by `hidden`, the
     median over the field (NaN: nobody asked), at its just undetected size, `hidden_worst` where it is largest; `remedy`
     is the measurement that would show it. `not_measured` are the mistakes on which the data hold no information.
-    `without_u` is the share of the field where a single exposure carries almost no information on u.
+    `without_u` is the share of the field where a single exposure carries almost no information on u, `with_u` says
+    where it does (None: everywhere).
     """
 
     error: Float[np.ndarray, "y x"]
@@ -68,6 +70,17 @@ class FieldAccuracy:
     hidden_worst: float = np.nan
     remedy: str = ""
     not_measured: tuple[CouldHide, ...] = ()
+    with_u: Bool[np.ndarray, "y x"] | None = None
+
+    @property
+    def reached(self) -> float:
+        """The error of p that `SHARE` of the field stays below, of that where one exposure measures u."""
+        return reached(self.error if self.with_u is None else self.error[self.with_u])
+
+    @property
+    def judged(self) -> str:
+        """The part of the field of which `reached` is the error, in words."""
+        return judged(self.without_u)
 
     @property
     def share(self) -> float:
@@ -113,6 +126,26 @@ class FieldAccuracy:
         return tuple(lines)
 
 
+def measures_u(matrix: Float[np.ndarray, "p 6"]) -> Bool[np.ndarray, " p"]:
+    """Where one exposure measures q and u, by the determinant of the 2 × 2 part of its matrix."""
+    return np.abs(np.linalg.det(matrix.reshape(-1, 2, 3)[:, :, 1:])) >= SMALLEST_DETERMINANT
+
+
+def reached(error: Float[np.ndarray, "*p"]) -> float:
+    """The error that `SHARE` of some places stay below; NaN without a place."""
+    return float(np.quantile(error, SHARE)) if error.size else np.nan
+
+
+def judged(without_u: float) -> str:
+    """The part of the field that `reached` is about, in words; `without_u` is the share that is left out."""
+    part = f"{100 * SHARE:.0f} % of the field"
+    return (
+        f"{part} where one exposure measures u ({100 * (1.0 - without_u):.0f} % of it)"
+        if without_u > 0
+        else part
+    )
+
+
 def answered(result: FitResult) -> FitResult:
     """The fit, able to say how well stars are known with it; worked out when it is first asked."""
     made = functools.cache(lambda: field_accuracy(Calibration.from_fit(result)))
@@ -127,7 +160,7 @@ def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy 
     x, y = np.concatenate([calibration.raster(size), calibration.raster(COARSE)], axis=1)
     matrix, covariance, slopes = calibration.over_field(x, y, settings, NODES, TOLERANCE)
     error = p_errors(matrix[: size**2], covariance[: size**2], sample_stars()).reshape(size, size)
-    determinant = np.abs(np.linalg.det(matrix.reshape(-1, 2, 3)[: size**2, :, 1:]))
+    with_u = measures_u(matrix[: size**2]).reshape(size, size)
     mistakes = could_hide(calibration)
     worst = mistakes[0] if mistakes else None
     nothing = np.nan if calibration.hidden is None else 0.0
@@ -142,7 +175,8 @@ def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy 
         remedy="" if worst is None else worst.remedy,
         not_measured=tuple(one for one in mistakes if not one.measured),
         trusted=calibration.verdict.trusted,
-        without_u=float(np.mean(determinant < SMALLEST_DETERMINANT)),
+        without_u=float(np.mean(~with_u)),
+        with_u=with_u,
     )
 
 

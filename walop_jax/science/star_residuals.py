@@ -43,6 +43,8 @@ ABOUT_GAINS = 2
 """Rounds in which the scale of stars is found about the gains that fit them best, and these with that scale."""
 SINGULAR = 1e-10
 """Share of the largest eigenvalue below which stars say nothing of a direction of what is fitted to them."""
+ROUNDING = 1e-12
+"""Share of its square that a column must have once flux, q and u are fitted: less is rounding, of either sign."""
 Matrix = Float[np.ndarray, "c c"]
 
 
@@ -177,7 +179,8 @@ def own_variance(stars: StarResiduals) -> Float[np.ndarray, " s"]:
     return 1.0 + spread / np.clip(stars.dof, 1, stars.model.shape[1] - 1)
 
 
-Columns = Callable[[StarResiduals], Float[np.ndarray, "r k c"]]
+Columns = Callable[[StarResiduals, slice], Float[np.ndarray, "r k c"]]
+"""Columns of some stars and their rows."""
 
 
 def normal_matrix(
@@ -191,13 +194,13 @@ def normal_matrix(
 
     `residual` is that of `stars` or what is left of it behind changes; `share` is κ.
     """
-    matrix, score = np.zeros((0, 0)), np.zeros(0)
+    matrix, score, whole = np.zeros((0, 0)), np.zeros(0), np.zeros(0)
     for here, rows, part in stars.blocks():
-        values = columns(part)
+        values = columns(part, rows)
         free, along = part.projected(values)
         count = len(free)
         if not score.size:
-            matrix, score = np.zeros((count, count)), np.zeros(count)
+            matrix, score, whole = np.zeros((count, count)), np.zeros(count), np.zeros(count)
         w, k = weight[here], share[here]
         scaled = np.sqrt(w * k)
         flat = (free * scaled[part.star, None]).reshape(count, -1)
@@ -205,6 +208,9 @@ def normal_matrix(
         taken = half.reshape(-1, count)
         matrix += flat @ flat.T - taken.T @ taken
         score += values.reshape(-1, count).T @ (residual[rows] * w[part.star, None]).ravel()
+        whole += np.einsum("rkc,r->c", values**2, scaled[part.star] ** 2)
+    rounding = np.diag(matrix) <= ROUNDING * whole
+    matrix[rounding], matrix[:, rounding], score[rounding] = 0.0, 0.0, 0.0
     return matrix, score
 
 

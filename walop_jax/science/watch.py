@@ -12,10 +12,14 @@ once        h = 1 in a single group
 
     z = hᵀg / √(hᵀQh),   β = hᵀg / hᵀQh,   σ_β = (hᵀQh)^(−1/2), the Cramér–Rao bound (matched filter)
 
-All cameras together are flux: no history of theirs leaves a trace. One correction for all histories asked: noise
+All cameras together are flux: no history of theirs leaves a trace. Asked are the gains of cameras and of arms (all
+cameras of one), their gradients over the field (of any direction φ: β cos φ x + β sin φ y, as χ² of two numbers), spots
+(`watch_spots`) and the numbers of the optics (thicknesses, axes of plates, …). One correction for all of it: noise
 raises an alarm in one of 1/`ALARM` catalogues, at z₀; what is seen in 99 % is (z₀ + 2.33) σ_β. What was found competes
-with the same history of the numbers of the optics (thicknesses, axes of plates, …) and of the other cameras: those that
-describe the stars as well are told together, and a camera is named only if no other is among them.
+with all others of the same history: those that describe the stars as well are told together, and a camera is named
+only if no other is among them. A number of the optics that would have to change by more than `FARTHEST` widths of its
+prior explains nothing: its columns are first-order, and no optics moves that far. If only such a number describes the
+stars, they have changed by something that has no name here.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy import special
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
@@ -41,17 +46,22 @@ from walop_jax.science.star_residuals import (
     ABOUT_GAINS,
     CROWDED,
     FEW,
+    ROUNDING,
     SINGULAR,
+    TRIMMED,
     Scale,
     StarResiduals,
     beside_fitted,
     eliminated,
     is_off,
     noise_scale,
+    normal_matrix,
     of_few,
     own_variance,
 )
-from walop_jax.science.watch_found import History, Suspect, Watch, WatchedChange
+from walop_jax.science.watch_found import UNNAMED, History, Suspect, Watch, WatchedChange
+from walop_jax.science.watch_readings import Answers, Readings
+from walop_jax.science.watch_spots import Spot, Spots, of_stars, profile
 
 SEEN = 2.33
 """Standard deviations above the alarm from which 99 % are found."""
@@ -69,7 +79,6 @@ RIVALS = (
     "filter_shift",
 )
 """Effects of the optics that may be what has changed, beside the parameters of the model."""
-Answers = Float[np.ndarray, "h c"]  # history, camera or number of the optics
 _CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
 _MOST_CHANGES = 4
 _ROUNDS = 6
@@ -80,27 +89,48 @@ def watch(
     calibration: Calibration,
     catalogues: Sequence[Catalogue],
     *,
+    names: Sequence[str] = (),
     rows: int = limits.WATCHED_ROWS,
     force: bool = False,
 ) -> Watch:
     """Look for changes of the instrument since it was calibrated in the stars of catalogues.
 
-    Rows of one MJD are an exposure group; catalogues without it are a group each, in their order. Of more than `rows`
-    rows as many are looked at, spread over the stars. Raises `DataError` as `science.apply.apply` does, and where no
-    row has a camera to spare.
+    Rows of one MJD are an exposure group; catalogues without it are a group each, in their order. Where some rows have
+    an MJD those without one are left out, and told by the `names` of their catalogues. Of more than `rows` rows as many
+    are looked at, spread over the stars. Raises `DataError` as `science.apply.apply` does, and where no row has a
+    camera to spare.
     """
-    dated = [np.isfinite(catalogue.time).any() for catalogue in catalogues]
+    catalogues, remarks = dated(catalogues, names)
     vectors = AnalysisVectors(with_rivals(calibration))
     total, parts = sum(map(len, catalogues)), []
-    for number, catalogue in enumerate(catalogues):
-        if not all(dated):
-            catalogue = dataclasses.replace(catalogue, time=np.full(len(catalogue), float(number)))
+    for catalogue in catalogues:
         share = -(-rows * len(catalogue) // total)
         parts += residuals_of(vectors, catalogue, share, force=force)
     if not parts:
         raise DataError("N: no star has a camera to spare beside flux, q and u; add rows at other settings")
     stars = StarResiduals.joined(parts)
-    return Watching(stars, vectors.instrument.cameras.names, vectors.named, vectors.root).watch()
+    return dataclasses.replace(Watching(stars, vectors).watch(), remarks=remarks)
+
+
+def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[Catalogue], tuple[str, ...]]:
+    """Catalogues with a time in every row, the number of the catalogue where none has any; what was left out."""
+    known = [np.isfinite(catalogue.time) for catalogue in catalogues]
+    if not any(map(np.any, known)):
+        numbered = enumerate(catalogues)
+        return [dataclasses.replace(c, time=np.full(len(c), float(n))) for n, c in numbered], ()
+    remarks = []
+    for number, timed in enumerate(known):
+        if not timed.all():
+            name = names[number] if number < len(names) else f"catalogue {number + 1}"
+            rows = (
+                "no row has a time"
+                if not timed.any()
+                else f"{np.sum(~timed)} of {len(timed)} rows have no time"
+            )
+            remarks.append(f"{name}, MJD: {rows}, others do: left out, as nobody knows when they were taken")
+    return [c.of_rows(timed) for c, timed in zip(catalogues, known, strict=True) if timed.any()], tuple(
+        remarks
+    )
 
 
 def with_rivals(calibration: Calibration) -> Calibration:
@@ -127,12 +157,8 @@ def with_rivals(calibration: Calibration) -> Calibration:
 def grouped(
     time: Float[np.ndarray, " r"], most: int = MOST_GROUPS
 ) -> tuple[Float[np.ndarray, " g"], Int[np.ndarray, " r"]]:
-    """Times of exposure groups and the group of every row; a time that is not known is as the earliest.
-
-    Neighbours of more than `most` groups are joined.
-    """
-    known = np.where(np.isfinite(time), time, np.nanmin(time) if np.isfinite(time).any() else 0.0)
-    times, group = np.unique(known, return_inverse=True)
+    """Times of exposure groups and the group of every row; neighbours of more than `most` groups are joined."""
+    times, group = np.unique(time, return_inverse=True)
     if len(times) > most:
         step = -(-len(times) // most)
         group = group // step
@@ -140,25 +166,21 @@ def grouped(
     return times, group.reshape(-1)
 
 
+Settled = tuple[WatchedChange, Float[np.ndarray, "r k"]]
+"""A change, and the residuals behind it."""
+
+
 class Watching:
     """The histories at the head of this file, looked for in the residuals of stars.
 
-    `stars.time` is an MJD, or the number of the exposure group; rows of equal time are one group. `cameras` are names,
-    `parameters` names and units of `stars.parameters()`, `root` a square root of their covariance.
+    `stars.time` is an MJD, or the number of the exposure group; rows of equal time are one group. `vectors` are those
+    of the calibration by which the residuals were made.
     """
 
-    def __init__(
-        self,
-        stars: StarResiduals,
-        cameras: Sequence[str],
-        parameters: Sequence[tuple[str, str]],
-        root: Float[np.ndarray, "n n"],
-    ) -> None:
-        self.stars, self.cameras = stars, tuple(cameras)
-        # Of the parameters those that make any difference to the light of stars.
-        self.seen = np.flatnonzero(np.abs(stars.plain).max(axis=(0, 1)) > 0)
-        self.optics = [parameters[p] for p in self.seen]  # pyright: ignore[reportArgumentType, reportCallIssue]
-        self.root = root[:, np.abs(root).max(axis=0, initial=0.0) > 0]
+    def __init__(self, stars: StarResiduals, vectors: AnalysisVectors) -> None:
+        self.stars, self.cameras = stars, tuple(vectors.instrument.cameras.names)
+        self.readings = Readings(stars, vectors)
+        self.root = vectors.root[:, np.abs(vectors.root).max(axis=0, initial=0.0) > 0]
         self.variance = own_variance(stars)
         self.time, self.group = grouped(stars.time)
         groups = len(self.time)
@@ -166,8 +188,13 @@ class Watching:
         self.histories += [History("drift", g) for g in range(groups - 2)]
         self.histories += [History("once", g) for g in range(1, groups - 1)]
         self.shapes = np.stack([h.over(self.time) for h in self.histories], axis=1)
-        self.tests = len(self.histories) * (len(cameras) + len(self.optics))
-        self.alarm = threshold(ALARM / self.tests)
+        self.spots = Spots(stars, self.readings.edge)
+        self.spoilt = np.zeros(len(stars.photon), bool)  # by spots that were found
+        self.tests = len(self.histories) * self.readings.asked
+        # Half of the false alarms are for spots: as many as there are would else take from all others.
+        self.alarm = threshold(0.5 * ALARM / self.tests)
+        asked = groups * len(self.readings.of_cameras) * len(self.spots)
+        self.alarm_of_spots = threshold(0.5 * ALARM / max(asked, 1))
         # Stars of a single group have a scale with the others of it; those of several groups together.
         low, high = (op.reduceat(self.group, stars.first) for op in (np.minimum, np.maximum))
         self.pool = np.where(low == high, low, groups)
@@ -183,12 +210,14 @@ class Watching:
         the scatter about the gains that fit each group best, if there are stars enough to know it.
         """
         weight, share, whole, off = self._scaled(residual, np.zeros(len(self.time)))
-        for _ in range(ABOUT_GAINS if off else 0):
-            left, fitted = self._behind_gains(residual, weight, share)
-            found = self._scaled(left, fitted)
-            if found[2].worth < FEW:
-                break
-            weight, share = found[:2]
+        # The gains, then their gradients as well if the scatter about the gains is not that of noise.
+        for kinds in (1, 3):
+            for _ in range(ABOUT_GAINS if off else 0):
+                left, fitted = self._behind_gains(residual, weight, share, kinds * len(self.cameras))
+                found = self._scaled(left, fitted)
+                if found[2].worth < FEW:
+                    return weight, share, whole
+                weight, share, _, off = found
         return weight, share, whole
 
     def _scaled(
@@ -222,17 +251,21 @@ class Watching:
         residual: Float[np.ndarray, "r k"],
         weight: Float[np.ndarray, " s"],
         share: Float[np.ndarray, " s"],
+        count: int,
     ) -> tuple[Float[np.ndarray, "r k"], Float[np.ndarray, " g"]]:
-        """Residuals behind the gains of the cameras that fit each group best, and how many numbers these are."""
-        groups, cameras = len(self.time), len(self.cameras)
+        """Residuals behind the first `count` columns as they fit each group best, and how many numbers these are."""
+        groups = len(self.time)
         blocks, slopes = self._by_group(*self.scan(residual, weight, share))
-        gain, fitted = np.zeros((groups, cameras)), np.zeros(groups)
+        size, fitted = np.zeros((groups, count)), np.zeros(groups)
         for g in range(groups):
-            root = whitening(blocks[g, :cameras, g, :cameras], SINGULAR)
-            gain[g] = root @ (root.T @ slopes[g, :cameras])
+            root = whitening(blocks[g, :count, g, :count], SINGULAR)
+            size[g] = root @ (root.T @ slopes[g, :count])
             fitted[g] = root.shape[1]
-        left = self.stars.behind(residual, lambda part, rows: part.model * gain[self.group[rows]])
-        return left, fitted
+
+        def change(part: StarResiduals, rows: slice) -> Float[np.ndarray, "r k"]:
+            return np.einsum("rkc,rc->rk", self.readings.columns(part)[..., :count], size[self.group[rows]])
+
+        return self.stars.behind(residual, change), fitted
 
     # -------------------------------------------------------------------------------------------- columns
 
@@ -242,15 +275,17 @@ class Watching:
         weight: Float[np.ndarray, " s"],
         share: Float[np.ndarray, " s"],
     ) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
-        """Q and g of `_changes` in all groups (group, change), errors of the calibration eliminated."""
-        stars, count, groups = self.stars, len(self.cameras) + len(self.optics), len(self.time)
+        """Q and g of `columns` in all groups (group, column), errors of the calibration eliminated."""
+        stars, count, groups = self.stars, self.readings.columns_count, len(self.time)
         known = self.root.shape[1] + 2
         gains = np.zeros((groups * count, groups * count))
         cross, nuisance = np.zeros((groups * count, known)), np.eye(known)
         score, pull = np.zeros(groups * count), np.zeros(known)
+        whole = np.zeros((groups, count))
         for here, rows, part in stars.blocks():
             group, w, k = self.group[rows], weight[here], share[here]
-            values = np.concatenate([self._changes(part), self._errors(part)], axis=-1)
+            values = np.concatenate([self.readings.columns(part), self._errors(part)], axis=-1)
+            np.add.at(whole, group, np.sum(values[..., :count] ** 2, axis=1) * (w * k)[part.star, None])
             free, along = part.projected(values)
             heavy = np.sqrt(w * k)[part.star]
             free = free * heavy[:, None]
@@ -278,6 +313,8 @@ class Watching:
             slopes = np.einsum("rkc,rk->rc", values, normal)
             np.add.at(score.reshape(groups, count), group, slopes[:, :count])
             pull += slopes[:, count:].sum(axis=0)
+        rounding = np.diag(gains) <= ROUNDING * whole.ravel()
+        gains[rounding], gains[:, rounding], cross[rounding], score[rounding] = 0.0, 0.0, 0.0, 0.0
         full = np.block([[gains, cross], [cross.T, nuisance]])
         return eliminated(full, np.concatenate([score, pull]), groups * count)
 
@@ -311,68 +348,76 @@ class Watching:
         slopes = score.reshape(len(self.time), -1)
         return matrix.reshape(*slopes.shape, *slopes.shape), slopes
 
-    def _changes(self, part: StarResiduals) -> Float[np.ndarray, "r k c"]:
-        """Columns of what may change: the gains of the cameras, then the numbers of the optics."""
-        gains = part.model[..., None] * np.eye(len(self.cameras))
-        return np.concatenate([gains, part.plain[..., self.seen]], axis=-1)
-
     def _errors(self, part: StarResiduals) -> Float[np.ndarray, "r k n"]:
         return np.concatenate([part.parameters() @ self.root, part.colour], axis=-1)
 
-    def suspects(self, size: Answers, error: Answers) -> list[Suspect]:
-        """Every camera and every number of the optics with the histories compared, the most significant first."""
-        asked = [*((name, "") for name in self.cameras), *self.optics]
-        found = [
+    def suspects(self, found: Answers) -> list[Suspect]:
+        """Every reading with the histories compared, the most significant first; those too large for theirs last."""
+        listed = [
             Suspect(
-                name, k < len(self.cameras), self.histories[n], float(size[n, k]), float(error[n, k]), unit
+                reading.name, reading.kind != "optics", self.histories[n], float(found.size[n, k]),
+                float(found.error[n, k]), reading.unit, reading.kind,
+                () if reading.across is None else (float(found.angle[n, k]),),
             )
-            for n in self.near(size / error)
-            for k, (name, unit) in enumerate(asked)
-            if np.isfinite(error[n, k])
-        ]
-        return sorted(found, key=lambda entry: -abs(entry.sigma))
+            for n in self.near(found.size / found.error)
+            for k, reading in enumerate(self.readings.listed)
+            if np.isfinite(found.error[n, k])
+        ]  # fmt: skip
+        return sorted(listed, key=lambda entry: (not self.readings.possible(entry), -abs(entry.sigma)))
 
     def without(
         self, residual: Float[np.ndarray, "r k"], change: Suspect, size: float
     ) -> Float[np.ndarray, "r k"]:
         """Residuals behind a change."""
         grown = change.history.over(self.time)[self.group, None] * size
-        column = [*self.cameras, *(name for name, _ in self.optics)].index(change.name)
-        return self.stars.behind(residual, lambda part, rows: self._changes(part)[..., column] * grown[rows])
+        return self.stars.behind(
+            residual, lambda part, rows: self.readings.signature(part, change) * grown[rows]
+        )
 
     # --------------------------------------------------------------------------------------------- asking
 
     def watch(self) -> Watch:
-        """Histories of cameras, the strongest first, until nothing is left."""
+        """Changes, the strongest first, until nothing is left."""
         residual, changes = self.stars.residual, []
         weight, share, whole = self.weights(residual)
         matrix, score = self.scan(residual, weight, share)
         while len(changes) < _MOST_CHANGES:
-            size, error = self.answers(matrix, score)
-            if not np.abs(size / error).max() > self.alarm:
+            found = self.answers(matrix, score)
+            ways = [self.spotted(residual, weight, share)]
+            if np.abs(found.size / found.error).max() > self.alarm:
+                ways.append(self.settled(residual, found))
+            if (chosen := self._likeliest([way for way in ways if way is not None])) is None:
                 break
-            found, residual = self.settled(residual, size, error)
-            changes.append(found)
+            change, residual = chosen
+            changes.append(change)
+            if change.best.kind == "spot":
+                x, y, radius, edge = change.best.place
+                self.spoilt |= profile(self.spots.x, self.spots.y, (x, y, 1.5 * radius, edge)) > 0
             weight, share, whole = self.weights(residual)
             matrix, score = self.scan(residual, weight, share)
         return self.told(changes, matrix, score, whole)
 
-    def answers(self, matrix: Any, score: Any) -> tuple[Answers, Answers]:
-        """Sizes and standard errors of every history of every camera and number of the optics, each alone."""
-        blocks, slopes = self._by_group(matrix, score)
-        count = slopes.shape[1]
-        size, error = np.zeros((len(self.histories), count)), np.full((len(self.histories), count), np.inf)
-        for k in range(count):
-            own = blocks[:, k, :, k]
-            information = np.einsum("gh,gf,fh->h", self.shapes, own, self.shapes, optimize=True)
-            seen = information > 1e-9 * np.trace(own)
-            size[seen, k] = self.shapes.T[seen] @ slopes[:, k] / information[seen]
-            error[seen, k] = information[seen] ** -0.5
-        return size, error
+    def _likeliest(self, ways: list[Settled]) -> Settled | None:
+        """The change behind which χ² is least, stars that are left out at their cut; others as good are alike."""
+        if len(ways) < 2:
+            return ways[0] if ways else None
+        dof = self.stars.dof.astype(float)
+        each = [self.stars.chi2(left) / self.variance for _, left in ways]
+        scale = max(1.0, min(noise_scale(chi2, dof).value for chi2 in each))
+        cut = special.chdtri(np.maximum(dof, 1e-12), TRIMMED)
+        cost = [float(np.minimum(chi2 / scale, cut)[dof > 0].sum()) for chi2 in each]
+        near = abs(cost[1] - cost[0]) < RIVAL and ways[1][0].best.kind != UNNAMED
+        # The simpler one, if both are as good: spots are the first.
+        (change, left), (other, _) = ways[::-1] if near else (ways[n] for n in np.argsort(cost))
+        if near:
+            change = dataclasses.replace(change, alike=change.alike + other.alike)
+        return change, left
 
-    def settled(
-        self, residual: Float[np.ndarray, "r k"], size: Answers, error: Answers
-    ) -> tuple[WatchedChange, Float[np.ndarray, "r k"]]:
+    def answers(self, matrix: Any, score: Any) -> Answers:
+        """Every history of every reading, each alone."""
+        return self.readings.answers(*self._by_group(matrix, score), self.shapes)
+
+    def settled(self, residual: Float[np.ndarray, "r k"], found: Answers) -> Settled:
         """A change with its rivals, and what is left behind it.
 
         Histories compared are the best of each kind and camera and their neighbours. The fit is repeated with the
@@ -383,21 +428,107 @@ class Watching:
         for _ in range(_ROUNDS):
             if best is not None:
                 weight, share, _ = self.weights(left)
-                size, error = self.answers(*self.scan(self.without(left, best, -total), weight, share))
-            ranked = self.suspects(size, error)
+                found = self.answers(*self.scan(self.without(left, best, -total), weight, share))
+            ranked = self.suspects(found)
+            if abs(ranked[0].sigma) < self.alarm or not self.readings.possible(ranked[0]):
+                ranked.sort(key=lambda entry: -abs(entry.sigma))
             before, best = best, ranked[0]
-            alike = [entry for entry in ranked if entry.sigma**2 > best.sigma**2 - RIVAL]
+            alike = [
+                entry
+                for entry in ranked
+                if entry.sigma**2 > best.sigma**2 - RIVAL and self.readings.possible(entry)
+            ]
             moved = abs(best.size - total) / best.error
             total = best.size
             left = self.without(residual, best, total)
-            if before is not None and before[:3] == best[:3] and moved < _SETTLED:
+            if before is not None and before.thing == best.thing and moved < _SETTLED:
                 break
         assert best is not None
+        if not self.readings.possible(best):
+            best = best._replace(name=UNNAMED, unit="", kind=UNNAMED)
+            alike = [best]
+        return self._dated(best, alike), left
+
+    def _dated(self, best: Suspect, alike: list[Suspect]) -> WatchedChange:
         began = self.time[[entry.history.start for entry in alike]]
         when = float(self.time[best.history.start]), (float(began.min()), float(began.max()))
-        return WatchedChange(best, tuple(alike), *when), left
+        return WatchedChange(best, tuple(alike), *when)
 
-    def near(self, z: Answers) -> list[int]:
+    def spotted(
+        self,
+        residual: Float[np.ndarray, "r k"],
+        weight: Float[np.ndarray, " s"],
+        share: Float[np.ndarray, " s"],
+    ) -> Settled | None:
+        """A step in a spot of the field, and what is left behind it; None where noise makes as much."""
+        # Stars that lie off may be those of the spot.
+        common = np.zeros(len(self.time) + 1)
+        np.maximum.at(common, self.pool, weight * self.variance)
+        every, members = common[self.pool] / self.variance, self.readings.members
+        strongest: tuple[Spot, int, Any, Any] | None = None
+        for start, (z, root) in enumerate(of_stars(self.stars, self.group, members, residual, every, share)):
+            z[self.spoilt] = 0.0
+            spot = self.spots.strongest(z)
+            if spot is not None and spot.strength > max(
+                self.alarm_of_spots, strongest[0].strength if strongest else 0.0
+            ):
+                strongest = spot, start, z[:, spot.unit], root[:, spot.unit]
+        if strongest is None:
+            return None
+        spot, start, z, root = strongest
+        place, described = self.spots.refined(spot, z, root)
+        best = Suspect(
+            self.readings.of_cameras[spot.unit].name,
+            True,
+            History("step", start),
+            0.0,
+            np.inf,
+            "",
+            "spot",
+            place,
+        )
+        ranked, weight = [best], np.where(described, every, weight)
+        for _ in range(2):  # which cameras, and from when on
+            best = ranked[0]
+            asked = [best._replace(name=reading.name) for reading in self.readings.of_cameras]
+            asked += [best._replace(history=History("step", g)) for g in range(len(self.time))]
+            if not (ranked := self._sized(residual, asked, weight, share)):
+                return None
+        best = ranked[0]
+        if abs(best.sigma) < self.alarm_of_spots or not self.readings.possible(best):
+            return None
+        alike = [entry for entry in ranked if entry.sigma**2 > best.sigma**2 - RIVAL]
+        return self._dated(best, alike), self.without(residual, best, best.size)
+
+    def _sized(
+        self,
+        residual: Float[np.ndarray, "r k"],
+        asked: list[Suspect],
+        weight: Float[np.ndarray, " s"],
+        share: Float[np.ndarray, " s"],
+    ) -> list[Suspect]:
+        """Changes with size and error, each alone, the most significant first; without those that no star sees."""
+
+        def columns(part: StarResiduals, rows: slice) -> Float[np.ndarray, "r k c"]:
+            steps = [
+                e.history.over(self.time)[self.group[rows], None] * self.readings.signature(part, e)
+                for e in asked
+            ]
+            return np.concatenate([np.stack(steps, axis=-1), self._errors(part)], axis=-1)
+
+        matrix, score = normal_matrix(self.stars, residual, columns, weight, share)
+        count, whole = len(asked), np.diag(matrix)
+        matrix = matrix + np.diag((np.arange(len(matrix)) >= count).astype(float))
+        left, pull = eliminated(matrix, score, count)
+        known = np.diag(left)
+        found = [
+            entry._replace(size=float(s / i), error=float(i**-0.5))
+            for entry, s, i, most in zip(asked, pull, known, whole, strict=False)
+            if i > ROUNDING * most > 0
+        ]
+        return sorted(found, key=lambda entry: -abs(entry.sigma))
+
+    def near(self, z: Float[np.ndarray, "h c"]) -> list[int]:
         """The best history of each kind, whatever has changed, and its neighbours in time."""
         strength = np.max(np.abs(z), axis=1)
         chosen: list[int] = []
@@ -425,7 +556,8 @@ class Watching:
             own = np.diag(blocks[:, k, :, k])
             gain[:, k] = slopes[:, k] / np.where(own > 0, own, np.inf)
             for change in changes:
-                mine = next((entry for entry in change.alike if entry.name == self.cameras[k]), None)
+                may = [e for e in change.alike if e.of_gain and self.cameras[k] in e.members]
+                mine = min(may, key=lambda entry: len(entry.name), default=None)
                 gain[:, k] += 0.0 if mine is None else mine.size * mine.history.over(self.time)
             error[:, k] = np.where(own > 0, own, np.nan) ** -0.5
             information = np.einsum("gh,gf,fh->h", steps, blocks[:, k, :, k], steps, optimize=True)

@@ -34,8 +34,18 @@ class History(NamedTuple):
         return np.clip((time - time[self.start]) / max(time[-1] - time[self.start], 1e-300), 0.0, 1.0)
 
 
+UNNAMED = "unnamed"
+"""Kind and name of a change that nothing in its range describes."""
+
+
 class Suspect(NamedTuple):
-    """Possible change: a camera or a number of the optics, by how much, and its significance."""
+    """Possible change: of cameras or a number of the optics, by how much, and its significance.
+
+    `kind` is gain (a camera), arm (its cameras together, NAME+NAME), gradient or spot (of a camera or an arm), optics,
+    or `UNNAMED`. `place` is the direction of a gradient (deg, from X towards Y), whose size is that at the edge of the
+    field, or centre and radius (deg) and the sharpness of the edge (`watch_spots`) of a spot, whose size is that at
+    its centre.
+    """
 
     name: str
     camera: bool
@@ -43,6 +53,23 @@ class Suspect(NamedTuple):
     size: float
     error: float
     unit: str
+    kind: str = "gain"
+    place: tuple[float, ...] = ()
+
+    @property
+    def members(self) -> tuple[str, ...]:
+        """The cameras that it is of."""
+        return tuple(self.name.split("+")) if self.camera else ()
+
+    @property
+    def of_gain(self) -> bool:
+        """True if cameras have changed as a whole."""
+        return self.kind in ("gain", "arm")
+
+    @property
+    def thing(self) -> tuple[str, str, History]:
+        """What has changed, and how in time."""
+        return self.kind, self.name, self.history
 
     @property
     def sigma(self) -> float:
@@ -66,7 +93,8 @@ class WatchedChange:
     def camera(self) -> str | None:
         """The camera, if it is one and no other, and not the optics."""
         names = {entry.name for entry in self.alike}
-        return self.best.name if len(names) == 1 and self.best.camera else None
+        single = len(names) == len(self.best.members) == 1 and self.best.kind != UNNAMED
+        return self.best.name if single else None
 
     def words(self) -> str:
         """The change in a sentence."""
@@ -81,7 +109,7 @@ class WatchedChange:
         when = how[self.best.history.kind].format(date)
         spread = f"; it began between {ends[0]} and {ends[1]}" if ends[0] != ends[1] else ""
         significance = f"({abs(self.best.sigma):.0f} σ{spread})"
-        others = {entry.name: entry for entry in self.alike if entry.name != self.best.name}
+        others = {e.thing[:2]: e for e in self.alike if e.thing[:2] != self.best.thing[:2]}
         if not others:
             return f"{_words(self.best)} {when} {significance}"
         told = some([_words(entry) for entry in (self.best, *others.values())], 5, " or ")
@@ -89,8 +117,17 @@ class WatchedChange:
 
 
 def _words(entry: Suspect) -> str:
+    if entry.kind == UNNAMED:
+        return "a change that no camera, arm or place of the field makes, nor a number of the optics within its range"
+    size, error, where = entry.size, entry.error, ""
+    if entry.kind == "gradient":
+        where = f" at the edge of the field {round(entry.place[0]) % 360}° from X towards Y"
+    elif entry.kind == "spot":
+        x, y, radius = (with_minus_sign(f"{value:.3f}") for value in entry.place[:3])
+        where = f" in a spot at X = {x}°, Y = {y}°, within {radius}°"
     kind, camera = ("gain", 0) if entry.camera else ("optics", -1)
-    return ChangeQuestion(kind, entry.name, entry.unit, camera).words(entry.size, entry.error)
+    name = " and ".join(entry.members) or entry.name
+    return ChangeQuestion(kind, name, entry.unit, camera).words(size, error) + where
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -100,7 +137,7 @@ class Watch(Displayed):
     By exposure group: `time` (MJD, or its number), `stars`, `chi2` per degree of freedom, `gain` of every camera
     (change since the calibration, that camera alone) with `error`, and `smallest`: the step of each camera from that
     group on that would be found in 99 % of cases. `tests` histories were asked; the alarm is at `alarm` standard
-    errors.
+    errors. `remarks` are about rows that were left out.
     """
 
     cameras: tuple[str, ...]
@@ -114,6 +151,7 @@ class Watch(Displayed):
     noise: float
     tests: int
     alarm: float
+    remarks: tuple[str, ...] = ()
 
     @property
     def holds(self) -> bool:
@@ -123,7 +161,7 @@ class Watch(Displayed):
     @property
     def warnings(self) -> tuple[str, ...]:
         """A sentence for every change, and one if N_ERR is not what the counts scatter by."""
-        said = tuple(change.words() for change in self.changes)
+        said = (*(change.words() for change in self.changes), *self.remarks)
         if 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS:
             return said
         return (

@@ -1,1 +1,1 @@
-"""The full-Moon sky and the turn from the sky to the instrument frame: astropy's second door."""
+"""The full-Moon sky, the turn from the sky to the instrument frame, and nights."""

@@ -131,6 +131,14 @@ class Change:
         """The change of an instrument with its scales."""
         return dataclasses.replace(self, units=units)
 
+    @property
+    def of_stars(self) -> bool:
+        """True if what it does to a star is known from the counts and the place of the star alone."""
+        elsewhere = self.kind == "afterglow" or (self.kind == "light" and self.origin in ("", OPPOSITE))
+        return not elsewhere and all(
+            factor.split()[0] not in ("hours", "exposure", "kind") for factor in self.factors
+        )
+
     def times(self, *factors: str) -> Change:
         """The change with further factors."""
         return dataclasses.replace(self, factors=(*self.factors, *factors))

@@ -1,0 +1,147 @@
+"""Spots of the field in which a camera has lost or gained light: dust, dew, a blemish.
+
+    f(d) = (1 − (d/R)ᵐ)²  within R of a place,     T = Σ f z / √(Σ f²)
+
+over the stars near the place, z the gain of a camera (or an arm) that each star has by itself, in standard errors and
+no more than `CLIPPED`: a star that lies off for reasons of its own is no spot, nor are three of them. Without a spot
+T is normal. Places lie on a grid of R/2, for every R of `RADII` and m = 2. Place, R and m (of `EDGES`: a blurred spot
+or a sharp one) are then those of the least Σ min((z − β f/σ)², c), c the square at which stars are no longer used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import optimize, sparse, spatial, special
+
+from walop_jax.science.star_residuals import FEW, ROUNDING, TRIMMED, StarResiduals
+
+RADII = (0.5, 0.25, 0.125)  # of the distance of the edge of the field
+WIDEST = 0.7  # the same, of any spot
+CLIPPED = float(-special.ndtri(0.5 * TRIMMED))  # 3.3 standard errors
+Place = tuple[float, ...]
+
+
+EDGES = (2.0, 8.0)
+
+
+def profile(x: Float[np.ndarray, " r"], y: Float[np.ndarray, " r"], place: Place) -> Float[np.ndarray, " r"]:
+    """f at positions (deg); a place is (x, y, R, m)."""
+    distance = np.hypot(x - place[0], y - place[1]) / max(place[2], 1e-9)
+    return (1.0 - np.minimum(distance, 1.0) ** place[3]) ** 2
+
+
+class Spot(NamedTuple):
+    """A spot that stands out: T, the number of the camera or arm, and (x, y, R in degrees, m)."""
+
+    strength: float
+    unit: int
+    place: Place
+
+
+class Spots:
+    """Places at which the stars of a list could see a spot."""
+
+    def __init__(self, stars: StarResiduals, edge: float) -> None:
+        self.edge = edge
+        self.x, self.y = x, y = stars.x[stars.first], stars.y[stars.first]
+        tree, blocks, places = spatial.KDTree(np.column_stack([x, y])), [], []
+        for radius in (share * edge for share in RADII):
+            axis = np.arange(-edge, edge + 0.25 * radius, 0.5 * radius)
+            centres = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+            near = spatial.KDTree(centres).sparse_distance_matrix(tree, radius, output_type="coo_matrix")
+            value = np.clip(1.0 - (near.data / radius) ** 2, 0.0, None) ** 2
+            shape = sparse.csr_array((value, (near.row, near.col)), shape=(len(centres), len(x)))
+            enough = np.diff(shape.indptr) >= FEW
+            blocks.append(shape[np.flatnonzero(enough)])
+            places += [(float(a), float(b), radius, EDGES[0]) for a, b in centres[enough]]
+        self.places: list[Place] = places
+        self.shape = sparse.csr_array(sparse.vstack(blocks))
+        self.square, self.within = (self.shape.copy() for _ in range(2))
+        self.square.data = self.shape.data**2
+        self.within.data = np.ones(self.shape.nnz)
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def strongest(self, z: Float[np.ndarray, "s k"]) -> Spot | None:
+        """Where T is largest; `z` is 0 for stars that do not see a camera. None without a place of enough stars."""
+        seen = (z != 0).astype(float)
+        enough = self.within @ seen >= FEW
+        heavy = np.sqrt(np.maximum(self.square @ seen, 1e-300))
+        strength = np.where(enough, np.abs(self.shape @ np.clip(z, -CLIPPED, CLIPPED)) / heavy, 0.0)
+        if not strength.any():
+            return None
+        place, unit = np.unravel_index(strength.argmax(), strength.shape)
+        return Spot(float(strength[place, unit]), int(unit), self.places[int(place)])
+
+    def refined(
+        self, spot: Spot, z: Float[np.ndarray, " s"], root: Float[np.ndarray, " s"]
+    ) -> tuple[Place, Bool[np.ndarray, " s"]]:
+        """The place near which a spot fits best, and the stars that it describes; `root` is 1/σ of each star's gain."""
+        near = np.flatnonzero(
+            (profile(self.x, self.y, (*spot.place[:2], 3.0 * spot.place[2], 2.0)) > 0) & (z != 0)
+        )
+        x, y, z, root = self.x[near], self.y[near], z[near], root[near]
+        inside = profile(x, y, spot.place) > 0.1
+        start = float(np.median(z[inside] / root[inside])) if inside.any() else 0.0
+        unit = spot.place[2]
+
+        def off(values: Float[np.ndarray, " v"], edge: float) -> Float[np.ndarray, " s"]:
+            place = (unit * values[0], unit * values[1], unit * abs(values[2]), edge)
+            return (z - start * values[3] * root * profile(x, y, place)) ** 2
+
+        widest = WIDEST * self.edge / unit
+
+        def cost(values: Float[np.ndarray, " v"], edge: float) -> float:
+            if abs(values[2]) > widest or np.abs(values[:2] * unit).max() > self.edge:
+                return np.inf  # what covers the field is no spot
+            return float(np.minimum(off(values, edge), CLIPPED**2).sum())
+
+        begin = [spot.place[0] / unit, spot.place[1] / unit]
+        ways = [
+            (optimize.minimize(cost, [*begin, wide, 1.2], (edge,), method="Nelder-Mead"), edge)
+            for edge in EDGES
+            for wide in (0.7, 1.0, 1.4)
+        ]
+        best, edge = min(ways, key=lambda way: way[0].fun)
+        place = (unit * float(best.x[0]), unit * float(best.x[1]), unit * abs(float(best.x[2])), edge)
+        described = np.zeros(len(self.x), bool)
+        described[near] = (off(best.x, edge) < CLIPPED**2) & (profile(x, y, place) > 0)
+        return place, described
+
+
+def of_stars(
+    stars: StarResiduals,
+    group: Int[np.ndarray, " r"],
+    members: Float[np.ndarray, "k c"],
+    residual: Float[np.ndarray, "r k"],
+    weight: Float[np.ndarray, " s"],
+    share: Float[np.ndarray, " s"],
+) -> Iterator[tuple[Float[np.ndarray, "s c"], Float[np.ndarray, "s c"]]]:
+    """For every exposure group the gain of cameras from it on, by each star alone, in standard errors; and 1/σ of it.
+
+    Both are 0 where a star does not see it. `members` are 1 for the cameras that are taken together; weights are those
+    of `normal_matrix`.
+    """
+    parts: list[list[np.ndarray]] = [[], [], [], []]
+    for here, rows, part in stars.blocks():
+        heavy = np.sqrt(weight[here] * share[here])[part.star, None]
+        free, _ = part.projected(part.model[..., None] * members)
+        half = np.linalg.cholesky(part.photon).swapaxes(1, 2)[part.star]
+        along = half @ np.einsum("rik,ark->ria", part.tangent, free, optimize=True)
+        parts[0].append((part.model * residual[rows]) @ members * weight[here][part.star, None])
+        parts[1].append(np.sum(free**2, axis=-1).T * heavy**2)
+        parts[2].append(along * heavy[..., None])
+        parts[3].append(part.model**2 @ members * heavy**2)
+    score, single, along, whole = map(np.concatenate, parts)
+    for start in range(int(group.max()) + 1):
+        on = (group >= start).astype(float)[:, None]
+        pull, information, most = (np.add.reduceat(on * v, stars.first) for v in (score, single, whole))
+        information -= np.sum(np.add.reduceat(on[..., None] * along, stars.first) ** 2, axis=1)
+        seen = information > ROUNDING * most
+        root = np.sqrt(np.where(seen, information, 1.0))
+        yield np.where(seen, pull / root, 0.0), np.where(seen, root, 0.0)
