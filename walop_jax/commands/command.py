@@ -31,7 +31,8 @@ LOG.addHandler(logging.NullHandler())
 
 T = TypeVar("T")
 Tell = Callable[[str], None]
-Writers = Mapping[str, Callable[[Path], object]]
+Writers = Mapping[str, Callable[[Path], object] | None]
+"""Writers of files by name; None: this result has no such file."""
 Given = Callable[[tuple[Any, ...], dict[str, Any]], tuple[tuple[Any, ...], dict[str, Any]]]
 
 
@@ -161,15 +162,24 @@ class Outcome(Generic[T]):
         value: Any = self.value
         return value.display().text() if self.text is None else self.text()
 
-    def save(self, folder: OutputFolder, drop: Sequence[str] = ()) -> None:
-        """Put all files into the output folder: they appear together, or none does."""
+    def save(self, folder: OutputFolder, drop: Sequence[str] = ()) -> Outcome[T]:
+        """Put all files into the output folder, together; gives the outcome, a failure where one was not written."""
+        from walop_jax.io.folder import NotWrittenError
         from walop_jax.io.text import json_text
 
-        with folder.filled(drop=drop) as temporary:
-            for name, write in self.files().items():
-                write(temporary / name)
-            if self.saved_as:
-                text_file(json_text(self.content))(temporary / self.saved_as)
+        files = self.files()
+        absent = [name for name, write in files.items() if write is None]
+        names = [name for name in folder.names if name not in absent]
+        try:
+            with folder.filled(names, (*drop, *absent)) as temporary:
+                for name, write in files.items():
+                    if write is not None:
+                        write(temporary / name)
+                if self.saved_as:
+                    text_file(json_text(self.content))(temporary / self.saved_as)
+        except NotWrittenError as error:
+            return dataclasses.replace(self, failure=self.failure or str(error))
+        return self
 
 
 COMMON = {
@@ -243,6 +253,8 @@ class Command(Generic[T]):
             found = self.run(Job(**shared), arguments)
             for sentence in found.warnings:
                 LOG.warning("%s", sentence)
+            if found.failure:
+                LOG.error("%s", found.failure)
             return found.value
 
         functools.update_wrapper(call, self.body)
@@ -265,9 +277,7 @@ class Command(Generic[T]):
         more = {name: value for key in rest for name, value in arguments.pop(key, {}).items()}
         with job.reserved(output if names else None, names) as reserved:
             found = self.body(reserved, **arguments, **more)
-            if reserved.folder is not None:
-                found.save(reserved.folder)
-        return found
+            return found if reserved.folder is None else found.save(reserved.folder)
 
 
 def command(**options: Any) -> Callable[[Callable[..., Outcome[T]]], Callable[..., T]]:

@@ -51,10 +51,10 @@ NEXT = {
     "import_zemax": ("walop-jax refit {output} -o RUN",),
     "model": ("walop-jax refit {calsets} --instrument {instrument} --model {output} -o RUN",),
     "sample": ("walop-jax report {fit}",),
-    "limits": ("walop-jax report {output}", "walop-jax plan"),
+    "plan": ("walop-jax report {output}", "walop-jax simulate {output}/plan.toml -o SET.fits"),
     "compare": ("walop-jax report {output}",),
     "epoch": ("walop-jax report {output}",),
-    "apply": ("walop-jax watch {calibration} {output}, with the nights to come",),
+    "apply": ("walop-jax watch {calibration} {output} -o WATCH",),
     "report": ("open the page in a browser",),
     "certify": ("walop-jax apply {calibration} STARS.fits -o OUT.fits",),
 }

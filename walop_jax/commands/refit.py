@@ -137,8 +137,7 @@ def refit(
                 return found
             job.tell("mapping the field", "mapping")
             if result.converged:
-                found.save(job.folder, drop=(FAILED, PARTIAL))
-                return found
+                return found.save(job.folder, drop=(FAILED, PARTIAL))
             job.folder.path.mkdir(exist_ok=True)
             with atomic_path(job.folder.path / FAILED, overwrite=True) as temporary:
                 temporary.write_text(json_text(found.content), encoding="utf-8")

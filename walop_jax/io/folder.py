@@ -30,7 +30,7 @@ from walop_jax.io.atomic import (
     remove,
     remove_leftovers,
 )
-from walop_jax.io.errors import fail
+from walop_jax.io.errors import DataError, fail
 
 _MOST = 2000
 """Files beyond which a folder is not exchanged as a whole: it is more than that of a run."""
@@ -66,6 +66,10 @@ def check_folder(path: str | os.PathLike[str], names: Sequence[str] = (), *, ove
     return Path(os.path.realpath(folder))
 
 
+class NotWrittenError(DataError):
+    """A file of a result was not written; all others are in their place."""
+
+
 @dataclasses.dataclass(frozen=True)
 class OutputFolder:
     """A folder that this process alone writes results to; `path` is what the caller named it."""
@@ -85,8 +89,8 @@ class OutputFolder:
         mount point, or it holds thousands of files) the old results go before the new ones come, one by one. When
         the block raises, nothing of it is left. `names` are those of the reservation, unless given.
 
-        Raises `DataError` as `check_folder` does, for a file that was not written, and for what the operating
-        system refuses.
+        Raises `DataError` as `check_folder` does, and for what the operating system refuses; `NotWrittenError` where a
+        file was not written, once all others are in place.
         """
         names = tuple(names) or self.names
         check_folder(self.path, names, overwrite=self.overwrite)
@@ -100,22 +104,24 @@ class OutputFolder:
         try:
             with errors_of(self.path, temporary):
                 yield temporary
-                if missing := [name for name in names if not (temporary / name).is_file()]:
-                    raise fail(f"{missing[0]} was not written", file=self.path, advice="report this")
+            missing = [name for name in names if not (temporary / name).is_file()]
+            names = tuple(name for name in names if name not in missing)
             for name in names:
                 flush(temporary / name)
                 if (self.target / name).is_file():
                     (temporary / name).chmod((self.target / name).stat().st_mode & 0o777)
             flush_folder(temporary)
             if whole:
-                _appear(temporary, self.target, {*names, *drop})
+                _appear(temporary, self.target, {*names, *missing, *drop})
             else:
-                _move(temporary, self.target, names, drop)
+                _move(temporary, self.target, names, (*missing, *drop))
         except OSError as error:
             advice = "free some space; what was there is untouched"
             raise fail(f"writing failed: {error.strerror or error}", file=self.path, advice=advice) from error
         finally:
             remove(temporary)
+        if missing:
+            raise NotWrittenError(f"{self.path}: {', '.join(missing)} was not written, all else was; report this")
 
 
 @contextlib.contextmanager

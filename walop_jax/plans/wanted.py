@@ -203,9 +203,10 @@ def _apart(found: Candidates) -> Wanted:
         raise ValueError("give two or more effects to be distinguished, and the size of one: NAME=VALUE")
     base = np.setdiff1d(np.arange(len(names)), np.concatenate(list(of.values())))
     size = np.zeros(len(names))
+    shapes = {effect: effect_by_name(effect, found.model.catalogue).shape for effect in effects}
     for effect, i in ((effect, i) for effect, places in of.items() for i in places):
         p = found.model.parameters[found.model.index(names[i])]
-        size[i] = 0.0 if names[i].split(".")[1] in effect_by_name(effect).shape else p.start
+        size[i] = 0.0 if names[i].split(".")[1] in shapes[effect] else p.start
         if size[i] and p.prior is not None:
             size[i] -= p.prior[0]
     widest, blocks = max(map(len, of.values())), []
