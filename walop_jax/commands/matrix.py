@@ -127,5 +127,5 @@ def matrix(
     made = MatrixTable(found.value, copy=False)
     if output is not None:
         return dataclasses.replace(found, value=made)
-    advice = ("walop-jax matrix RUN --points TABLE -o OUT, for many points",)
+    advice = ("walop-jax matrix RUN --points TABLE -o OUT.fits",)
     return dataclasses.replace(found, value=made, text=lambda: str(made), next=advice)

@@ -55,6 +55,7 @@ NEXT = {
     "compare": ("walop-jax report {output}",),
     "epoch": ("walop-jax report {output}",),
     "apply": ("walop-jax watch {calibration} {output} -o WATCH",),
+    "watch": ("walop-jax report {output}",),
     "report": ("open the page in a browser",),
     "certify": ("walop-jax apply {calibration} STARS.fits -o OUT.fits",),
 }

@@ -38,7 +38,7 @@ ProcessesOption = Option(
 )
 
 
-@command(stages=STAGES, writes=())
+@command(stages=STAGES, writes=(), random=True)
 def refit(
     job: Job,
     data: Sets,
@@ -99,7 +99,7 @@ def refit(
                     calset, chosen, folder=kept, progress=say, memory=in_bytes(memory), processes=crew
                 )
                 say(Stage("looking for patterns in the residuals", "examining"))
-                result = answered(examined(fitted))
+                result = answered(examined(fitted, job.seed))
             wanted = output is not None
             mapped = wanted and result.likelihood.layout.large and result.converged
             residuals = residual_map(result) if mapped else None

@@ -140,7 +140,7 @@ def diagnose(
         ended=judge.ended,
     )
     del first, last  # the columns of all candidates, gigabytes of a large set
-    return _examined(found)
+    return _examined(found, seed)
 
 
 def _left(first: Examination, judge: Refit, policy: Policy) -> Examination:
@@ -157,18 +157,18 @@ def _forget(result: FitResult) -> None:
         forget_programs()
 
 
-def _examined(found: Diagnosis) -> Diagnosis:
+def _examined(found: Diagnosis, seed: int) -> Diagnosis:
     """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked."""
     if found.before is not found.after:
         _forget(found.after)
-    after = examined(with_honest_errors(found.after), as_written=True)
+    after = examined(with_honest_errors(found.after), seed, as_written=True)
     if found.before is found.after:
         return dataclasses.replace(found, before=after, after=after)
     for sentence in rival_conditions(Design.of(found.before), found.after.chi2):
         after = after.remarked(sentence)
     # Where χ² speaks against the model given, the steps say what is missing.
     explained = found.before.explains_data or found.before.nearly_explains_data
-    before = examined(found.before, as_written=True) if explained else found.before.judged()
+    before = examined(found.before, seed, as_written=True) if explained else found.before.judged()
     return dataclasses.replace(found, before=before, after=after)
 
 

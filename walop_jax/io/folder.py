@@ -121,7 +121,9 @@ class OutputFolder:
         finally:
             remove(temporary)
         if missing:
-            raise NotWrittenError(f"{self.path}: {', '.join(missing)} was not written, all else was; report this")
+            raise NotWrittenError(
+                f"{self.path}: {', '.join(missing)} was not written, all else was; report this"
+            )
 
 
 @contextlib.contextmanager

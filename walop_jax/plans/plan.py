@@ -40,10 +40,10 @@ from walop_jax.plans.optimal import (
     worth,
 )
 from walop_jax.plans.wanted import APART, NAMED, WORST, FieldErrors, Wanted, field_errors, wanted
+from walop_jax.posterior.files import PLANNED
 from walop_jax.science.star_errors import GOAL
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 
-PLANNED = "plan.json"
 _NOTHING = 1e-6  # of what is known: less of it makes no plan
 _ALIKE = 3.0  # deg: angles of the plate that are taken as one
 LONGEST = 1440.0

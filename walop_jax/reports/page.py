@@ -31,9 +31,8 @@ from walop_jax.io.text import (
     with_error,
     with_minus_sign,
 )
-from walop_jax.nights.stacking import SURVEY, TRACKS
-from walop_jax.plans.plan import PLANNED
-from walop_jax.posterior.files import COMPARISON, EPOCH, LIMITS
+from walop_jax.nights.stacking import TRACKS
+from walop_jax.posterior.files import COMPARISON, EPOCH, LIMITS, PLANNED, SURVEY, WATCHED
 from walop_jax.posterior.result import interval_in_words
 from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import draw
@@ -386,8 +385,18 @@ def _of_survey(folder: Path, document: Mapping[str, Any]) -> Pictures:
 
 def _of_comparison(folder: Path, document: Mapping[str, Any]) -> Pictures:
     """The figures that the command has drawn, and those that are not there."""
+    return _drawn_before(folder, PICTURES)
+
+
+def _of_watch(folder: Path, document: Mapping[str, Any]) -> Pictures:
+    """The figure that the command has drawn."""
+    return _drawn_before(folder, {"watch.png": "Gain of every camera since the calibration, group by group."})
+
+
+def _drawn_before(folder: Path, pictures: Mapping[str, str]) -> Pictures:
+    """Pictures of a folder with their captions, and those that are not there."""
     found, missing = [], []
-    for name, caption in PICTURES.items():
+    for name, caption in pictures.items():
         if not (folder / name).exists():
             missing.append(f"{name} is not there.")
             continue
@@ -410,4 +419,5 @@ OTHERS = {
     "plan": OtherPage(PLANNED, ("exposures", "bound", "value", "beside"), _of_plan),
     "limits": OtherPage(LIMITS, ("probability",), _of_limits),
     "survey": OtherPage(SURVEY, ("breaks", "events", "by_night", "advice"), _of_survey),
+    "watch": OtherPage(WATCHED, ("holds", "changes", "groups", "warnings"), _of_watch),
 }
