@@ -159,6 +159,7 @@ def _command(name: str) -> Any:
 def _function(command: Command[Any]) -> Callable[..., None]:
     """Function that typer calls: its signature is made of the options of a command."""
     defaults = {p.name: p.default for p in inspect.signature(command.body).parameters.values()}
+    defaults["elements"] = None
     parameters = [_parameter(name, option, defaults[name]) for name, option in command.options.items()]
     for name, (default, option) in COMMON.items():
         if option is not None and (name != "overwrite" or command.writes is not None):

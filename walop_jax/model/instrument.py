@@ -30,7 +30,7 @@ from walop_jax.instruments.description import (
 )
 from walop_jax.io.errors import nearest
 from walop_jax.model import legendre
-from walop_jax.model.build import parts
+from walop_jax.model.build import parts, with_origins
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.compiled import array
 from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate
@@ -311,6 +311,7 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
     for what does not exist or would do nothing where it stands.
     """
     made = parts(description, elements)
+    every = (*made.elements, *(element for _, inside, _ in made.arms for element in inside))
     instrument = Instrument(
         name=description.name,
         sources=sources(),
@@ -322,7 +323,7 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
         field_limit=description.field_limit,
         site=description.place,
         raster=(description.raster, description.edge),
-        description="" if description.name in shipped() else description.text,
+        description="" if description.name in shipped() else with_origins(description.text, every),
     )
     _check(instrument, description.read)
     return adapted(instrument, **options)

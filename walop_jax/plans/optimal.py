@@ -143,7 +143,7 @@ class Bound:
     here: float
     known: float
     ratio: float
-    tops: tuple[tuple[int, Float[np.ndarray, " d"]], ...]
+    tops: tuple[tuple[int, Float[np.ndarray, " _"]], ...]
 
     def value(self, budget: float) -> float:
         """The least criterion of any plan of a budget."""
@@ -163,7 +163,7 @@ class Allocation:
     """
 
     family: Int[np.ndarray, " s"]
-    place: list[Float[np.ndarray, " d"]]
+    place: list[Float[np.ndarray, " _"]]
     weight: Float[np.ndarray, " s"]
     value: float
     bound: float
