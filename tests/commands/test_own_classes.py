@@ -152,7 +152,9 @@ def test_what_is_fitted_with_an_element_of_ones_own_is_read(own: Path, call):
         "print(held.value)\n"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    told = subprocess.run([sys.executable, "-c", alone], capture_output=True, text=True, env=environment)
+    told = subprocess.run(
+        [sys.executable, "-c", alone], capture_output=True, text=True, env=environment, check=True
+    )
     said, value = told.stdout.splitlines()
     assert "there is no kind of element 'grey_depolariser'" in said
     assert "It is class Grey of grey.py: give --elements FILE.py, in Python elements=[CLASS]" in said

@@ -202,8 +202,8 @@ class Command(Generic[T]):
 
     `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
     "file" if `output` is a single file; () if the body looks after its outputs itself. `random`: its seed matters.
-    `jax`: it computes. `elements`: it takes kinds of elements of one's own, as commands with `effects` do anyway. `given`
-    may rearrange the arguments of a call in Python.
+    `jax`: it computes. `elements`: it takes kinds of elements of one's own, as commands with `effects` do anyway.
+    `given` may rearrange the arguments of a call in Python.
     """
 
     body: Callable[..., Outcome[T]]

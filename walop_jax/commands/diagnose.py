@@ -49,8 +49,8 @@ def diagnose(
     The verdict is consistent, effect_found or unexplained. Effects that the data cannot tell apart are listed
     together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and RUN/summary.json
     are of the extended model, and RUN/model.toml is that model, for `refit --model` and `compare --model`;
-    `walop-jax report` draws its figures from RUN/diagnosis.fits. Exit code 3 where that calibration is not to be trusted,
-    whatever was found.
+    `walop-jax report` draws its figures from RUN/diagnosis.fits. Exit code 3 where that calibration is not to be
+    trusted, whatever was found.
 
     In Python: a `Diagnosis`; `effects=(*walop.EFFECTS, MyEffect)` adds one of your own to those that may be named.
 

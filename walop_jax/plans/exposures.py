@@ -115,8 +115,9 @@ def candidates(
     """The exposures that could be taken, each with its information in `draws` draws of the instrument.
 
     Instruments are drawn from the priors, or from the posterior of the calibration `around`; `angles`, an odd number,
-    are those of the polariser. `effects` of the `catalogue` may be there as well, at their values; those given by name
-    alone at the size of their scale. Raises ValueError where nothing is left to be observed, and for effects that do not act on light.
+    are those of the polariser. `effects` of the `catalogue` may be there as well, at their values; those given by
+    name alone at the size of their scale. Raises ValueError where nothing is left to be observed, and for effects
+    that do not act on light.
     """
     tell = progress or (lambda text: None)
     choices, notes = could.choices()

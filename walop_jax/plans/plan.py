@@ -40,7 +40,6 @@ from walop_jax.plans.optimal import (
     worth,
 )
 from walop_jax.plans.wanted import APART, NAMED, WORST, FieldErrors, Wanted, field_errors, wanted
-from walop_jax.posterior.files import PLANNED
 from walop_jax.science.star_errors import GOAL
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 
@@ -260,10 +259,11 @@ def plan_exposures(
 ) -> ExposurePlan:
     """The calibration exposures of `minutes` that make a criterion (`wanted`) best.
 
-    `known` is a calibration that is there already; `goal` a value of the criterion, as it is told, to which the time is
-    found. `apart` are effects that are to be told apart (`wanted.APART`), each with its value or by name
-    alone, of the `catalogue`; their goal is `NAMED` unless another is given. Raises ValueError as `check_wishes` and
-    for a time that pays for nothing, NotEstimableError where nothing that could be observed, or too little in that time, determines what is asked.
+    `known` is a calibration that is there already; `goal` a value of the criterion, as it is told, to which the time
+    is found. `apart` are effects that are to be told apart (`wanted.APART`), each with its value or by name alone, of
+    the `catalogue`; their goal is `NAMED` unless another is given. Raises ValueError as `check_wishes` and for a time
+    that pays for nothing, NotEstimableError where nothing that could be observed, or too little in that time,
+    determines what is asked.
     """
     check_wishes(minutes, goal, draws)
     if apart:
