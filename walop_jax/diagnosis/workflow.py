@@ -522,8 +522,10 @@ def unexplained(state: Examination, patterns: tuple[tuple[str, float], ...]) -> 
         p = state.table.corrected(nearest.score)
         text += f". Nearest comes '{nearest.probe.name}' (p = {p:.1g}), which was not confirmed"
     where = describe(state.design, state.design.residual)
-    moving = "".join(f"; {p} {where[p]}" for p in state.design.measured.likelihood.plan.moving if p in where)
-    text += f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}{moving}"
+    words = {"cameras": "camera", "kinds": "kind", "field": "field"}
+    words |= {prefix: prefix for prefix in state.design.measured.likelihood.plan.moving}
+    told = (f"{name} {where[key]}" for name, key in words.items() if where.get(key) is not None)
+    text += f". Residuals sit in: {'; '.join(told)}"
     return Unexplained(state.table.p_global, text, patterns)
 
 

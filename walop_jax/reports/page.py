@@ -15,7 +15,7 @@ import jinja2
 import numpy as np
 from matplotlib.figure import Figure
 
-from walop_jax.calibration import SUMMARY, read_calibration
+from walop_jax.calibration import SUMMARY, Calibration, read_calibration
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.findings import sentences
 from walop_jax.diagnosis.limits_found import DetectionLimits
@@ -110,6 +110,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "sentence": sentence,
         "fit_sentence": ": ".join(verdict_of_fit(summary)),
         "good": good,
+        "noise_alone": _noise_alone(run.product),
         "trusted": trusted,
         "quality": quality.meanings,
         "hidden": hidden_in_words(summary),
@@ -137,6 +138,14 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         if run.corner is None
         else symbols_in_words([str(row["NAME"]) for row in run.intervals]),
     }
+
+
+def _noise_alone(product: Calibration | None) -> str:
+    """Mean squared residual of noise: a flux is fitted to the cameras of a row, one of each arm where it is split."""
+    if product is None:
+        return "1 − 1/K, of K cameras,"
+    cameras = product.design.cameras
+    return rounded(1.0 - cameras.fluxes / len(cameras), ".3g")
 
 
 def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
