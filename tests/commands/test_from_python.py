@@ -22,6 +22,8 @@ from walop_jax.calibration import write_calibration
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
 
+from .conftest import FittedSet
+
 OWN = '''
 import walop_jax as walop
 

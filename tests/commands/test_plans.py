@@ -213,7 +213,7 @@ about = "Zero point of the polariser, called by another name"
 source = "a test"
 revealed_by = "sky of known polarisation"
 separated_by = "nothing"
-angle = { does = "angle of polariser", unit = "deg", width = 0.3, about = "added" }
+angle = { does = "turn of polariser", unit = "deg", width = 0.3, about = "added" }
 """
 
 

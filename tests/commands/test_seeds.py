@@ -34,7 +34,7 @@ def test_the_seed_reaches_the_verdict(name: str, fitted: FittedSet, monkeypatch)
         raise Examined(seed)
 
     monkeypatch.setattr("walop_jax.diagnosis.trust.examined", stop)
-    with pytest.raises(Examined, match="^5$"):
+    with pytest.raises(Examined, match=r"^5$"):
         CALLS[name](fitted, seed=5)
 
 

@@ -269,7 +269,7 @@ class Runner:
     progress: Progress | None = None
     journal: Journal | None = None
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """Parts that a copy in another process can use: it works alone there, and is listened to by nobody."""
         return vars(dataclasses.replace(self.alone(), progress=None))
 
