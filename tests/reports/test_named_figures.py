@@ -235,4 +235,3 @@ def test_figures_have_the_style_of_the_package(source, dark):
         theirs = matplotlib.figure.Figure()
         plot(source, "accuracy", ax=theirs.subplots())
         assert theirs.subfigs[0].axes[0].get_facecolor()[:3] == (0.0, 0.0, 0.0)
-    assert pixels(figure) == expected

@@ -94,7 +94,8 @@ def plan(
     from walop_jax.data.user_tables import read_input_table
     from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.plans.could import Could
-    from walop_jax.plans.plan import check_wishes, plan_exposures
+    from walop_jax.plans.plan import plan_exposures
+    from walop_jax.plans.wanted import check_wishes
     from walop_jax.posterior.files import PLANNED
     from walop_jax.simulation.observing_plan import plan_text
 

@@ -121,7 +121,7 @@ def refit(
                 ),
                 files,
                 saved_as=SUMMARY,
-                next=next_steps(result.trusted, output, data),
+                next=next_steps(result.trusted, output, data, instrument=instrument, effects=effects),
                 warnings=(*result.warnings, *(() if misfit is None else misfit.sentences())),
                 trusted=result.trusted,
                 silent=not first,
@@ -145,12 +145,13 @@ def refit(
             return found
 
 
-def next_steps(trusted: bool, output: PathLike | None, data: Sets) -> tuple[str, ...]:
-    """Command lines to type after a fit."""
+def next_steps(trusted: bool, output: PathLike | None, data: Sets, **options: object) -> tuple[str, ...]:
+    """Command lines to type after a fit; `options` are those that a diagnosis of the sets needs as well."""
     if trusted:
         return (f"walop-jax report {output}", f"walop-jax apply {output} STARS.fits -o OUT.fits")
     sets = " ".join(str(path) for path in paths_of(data)) if output is not None else "CALSET"
-    return (f"walop-jax report {output}", f"walop-jax diagnose {sets} -o {output}_diagnosis")
+    more = "".join(f" --{name} {value}" for name, value in options.items() if isinstance(value, str | Path))
+    return (f"walop-jax report {output}", f"walop-jax diagnose {sets}{more} -o {output}_diagnosis")
 
 
 @contextlib.contextmanager

@@ -101,7 +101,7 @@ class _Maker:
     text: str = ""
 
     def origin(self, kind: str) -> str:
-        """Where the class of a kind that is not there is to be looked for, as far as the description says."""
+        """Advice on the class of a kind that is not there, which the description may name."""
         line = next((line for line in self.text.splitlines() if line.startswith(made_by(kind))), "")
         where = line.removeprefix(made_by(kind))
         return f"It is {where}: give --elements FILE.py" if where else "One of your own: --elements FILE.py"

@@ -39,14 +39,21 @@ from walop_jax.plans.optimal import (
     rounded,
     worth,
 )
-from walop_jax.plans.wanted import APART, NAMED, WORST, FieldErrors, Wanted, field_errors, wanted
+from walop_jax.plans.wanted import (
+    APART,
+    NAMED,
+    WORST,
+    FieldErrors,
+    Wanted,
+    check_wishes,
+    field_errors,
+    wanted,
+)
 from walop_jax.science.star_errors import GOAL
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 
 _NOTHING = 1e-6  # of what is known: less of it makes no plan
 _ALIKE = 3.0  # deg: angles of the plate that are taken as one
-LONGEST = 1440.0
-"""Minutes of a plan at most. It is one of a night, in which the sky stands still and the instrument does not change."""
 _TRIES = 6  # budgets, until the exposures and the changes between them fit into the time
 
 USUAL: Mapping[str, tuple[tuple[float, ...], bool, int]] = {
@@ -226,21 +233,6 @@ class ExposurePlan(Displayed):
 
 def _angle(angle: float | None) -> str:
     return "out" if angle is None else f"{angle:.1f}°"
-
-
-def check_wishes(minutes: float, goal: float | None = None, draws: int = 1) -> None:
-    """Raise ValueError for a time, a goal or a number of draws that no plan can have."""
-    if not minutes > 0:
-        raise ValueError(f"{minutes:g} minutes: nothing can be observed in no time; give --minutes")
-    if not minutes <= LONGEST:
-        raise ValueError(
-            f"{minutes:g} minutes: a plan is one of a night, of {LONGEST:g} minutes at most; for what is longer plan "
-            "a night, and add to its calibration with --after RUN"
-        )
-    if goal is not None and not 0 < goal < np.inf:
-        raise ValueError(f"goal = {goal:g}: no time reaches it; give a value above 0, in % for errors of p")
-    if draws < 1:
-        raise ValueError(f"draws = {draws}: give 1 or more")
 
 
 def plan_exposures(

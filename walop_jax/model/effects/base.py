@@ -155,7 +155,7 @@ class Effect(Component):
         return self
 
     def lacks(self, instrument: Instrument) -> str:
-        """What the effect acts on and the instrument does not have, in words; empty where it fits."""
+        """The part that the effect acts on and the instrument does not have, in words; empty where it fits."""
         try:
             jax.eval_shape(lambda: self.patch(dataclasses.replace(instrument, effects=())))
         except NoSuchPlaceError as error:

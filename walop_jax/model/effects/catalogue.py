@@ -186,7 +186,7 @@ class Entry(Effect):
         return {name: getattr(self, name) for name in self.options}
 
     def lacks(self, instrument: Instrument) -> str:
-        """What the instrument does not have; there may be no star that a choice could name."""
+        """As for any effect; there may be no star that a choice could name."""
         if "" in self.choices().values():
             return NO_STANDARD
         if not self.arrangement:
