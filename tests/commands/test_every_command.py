@@ -49,10 +49,10 @@ LINES = {
         Line(
             "simulate --grid 3 --standard-grid 1 --angles 4 -o made.fits --truth truth.json", takes="seconds"
         ),
-        Line("simulate plan.toml -o made.fits"),
+        Line("simulate plan.toml -o made.fits", takes="seconds"),
     ],
     "refit": [Line("refit set.fits -o FIT", "summary", "seconds")],
-    "commission": [Line("commission set.fits -o NIGHT", "commissioning")],
+    "commission": [Line("commission set.fits -o NIGHT", "commissioning", "seconds")],
     "compress": [Line("compress frames.fits -o small.fits", takes="minutes")],
     "clip": [Line("clip set.fits -o clipped.fits", takes="seconds")],
     "diagnose": [Line("diagnose set.fits -o FOUND", "diagnosis", "seconds")],

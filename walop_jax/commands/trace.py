@@ -24,7 +24,7 @@ from walop_jax.commands.inputs import (
 )
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Run
+    from walop_jax import Calibration, FitResult, Instrument, Run
     from walop_jax.model.trace import LightStage
 
 PRODUCT = Argument("An instrument as fitted; without it, as designed.", "[RUN/calibration.fits]", Path)
