@@ -47,3 +47,24 @@ def test_version_is_one():
     assert project["version"] == walop_jax.__version__
     assert f"version: {walop_jax.__version__}" in citation
     assert f"## {walop_jax.__version__}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+def test_false_alarms_are_those_of_the_study():
+    """README said 0 for as long as the study has said 4."""
+    study = (ROOT / "walop_jax" / "docs" / "validation.md").read_text(encoding="utf-8")
+    row = re.search(r"^\| false alarms, 1000 scenes .*in 9000 more: (\d+)\) \| (\d+) ", study, re.MULTILINE)
+    told = re.search(r"nothing hidden: false alarms \| (\d+); in 9000 more (\d+) \|", TEXT)
+    assert row is not None
+    assert told is not None
+    assert told.groups() == (row[2], row[1])
+
+
+def test_the_test_command_is_that_of_contributors_and_of_the_checks():
+    """Set-up and tests are two lines that anybody can paste."""
+    install, test = "pip install -e '.[test]'", "python -m pytest -n 2 --fast"
+    assert f"{install} && {test}\n" in TEXT
+    contributing = (ROOT / ".github" / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    checks = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    for text in (contributing, checks):
+        assert test in text
+    assert install in contributing

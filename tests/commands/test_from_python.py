@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import os
+import pickle
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +21,8 @@ import walop_jax as walop
 from walop_jax.calibration import write_calibration
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
+
+from .conftest import FittedSet
 
 OWN = '''
 import walop_jax as walop
@@ -215,3 +221,36 @@ def test_files_of_effects_that_are_none(tmp_path, text, message):
     (tmp_path / "own.py").write_text(text)
     with pytest.raises(walop.DataError, match=message):
         _own(tmp_path / "own.py")
+
+
+def test_results_go_through_pickle_into_another_process(fitted: FittedSet, tmp_path: Path):
+    """A fit held a function that no pickle takes, and what came out in a fresh process had lost half its digits."""
+    result = walop.refit(fitted.calset)
+    whole = {
+        "fit": result,
+        "product": fitted.calibration,
+        "run": walop.read(fitted.run),
+        "model": result.model,
+    }
+    for name, one in whole.items():
+        (tmp_path / f"{name}.pkl").write_bytes(pickle.dumps(one))
+    code = (
+        "import pickle, sys\n"
+        "fit, product, run, model = (pickle.load(open(f'{name}.pkl', 'rb')) for name in sys.argv[1:])\n"
+        "import walop_jax as walop\n"
+        "for one in (fit, product, run):\n    print(repr(walop.matrix(one, x=0.1, y=-0.2)['M22'][0].item()))\n"
+        "print(repr(float(model.start[0])))\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    told = subprocess.run(
+        [sys.executable, "-c", code, *whole],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    expected = [walop.matrix(whole[name], x=0.1, y=-0.2)["M22"][0] for name in ("fit", "product", "run")]
+    np.testing.assert_allclose(
+        [float(line) for line in told.stdout.split()], [*expected, result.model.start[0]], rtol=1e-11
+    )

@@ -10,6 +10,7 @@ from own_instrument import OWN
 
 from walop_jax.commands.inputs import design_of
 from walop_jax.commands.limits import limits
+from walop_jax.commands.plan import plan as plan_command
 from walop_jax.data import read_calibration_set, write_calibration_set
 from walop_jax.data.records import FilterCurve
 from walop_jax.diagnosis.detection_limits import detection_limits
@@ -185,3 +186,67 @@ def test_limits_of_a_plan_are_those_of_data_taken_so(plan):
     assert len(conditions) >= 5
     for one in found.conditions:
         np.testing.assert_allclose(one.detected, conditions[one.what], rtol=0.1, err_msg=one.what)
+
+
+@pytest.mark.parametrize(
+    ("wishes", "message"),
+    [
+        ({"minutes": float("inf")}, "a plan is one of a night, of 1440 minutes at most"),
+        ({"minutes": 1e6}, "add to its calibration with --after RUN"),
+        ({"minutes": 0.0}, "nothing can be observed in no time"),
+        ({"minutes": float("nan")}, "nothing can be observed in no time"),
+        ({"goal": 0.0}, "no time reaches it; give a value above 0"),
+        ({"goal": -1.0}, "no time reaches it"),
+        ({"goal": float("nan")}, "no time reaches it"),
+        ({"draws": 0}, "draws = 0: give 1 or more"),
+    ],
+)
+def test_wishes_that_no_plan_has(wishes, message):
+    """Refused at once; a million minutes promised p to 3e-8."""
+    with pytest.raises(ValueError, match=message):
+        plan_command(ObservingPlan(grid=2), **wishes)
+
+
+OWN_EFFECT = """
+[twin]
+about = "Zero point of the polariser, called by another name"
+source = "a test"
+revealed_by = "sky of known polarisation"
+separated_by = "nothing"
+angle = { does = "turn of polariser", unit = "deg", width = 0.3, about = "added" }
+"""
+
+
+def test_effects_of_ones_own_are_told_apart(call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("own.toml").write_text(OWN)
+    Path("twin.toml").write_text(OWN_EFFECT)
+    Path("plan.toml").write_text(
+        'instrument = "own.toml"\ngrid = 2\npolariser_angles = 4\nmoving = { WIN = [0, 45] }\n'
+        "moon_patches = 0\nstandards = 0\n"
+    )
+    words = (
+        "plan",
+        "plan.toml",
+        "--minutes",
+        20,
+        "--draws",
+        1,
+        "--apart",
+        "twin=0.5",
+        "--apart",
+        "clp_wobble",
+    )
+    refused = call(*words)
+    assert refused.exit_code == 1
+    assert "there is no effect 'twin'" in refused.stderr
+    done = call(*words, "--effects", "twin.toml", "-o", "P")
+    assert done.exit_code == 0, done.output
+    assert json.loads(Path("P/plan.json").read_text())["criterion"] == "apart"
+
+
+def test_what_a_fit_in_memory_left_undecided(tmp_path):
+    """It has no diagnosis; asking it for one ended in a TypeError."""
+    result = refit(simulate(ObservingPlan(grid=3, moon_patches=2, standards=3), seed=1).calset).judged()
+    with pytest.raises(DataError, match="no diagnosis; run diagnose first, or name the effects with --apart"):
+        plan_command(after=result, could="", criterion="apart")

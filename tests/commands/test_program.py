@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import handmade_run
 import pytest
 from south_sets import CUTS
 
@@ -131,3 +132,24 @@ def test_a_reader_that_has_gone_is_no_error(calset_file):
     )  # fmt: skip
     assert "Traceback" not in done.stderr
     assert done.stdout.startswith("# Model of WALOP-SOUTH")
+
+
+@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
+def test_streams_that_are_closed_are_no_error(tmp_path: Path, closed: tuple[int, ...]):
+    """As daemons start programs (`>&-`): the work is done, what would be printed is dropped and ends up in no file."""
+    close = " ".join(("<&-", ">&-", "2>&-")[number] for number in closed)
+    shown = subprocess.run(
+        ["bash", "-c", f'"$@" {close}', "bash", sys.executable, "-m", "walop_jax", "conformance", "--make", "pack"],
+        cwd=tmp_path, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert sorted(path.name for path in (tmp_path / "pack").iterdir())[-1] == "results.csv"
+    assert "questions" not in "".join(path.read_text() for path in (tmp_path / "pack").glob("*.csv"))
+
+
+def test_a_back_end_of_a_notebook_is_not_needed(tmp_path: Path):
+    """Jupyter exports the name of one that need not be where the program is."""
+    run = handmade_run.make_refit(tmp_path / "run")
+    shown = program("report", run, MPLBACKEND="module://matplotlib_that_is_not_there.backend")
+    assert shown.returncode == 0, shown.stderr
+    assert (run / "report.html").exists()

@@ -99,6 +99,10 @@ def test_an_argument_that_does_not_exist_is_named_with_the_nearest(name: str, fi
         (lambda: walop.read(5), "read: paths is 5, but a path is wanted"),
         (lambda: walop.trace(instrument=[]), "trace: instrument is a list"),
         (lambda: walop.report(1.0), "report: run is 1.0, but a fit or a run or a path is wanted"),
+        (
+            lambda: walop.refit("x.fits", free=["half1.wedge"]),
+            "refit: there is no argument 'free'; the model says that of its parameters: model=base_model(calset)",
+        ),
         (walop.refit, "refit: missing a required argument: 'data'; the arguments are data, model"),
         (lambda: walop.effect_by_name(3), "effect_by_name: name is 3, but a text is wanted"),
     ],

@@ -81,3 +81,24 @@ def test_an_instrument_tells_what_its_plates_do(tmp_path):
     assert found.retardance["window"] == pytest.approx(0.1 / (2 * np.pi))
     assert "retards by 0.016 waves at 0.62 um" in str(found)
     assert any(line.split() == ["moves", "nothing"] for line in str(found).splitlines())
+
+
+def test_an_instrument_may_be_traced_as_it_is():
+    """It was refused as a wrong kind of calibration; `instrument=` is the same."""
+    _, truth = walop.simulate(grid=2, standard_grid=1, angles=3, moon_patches=0, standards=0)
+    one, other = walop.trace(truth, x=0.1, q=0.02), walop.trace(instrument=truth, x=0.1, q=0.02)
+    np.testing.assert_array_equal(one[-1].value, other[-1].value)
+
+
+def test_one_search_for_names_of_effects(call):
+    """What nobody is much like goes by what effects are about; a slip of a letter by its looks."""
+    told = [
+        call("docs", "effect", "polariser_encoder").stderr,
+        call("simulate", "--effect", "polariser_encoder=3", "-o", "none.fits").stderr,
+    ]
+    for text in told:
+        assert "did you mean 'clp_zero' or 'clp_wobble'" in " ".join(text.split())
+    assert (
+        "did you mean 'wollaston_axis'"
+        in call("simulate", "--effect", "wolaston_axs=3", "-o", "n.fits").stderr
+    )

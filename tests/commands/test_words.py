@@ -12,7 +12,9 @@ from walop_jax.commands import COMMANDS
 from walop_jax.commands.program import step_counter
 from walop_jax.io.progress import Stage
 
-RANDOM = ("simulate", "sample", "diagnose", "limits", "compare", "plan")
+RANDOM = (
+    "simulate", "sample", "diagnose", "limits", "compare", "plan", "refit", "commission", "clip", "epoch",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -20,8 +20,9 @@ from walop_jax.likelihood.flux import Sharing
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.plans.could import Costs, Could
 from walop_jax.plans.exposures import Illumination, candidates
-from walop_jax.plans.plan import PLANNED, plan_from
+from walop_jax.plans.plan import plan_from
 from walop_jax.plans.wanted import FieldErrors, field_errors, wanted
+from walop_jax.posterior.files import PLANNED
 from walop_jax.reports.page import kind_of_run, render_other
 from walop_jax.science.field_accuracy import p_errors
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, plan_text, read_plan

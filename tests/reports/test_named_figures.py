@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 
 import handmade_run
 import jax.numpy as jnp
+import matplotlib.figure
 import numpy as np
 import pytest
+from own_instrument import OWN
 from small_run import SEED, SMALL
 
 from walop_jax.calibration import write_calibration
@@ -19,12 +22,14 @@ from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model import mueller
+from walop_jax.model.instrument import Instrument
 from walop_jax.paper.wavelength import plate_retardances, retardance
 from walop_jax.reports.named import FIGURES, draw, possible
 from walop_jax.reports.paper_figures import retardance_figure, retardance_wavelength_figure
 from walop_jax.reports.posterior_figures import informed
 from walop_jax.reports.run import FigureSource
 from walop_jax.reports.style import element_kind
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
 OF_A_DIAGNOSIS = ("ladder", "effect", "signature", "rms", "shares")
@@ -185,3 +190,48 @@ def test_modulation_shows_a_point_that_was_seen_behind_the_polariser(source):
     assert all(
         max(len(line.get_xdata()) for line in axis.lines if line.get_marker() != "None") >= 4 for axis in axes
     )
+
+
+def test_a_source_on_disk_stays_one(source):
+    """Reading its documents made it one that is in memory, with no files."""
+    assert source.documents == {}
+    assert "calibration.fits" in source
+    assert source.maps.values.shape[0] == 6
+
+
+def test_plates_are_found_by_their_class(tmp_path):
+    """Names of crystals are those of the description; figures of retardance were hidden where they were others."""
+    (tmp_path / "own.toml").write_text(OWN)
+    design = Instrument.read(tmp_path / "own.toml")
+    plan = ObservingPlan(
+        design,
+        grid=3,
+        polariser_angles=polariser_turn(4),
+        moon_patches=0,
+        standards=0,
+        moving={"WIN": (0.0, 45.0)},
+    )
+    calset = simulate(plan, seed=SEED).calset
+    calibration = Calibration.from_fit(refit(calset, base_model(calset, design)).judged())
+    write_calibration(tmp_path / "calibration.fits", calibration)
+    listed = possible(FigureSource(tmp_path))
+    assert listed["retardance"].about == "maps of the retardance of main.plate"
+
+
+@pytest.mark.parametrize("dark", [{"axes.facecolor": "black", "text.color": "white", "font.size": 25.0}])
+def test_figures_have_the_style_of_the_package(source, dark):
+    """Whatever a matplotlibrc says, and without a change of it; axes of the caller keep the caller's."""
+
+    def pixels(figure):
+        stream = io.BytesIO()
+        figure.savefig(stream, format="rgba", dpi=40)
+        return stream.getvalue()
+
+    expected = pixels(draw("matrix", source))
+    with matplotlib.rc_context(dark | {"lines.linewidth": 9.0}):
+        figure = draw("matrix", source)
+        assert pixels(figure) == expected
+        assert matplotlib.rcParams["axes.facecolor"] == "black"
+        theirs = matplotlib.figure.Figure()
+        plot(source, "accuracy", ax=theirs.subplots())
+        assert theirs.subfigs[0].axes[0].get_facecolor()[:3] == (0.0, 0.0, 0.0)

@@ -50,6 +50,7 @@ from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.text import in_ascii
 from walop_jax.model.dependence import left_behind, needs
 from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.elements import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.planning import plan_for_settings
@@ -226,14 +227,15 @@ class Calibration(Fitted):
     def design(self) -> Instrument:
         """The instrument as designed: from the description in the file, or the one that comes with the package.
 
-        Raises `DataError` for elements that only the fit has known: such a product is rebuilt where they are known.
+        Its kinds of elements are those of the package and those that this process has defined. Raises `DataError`, with
+        the class that is missing, for another kind.
         """
         if isinstance(self.fitted, Model):
             return self.fitted.template
         if not self.description:
             return nominal_instrument(self.fitted.name)
         name = f"the description of {self.fitted.name} in the product"
-        return build(parsed("\n".join(self.description), name))
+        return build(parsed("\n".join(self.description), name), elements=defined_elements())
 
     @functools.cached_property
     def model_lines(self) -> tuple[str, ...]:

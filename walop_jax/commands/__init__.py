@@ -55,6 +55,9 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # What modules define is not garbage: looking through it again and again takes a tenth of a start.
     gc.set_threshold(50_000, 20, 20)
+    # That of a notebook may not be there, and commands only write files.
+    os.environ["MPLBACKEND"] = "agg"
+    _open_streams()
     # A path may hold bytes that are no text.
     sys.stdout.reconfigure(errors="backslashreplace")  # pyright: ignore[reportAttributeAccessIssue]
     try:
@@ -64,3 +67,17 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.stderr.write("walop-jax: error: interrupted; nothing was left half-written\n")
         raise SystemExit(INTERRUPTED) from None
+
+
+def _open_streams() -> None:
+    """Open what is closed (`>&-`, daemons) to nowhere: the next file would take its number, and get what is printed."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 SIGMA = Option("Standard errors beyond which a row is flagged, at least 3.", "N")
 
 
-@command(stages=("reading", "fitting", "writing"), writes="file")
+@command(stages=("reading", "fitting", "writing"), writes="file", random=True)
 def clip(
     job: Job,
     data: Sets,
@@ -66,7 +66,9 @@ def clip(
         say(Stage("fitting", "fitting"))
         found = clipped(calset, chosen, sigma)
         # Of too many rows the model lacks something: no need to ask what.
-        result = found.result.judged() if found.too_many else examined(found.result, as_written=True)
+        result = (
+            found.result.judged() if found.too_many else examined(found.result, job.seed, as_written=True)
+        )
         found = dataclasses.replace(found, result=result)
     job.begin("writing")
     if output is not None:

@@ -31,7 +31,8 @@ LOG.addHandler(logging.NullHandler())
 
 T = TypeVar("T")
 Tell = Callable[[str], None]
-Writers = Mapping[str, Callable[[Path], object]]
+Writers = Mapping[str, Callable[[Path], object] | None]
+"""Writers of files by name; None: this result has no such file."""
 Given = Callable[[tuple[Any, ...], dict[str, Any]], tuple[tuple[Any, ...], dict[str, Any]]]
 
 
@@ -161,16 +162,28 @@ class Outcome(Generic[T]):
         value: Any = self.value
         return value.display().text() if self.text is None else self.text()
 
-    def save(self, folder: OutputFolder, drop: Sequence[str] = ()) -> None:
-        """Put all files into the output folder: they appear together, or none does."""
+    def save(self, folder: OutputFolder, drop: Sequence[str] = ()) -> Outcome[T]:
+        """Put all files into the output folder, together; gives the outcome, a failure where one was not written."""
+        from walop_jax.io.folder import NotWrittenError
         from walop_jax.io.text import json_text
 
-        with folder.filled(drop=drop) as temporary:
-            for name, write in self.files().items():
-                write(temporary / name)
-            if self.saved_as:
-                text_file(json_text(self.content))(temporary / self.saved_as)
+        files = self.files()
+        absent = [name for name, write in files.items() if write is None]
+        names = [name for name in folder.names if name not in absent]
+        try:
+            with folder.filled(names, (*drop, *absent)) as temporary:
+                for name, write in files.items():
+                    if write is not None:
+                        write(temporary / name)
+                if self.saved_as:
+                    text_file(json_text(self.content))(temporary / self.saved_as)
+        except NotWrittenError as error:
+            return dataclasses.replace(self, failure=self.failure or str(error))
+        return self
 
+
+ELEMENTS = Option("Kinds of elements of your own; see walop-jax docs adding-an-instrument.", "FILE.py", Path)
+"""Of every command that reads instruments, runs or models: of the commands that take effects of one's own."""
 
 COMMON = {
     "overwrite": (False, Option("Replace outputs that exist.")),
@@ -189,7 +202,8 @@ class Command(Generic[T]):
 
     `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
     "file" if `output` is a single file; () if the body looks after its outputs itself. `random`: its seed matters.
-    `jax`: it computes. `given` may rearrange the arguments of a call in Python.
+    `jax`: it computes. `elements`: it takes kinds of elements of one's own, as commands with `effects` do anyway.
+    `given` may rearrange the arguments of a call in Python.
     """
 
     body: Callable[..., Outcome[T]]
@@ -197,6 +211,7 @@ class Command(Generic[T]):
     writes: Sequence[str] | Literal["file"] | None = None
     random: bool = False
     jax: bool = True
+    elements: bool = False
     given: Given | None = None
 
     def __post_init__(self) -> None:
@@ -206,18 +221,24 @@ class Command(Generic[T]):
         self.options = {
             name: note for name, found in notes.items() for note in found if isinstance(note, Option)
         }
+        self.elements |= "effects" in self.options
+        if self.elements:
+            self.options["elements"] = ELEMENTS
 
     @functools.cached_property
     def signature(self) -> inspect.Signature:
         """The signature of the Python function: its own arguments, then those that all commands share."""
         own = [p.replace(annotation=door.kind_in_short(self.body, p)) for p in self.own]
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        kind = "PathLike | Sequence[type] | None"
+        elements = [inspect.Parameter("elements", keyword, default=None, annotation=kind)]
         shared = [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+            inspect.Parameter(name, keyword, default=default, annotation=kind)
             for (name, (default, _)), kind in zip(COMMON.items(), ("bool", "Tell | None", "int"), strict=True)
             if name != "overwrite" or self.writes is not None
         ]
         rest = [own.pop()] if own and own[-1].kind is inspect.Parameter.VAR_KEYWORD else []
-        return inspect.Signature([*own, *shared, *rest])
+        return inspect.Signature([*own, *elements * self.elements, *shared, *rest])
 
     @functools.cached_property
     def function(self) -> Callable[..., T]:
@@ -246,6 +267,8 @@ class Command(Generic[T]):
                 found = self.run(Job(**shared), arguments)
             for sentence in found.warnings:
                 LOG.warning("%s", sentence)
+            if found.failure:
+                LOG.error("%s", found.failure)
             return found.value
 
         functools.update_wrapper(call, self.body)
@@ -258,6 +281,7 @@ class Command(Generic[T]):
 
     def run(self, job: Job, arguments: dict[str, Any]) -> Outcome[T]:
         """Do the work, with results written as they are asked for."""
+        load_elements(arguments.pop("elements", None))
         output = arguments.get("output")
         if self.writes == "file" and output is not None:
             from walop_jax.io.atomic import check_output
@@ -268,9 +292,28 @@ class Command(Generic[T]):
         more = {name: value for key in rest for name, value in arguments.pop(key, {}).items()}
         with job.reserved(output if names else None, names) as reserved:
             found = self.body(reserved, **arguments, **more)
-            if reserved.folder is not None:
-                found.save(reserved.folder)
-        return found
+            return found if reserved.folder is None else found.save(reserved.folder)
+
+
+def load_elements(given: str | os.PathLike[str] | Sequence[type] | None) -> None:
+    """Run the file of kinds of elements of one's own: what is defined is known (`model.elements.defined_elements`).
+
+    Raises `DataError` for a file that defines none, TypeError for a class that is none.
+    """
+    if given is None:
+        return
+    from walop_jax.io.code import classes_of
+    from walop_jax.io.errors import fail
+    from walop_jax.model.elements import Element
+
+    if isinstance(given, str | os.PathLike):
+        advice = "give a Python file with subclasses of Element (walop-jax docs adding-an-instrument)"
+        if not any(vars(kind).get("kind") for kind in classes_of(given, Element, advice).values()):
+            raise fail("defines no kind of element", file=given, advice=advice)
+        return
+    for kind in given:
+        if not (isinstance(kind, type) and issubclass(kind, Element)):
+            raise TypeError(f"elements: {kind!r} is no class of elements, a subclass of Element")
 
 
 def command(**options: Any) -> Callable[[Callable[..., Outcome[T]]], Callable[..., T]]:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from walop_jax.science.commissioning import Commissioning
 
 
-@command(stages=STAGES, writes=())
+@command(stages=STAGES, writes=(), random=True)
 def commission(
     job: Job,
     data: Sets,

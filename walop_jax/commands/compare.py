@@ -84,7 +84,7 @@ def compare(
         truth = Truth(*true_matrices(truth, chosen.template.patched()))
     if held is None:
         job.tell("fitting the joint model", "fitting")
-        result = examined(refit(calset, chosen, progress=job.progress))
+        result = examined(refit(calset, chosen, progress=job.progress), job.seed)
         if not result.converged:
             raise ValueError(f"the joint fit did not converge ({result.minimum.message})")
         joint, trusted, warnings = Calibration.from_fit(result), result.trusted, result.warnings

@@ -49,7 +49,8 @@ def diagnose(
     The verdict is consistent, effect_found or unexplained. Effects that the data cannot tell apart are listed
     together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and RUN/summary.json
     are of the extended model, and RUN/model.toml is that model, for `refit --model` and `compare --model`;
-    `walop-jax report` draws its figures from RUN/diagnosis.fits.
+    `walop-jax report` draws its figures from RUN/diagnosis.fits. Exit code 3 where that calibration is not to be
+    trusted, whatever was found.
 
     In Python: a `Diagnosis`; `effects=(*walop.EFFECTS, MyEffect)` adds one of your own to those that may be named.
 
@@ -88,10 +89,14 @@ def diagnose(
     return Outcome(
         found,
         lambda: document(found),
-        lambda: f"{_with_answer(found, after).text()}\nWritten to {output}.",
+        lambda: (
+            f"{_with_answer(found, after).text()}\n"
+            f"The calibration can{'' if usable else 'not'} be trusted; written to {output}."
+        ),
         files,
         saved_as=DIAGNOSIS,
         warnings=found.after.warnings,
+        trusted=usable,
         next=(f"walop-jax report {output}", *[f"walop-jax apply {output} STARS.fits -o OUT.fits"] * usable),
     )
 

@@ -43,6 +43,13 @@ WORDS = {
 """Kinds of arguments, as messages name them."""
 
 
+OF_MODELS = ("free", "fixed", "fix", "frozen", "start", "prior", "priors", "tie", "ties", "bounds")
+IN_THE_MODEL = (
+    "the model says that of its parameters: model=base_model(calset).change('half1.wedge', free=False)"
+)
+"""Advice on arguments that users of other fitting programs expect."""
+
+
 class _Names(dict[str, Any]):
     """The names that an annotation may use: of its module, of Python, and the public ones, loaded when asked for.
 
@@ -96,7 +103,10 @@ def bound(
             if key not in parameters:
                 from walop_jax.io.errors import nearest
 
-                raise TypeError(f"{name}: there is no argument {key!r}; {nearest(key, parameters)}")
+                advice = (
+                    IN_THE_MODEL if key in OF_MODELS and "model" in parameters else nearest(key, parameters)
+                )
+                raise TypeError(f"{name}: there is no argument {key!r}; {advice}")
     try:
         found = signature.bind(*args, **kwargs)
     except TypeError as error:

@@ -26,7 +26,7 @@ FOLDER = Option("Folder for the new calibration and what was found.", "RUN", Pat
 OUTPUTS = ("calibration.fits", "epoch.json")
 
 
-@command(stages=("reading", "fitting", "lacking"), writes=OUTPUTS)
+@command(stages=("reading", "fitting", "lacking"), writes=OUTPUTS, random=True)
 def epoch(
     job: Job,
     old: Annotated[Calibration | FitResult | Run | PathLike, OLD],
@@ -61,7 +61,7 @@ def epoch(
     held, calset = calibration_of(old, effects), set_of(new)
     job.tell("fitting the new set", "fitting")
     with errors_naming(held.path):
-        result = examined(fit_like(held, calset))
+        result = examined(fit_like(held, calset), job.seed)
         found = compared(held, result)
     lacking = None
     if found.fits is None:

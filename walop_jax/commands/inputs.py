@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, load_elements
 from walop_jax.commands.door import PathLike
 from walop_jax.io.errors import DataError, errors_naming, fail
 from walop_jax.io.text import in_ascii, read_text
@@ -88,11 +88,15 @@ TableFile = Annotated[
 
 
 def read(
-    *paths: PathLike, kinds: Collection[str] = (), catalogue: Effects = None
+    *paths: PathLike,
+    kinds: Collection[str] = (),
+    catalogue: Effects = None,
+    elements: PathLike | Sequence[type] | None = None,
 ) -> CalibrationSet | Calibration | Run:
     """Read calibration sets (several become one), a calibration product, or the folder of a run.
 
-    `kinds` are kinds of exposures beyond those of the format, `catalogue` the effects that a fitted model may have.
+    `kinds` are kinds of exposures beyond those of the format, `catalogue` the effects that a fitted model may have,
+    `elements` kinds of elements of your own, or the file that defines them.
     Raises `DataError`, naming file, extension, column and row, for what cannot be read or trusted.
 
     >>> walop.read("night.fits").instrument
@@ -104,6 +108,7 @@ def read(
     from walop_jax.io.fits_reading import primary_keywords
     from walop_jax.posterior.files import DOCUMENTS
 
+    load_elements(elements)
     if not paths:
         raise fail("no file was given", advice="name a calibration set, a calibration product or a run")
     first = Path(paths[0])
@@ -129,12 +134,14 @@ def catalogue_of(effects: Effects) -> tuple[type[Effect], ...]:
 def design_of(instrument: InstrumentLike) -> Instrument | None:
     """The instrument as designed: as given, or read, also from a run or a product; None if nothing was given."""
     from walop_jax import Instrument
+    from walop_jax.model.elements import defined_elements
 
     if isinstance(instrument, str | os.PathLike):
         path = Path(instrument)
         if path.is_dir() or path.suffix == ".fits":
             return calibration_of(path).design
-    return Instrument.read(instrument) if isinstance(instrument, str | os.PathLike) else instrument
+        return Instrument.read(instrument, elements=defined_elements())
+    return instrument
 
 
 def paths_of(data: Sets) -> tuple[PathLike, ...]:

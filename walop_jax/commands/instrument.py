@@ -80,7 +80,7 @@ class CheckedInstrument(Displayed):
         )
 
 
-@command(jax=False)
+@command(jax=False, elements=True)
 def instrument(
     job: Job,
     source: Annotated[PathLike | None, SOURCE] = None,
@@ -129,9 +129,10 @@ def checked(source: PathLike) -> CheckedInstrument:
     from walop_jax.calibration.matrix import point_vectors
     from walop_jax.fit.model_file import model_without_data
     from walop_jax.model.dependence import needs, optical_indices
+    from walop_jax.model.elements import defined_elements
     from walop_jax.model.plan import blank_plan
 
-    design = Instrument.read(source)
+    design = Instrument.read(source, elements=defined_elements())
     asked = needs(design)
     plan = blank_plan(design, asked.conditions, asked.median)
     edge = OFF_AXIS * min(design.field_limit, LARGEST_FIELD)

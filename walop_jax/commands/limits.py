@@ -79,7 +79,7 @@ def limits(
         planned = data if plan is None else as_planned(plan)
         design = instrument if plan is None else plan.design
         calset, chosen = set_and_model(planned, model, design, effects)  # pyright: ignore[reportArgumentType]
-        result = examined(refit(calset, chosen, progress=job.progress))
+        result = examined(refit(calset, chosen, progress=job.progress), job.seed)
     if not result.converged:
         raise ValueError(f"the fit did not converge ({result.minimum.message})")
     found = detection_limits(result, catalogue=asked, seed=job.seed, progress=job.progress)
@@ -107,5 +107,22 @@ def limits(
         ),
         files=files,
         saved_as=OUTPUTS[0],
+        next=()
+        if output is None
+        else (f"walop-jax report {output}", *_plan(data, output, instrument, result)),
         warnings=tuple(f"the fit: {text}" for text in result.warnings),
     )
+
+
+def _plan(data: object, output: PathLike, instrument: object, result: FitResult) -> Sequence[str]:
+    """The command that plans better exposures: beside a fit, of the plan that was given, or of the instrument."""
+    from walop_jax.calibration import PRODUCT
+    from walop_jax.simulation.observing_plan import is_plan
+
+    if len(result.model.template.cameras.pairs) != 2:
+        return ()  # which error is to be small is for the user to say
+    if (Path(output) / PRODUCT).exists():
+        return (f"walop-jax plan {output} --minutes 10",)
+    paths = [str(path) for path in data] if isinstance(data, list) else []
+    where = paths[0] if len(paths) == 1 and is_plan(paths[0]) else instrument or result.model.name
+    return (f"walop-jax plan {where} --minutes 30",)

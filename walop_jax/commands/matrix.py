@@ -134,5 +134,5 @@ def matrix(
     made.meanings = {int(bit): bit.meaning for bit in Quality}
     if output is not None:
         return dataclasses.replace(found, value=made)
-    advice = ("walop-jax matrix RUN --points TABLE -o OUT, for many points",)
+    advice = ("walop-jax matrix RUN --points TABLE -o OUT.fits",)
     return dataclasses.replace(found, value=made, text=lambda: str(made), next=advice)

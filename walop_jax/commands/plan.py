@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, Writers, command, text_file
-from walop_jax.commands.inputs import PathLike, calibration_of
+from walop_jax.commands.inputs import Effects, PathLike, calibration_of, catalogue_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, ObservingPlan
+    from walop_jax import Calibration, FitResult, ObservingPlan, Run
     from walop_jax.data.records import Exposures
+    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.plans.plan import ExposurePlan
 
 PLAN, INSTRUMENT = "plan.toml", "instrument.toml"
@@ -19,7 +21,7 @@ MOST_ANGLES = 24  # of a moving element, where a plan takes them from a run
 
 FOLDER = Option(f"Folder for {PLAN} and plan.json; without it the plan is printed only.", "RUN", Path, "-o")
 What = Annotated[
-    "ObservingPlan | PathLike",
+    "ObservingPlan | FitResult | Calibration | Diagnosis | Run | PathLike",
     Argument(
         "What could be observed: a plan file, an instrument by name, or the RUN to add to.",
         "PLAN.toml|INSTRUMENT|RUN",
@@ -72,6 +74,7 @@ def plan(
     after: After = None,
     apart: Apart = None,
     draws: Draws = 20,
+    effects: Effects = None,
     output: Annotated[PathLike | None, FOLDER] = None,
 ) -> Outcome[ExposurePlan]:
     """Plan the calibration exposures of a night: those that make the error of p smallest where it is largest.
@@ -89,18 +92,24 @@ def plan(
     from walop_jax import ObservingPlan
     from walop_jax.data.records import CALIBRATION_PLATE
     from walop_jax.data.user_tables import read_input_table
+    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.plans.could import Could
-    from walop_jax.plans.plan import PLANNED, plan_exposures
+    from walop_jax.plans.plan import plan_exposures
+    from walop_jax.plans.wanted import check_wishes
+    from walop_jax.posterior.files import PLANNED
     from walop_jax.simulation.observing_plan import plan_text
 
-    if isinstance(could, str | Path) and Path(could).is_dir():
+    check_wishes(minutes, goal, draws)
+    if not isinstance(could, str | Path | ObservingPlan) or (could != "" and Path(str(could)).is_dir()):
         after, could = could, ""
-    known = None if after is None else calibration_of(after)
-    alike = tuple(apart or ())
+    held = after.after if isinstance(after, Diagnosis) else after
+    known = None if held is None else calibration_of(held, effects)
+    catalogue = catalogue_of(effects) if effects is not None or known is None else known.model.catalogue
+    alike = (apart,) if isinstance(apart, str) else tuple(apart or ())
     if criterion == "apart" and not alike:
-        if after is None or known is None:
+        if known is None:
             raise UsageError("give the effects that are to be told apart, or a RUN of diagnose", "apart")
-        alike = _alike(Path(after), known)
+        alike = _alike(after, known)
     if candidates is not None:
         could = candidates
     elif could == "" and known is not None:
@@ -110,8 +119,6 @@ def plan(
             if prefix != CALIBRATION_PLATE
         }
         could = ObservingPlan(known.design if known.design.description else known.instrument, moving=moving)
-    if not minutes > 0:
-        raise fail("nothing can be observed in no time", advice="give --minutes")
     wanted = (
         read_input_table(criterion)
         if Path(str(criterion)).suffix and Path(str(criterion)).exists()
@@ -127,6 +134,7 @@ def plan(
             goal=goal,
             draws=draws,
             apart=alike,
+            catalogue=catalogue,
             seed=job.seed,
             progress=say,
         )
@@ -134,7 +142,7 @@ def plan(
     def files() -> Writers:
         described = found.observing_plan.design.description
         text = plan_text(found.observing_plan, INSTRUMENT if described else None)
-        return {PLAN: text_file(text)} | ({INSTRUMENT: text_file(described)} if described else {})
+        return {PLAN: text_file(text), INSTRUMENT: text_file(described) if described else None}
 
     return Outcome(
         found,
@@ -158,15 +166,23 @@ def _stood_at(exposures: Exposures, prefix: str) -> tuple[float | None, ...]:
     return tuple(float(angle) if np.isfinite(angle) else None for angle in stood)
 
 
-def _alike(run: Path, known: Calibration) -> tuple[Any, ...]:
+def _alike(after: Any, known: Calibration) -> tuple[Any, ...]:
     """The effects that a diagnosis could not tell apart: that found, as it is, then its rivals by name."""
-    from walop_jax.io.text import read_json
+    from walop_jax import Run
+    from walop_jax.diagnosis.findings import Diagnosis, document
+    from walop_jax.posterior.files import DIAGNOSIS
 
-    path = run / "diagnosis.json"
-    if not path.exists():
-        raise fail("no diagnosis", file=path, advice="run diagnose first, or name the effects with --apart")
+    if isinstance(after, str | os.PathLike):
+        after = Run(Path(after))
+    there = document(after) if isinstance(after, Diagnosis) else None
+    if isinstance(after, Run):
+        there = after.documents.get("diagnosis")
+    path = after.folder / DIAGNOSIS if isinstance(after, Run) else None
+    if there is None:
+        advice = "run diagnose first, or name the effects with --apart (apart= in Python)"
+        raise fail("no diagnosis", file=path, advice=advice)
     found = {effect.name: effect for effect in known.model.instrument(known.values).effects}
-    for step in read_json(path)["steps"]:
+    for step in there["steps"]:
         if step["equivalent"] and step["effect"] in found:
             return (found[step["effect"]], *step["equivalent"])
     raise fail(

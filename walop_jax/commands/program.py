@@ -51,10 +51,11 @@ NEXT = {
     "import_zemax": ("walop-jax refit {output} -o RUN",),
     "model": ("walop-jax refit {calsets} --instrument {instrument} --model {output} -o RUN",),
     "sample": ("walop-jax report {fit}",),
-    "limits": ("walop-jax report {output}", "walop-jax plan"),
+    "plan": ("walop-jax report {output}", "walop-jax simulate {output}/plan.toml -o SET.fits"),
     "compare": ("walop-jax report {output}",),
     "epoch": ("walop-jax report {output}",),
-    "apply": ("walop-jax watch {calibration} {output}, with the nights to come",),
+    "apply": ("walop-jax watch {calibration} {output} -o WATCH",),
+    "watch": ("walop-jax report {output}",),
     "report": ("open the page in a browser",),
     "certify": ("walop-jax apply {calibration} STARS.fits -o OUT.fits",),
 }
@@ -158,6 +159,7 @@ def _command(name: str) -> Any:
 def _function(command: Command[Any]) -> Callable[..., None]:
     """Function that typer calls: its signature is made of the options of a command."""
     defaults = {p.name: p.default for p in inspect.signature(command.body).parameters.values()}
+    defaults["elements"] = None
     parameters = [_parameter(name, option, defaults[name]) for name, option in command.options.items()]
     for name, (default, option) in COMMON.items():
         if option is not None and (name != "overwrite" or command.writes is not None):

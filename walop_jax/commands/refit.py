@@ -38,7 +38,7 @@ ProcessesOption = Option(
 )
 
 
-@command(stages=STAGES, writes=())
+@command(stages=STAGES, writes=(), random=True)
 def refit(
     job: Job,
     data: Sets,
@@ -99,7 +99,7 @@ def refit(
                     calset, chosen, folder=kept, progress=say, memory=in_bytes(memory), processes=crew
                 )
                 say(Stage("looking for patterns in the residuals", "examining"))
-                result = answered(examined(fitted))
+                result = answered(examined(fitted, job.seed))
             wanted = output is not None
             mapped = wanted and result.likelihood.layout.large and result.converged
             residuals = residual_map(result) if mapped else None
@@ -121,7 +121,7 @@ def refit(
                 ),
                 files,
                 saved_as=SUMMARY,
-                next=next_steps(result.trusted, output, data),
+                next=next_steps(result.trusted, output, data, instrument=instrument, effects=effects),
                 warnings=(*result.warnings, *(() if misfit is None else misfit.sentences())),
                 trusted=result.trusted,
                 silent=not first,
@@ -137,8 +137,7 @@ def refit(
                 return found
             job.tell("mapping the field", "mapping")
             if result.converged:
-                found.save(job.folder, drop=(FAILED, PARTIAL))
-                return found
+                return found.save(job.folder, drop=(FAILED, PARTIAL))
             job.folder.path.mkdir(exist_ok=True)
             with atomic_path(job.folder.path / FAILED, overwrite=True) as temporary:
                 temporary.write_text(json_text(found.content), encoding="utf-8")
@@ -146,12 +145,13 @@ def refit(
             return found
 
 
-def next_steps(trusted: bool, output: PathLike | None, data: Sets) -> tuple[str, ...]:
-    """Command lines to type after a fit."""
+def next_steps(trusted: bool, output: PathLike | None, data: Sets, **options: object) -> tuple[str, ...]:
+    """Command lines to type after a fit; `options` are those that a diagnosis of the sets needs as well."""
     if trusted:
         return (f"walop-jax report {output}", f"walop-jax apply {output} STARS.fits -o OUT.fits")
     sets = " ".join(str(path) for path in paths_of(data)) if output is not None else "CALSET"
-    return (f"walop-jax report {output}", f"walop-jax diagnose {sets} -o {output}_diagnosis")
+    more = "".join(f" --{name} {value}" for name, value in options.items() if isinstance(value, str | Path))
+    return (f"walop-jax report {output}", f"walop-jax diagnose {sets}{more} -o {output}_diagnosis")
 
 
 @contextlib.contextmanager

@@ -75,6 +75,4 @@ def stack(
             warnings=survey.verdict.warnings,
             trusted=survey.trusted,
         )
-        if job.folder is not None:
-            found.save(job.folder, drop=(PARTIAL,))
-        return found
+        return found if job.folder is None else found.save(job.folder, drop=(PARTIAL,))

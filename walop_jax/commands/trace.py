@@ -24,7 +24,7 @@ from walop_jax.commands.inputs import (
 )
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Run
+    from walop_jax import Calibration, FitResult, Instrument, Run
     from walop_jax.model.trace import LightStage
 
 PRODUCT = Argument("An instrument as fitted; without it, as designed.", "[RUN/calibration.fits]", Path)
@@ -48,7 +48,7 @@ def _numbers_first(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple
 @command(given=_numbers_first)
 def trace(
     job: Job,
-    calibration: Annotated[Calibration | FitResult | Run | PathLike | None, PRODUCT] = None,
+    calibration: Annotated[Calibration | FitResult | Run | Instrument | PathLike | None, PRODUCT] = None,
     *,
     instrument: InstrumentLike = None,
     effects: Effects = None,
@@ -72,12 +72,14 @@ def trace(
 
     >>> print(walop.trace(result, x=0.1, y=0.0, q=0.05))  # doctest: +SKIP
     """
-    from walop_jax import Settings
+    from walop_jax import Instrument, Settings
     from walop_jax.data.settings import builtin_filter
     from walop_jax.model.instrument import nominal_instrument
     from walop_jax.model.trace import Sightline
     from walop_jax.model.trace import trace as traced
 
+    if isinstance(calibration, Instrument):
+        calibration, instrument = None, calibration
     there = {name.upper(): value for name, value in positions.items()} | angles_of(at)
     try:
         setting = Settings.default(1, filter).at(**there)

@@ -228,7 +228,11 @@ class Catalogue:
         """Some of the rows; stars are numbered anew."""
         if keep.all():
             return self
-        whole = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("points", "remarks")}
+        whole = {
+            f.name: getattr(self, f.name)
+            for f in dataclasses.fields(self)
+            if f.name not in ("points", "remarks")
+        }
         p = self.points
         points = FieldPoints(p.x[keep], p.y[keep], p.settings[np.flatnonzero(keep)], p.outside[keep])
         some = Catalogue(points=points, **{name: values[keep] for name, values in whole.items()})

@@ -41,6 +41,7 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.conventions import Units
 from walop_jax.model.dependence import conditions_of_effect
 from walop_jax.model.effects import Context, Described, Effect
+from walop_jax.model.effects.catalogue import applies
 from walop_jax.model.effects.change import BAND, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.etalon import probed_gaps
@@ -94,8 +95,8 @@ class Probe:
 def applicable(
     catalogue: Sequence[type[Effect]], context: Context, instrument: Instrument
 ) -> tuple[type[Effect], ...]:
-    """The effects of a catalogue that have what they act on in an instrument."""
-    return tuple(kind for kind in catalogue if kind.neutral(context).fits(instrument))
+    """The effects of a catalogue that have what they act on in an instrument; ValueError as `applies`."""
+    return tuple(kind for kind in catalogue if applies(kind.neutral(context), instrument))
 
 
 def probes(catalogue: Sequence[type[Effect]], context: Context) -> Iterator[Probe]:

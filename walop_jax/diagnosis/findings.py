@@ -8,8 +8,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from walop_jax.data.records import Exposures
 from walop_jax.diagnosis.design import Design, positions_of
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.fit.refit import FitResult
@@ -23,6 +24,8 @@ from walop_jax.model.parameters import field_declarations
 
 HARMONICS = (0, 1, 2, 3, 4)
 FIELD_WORDS = ("uniform", "gradient", "quadratic", "cubic", "fourth order")
+DIFFERENT = 0.1  # of the whole: less is no difference
+FEWEST_FREE = 4  # exposures beyond what their settings explain, for a trend to be told
 SHARE = 0.2  # a group is mentioned when it carries this share of the largest
 
 
@@ -81,28 +84,66 @@ def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
 
 
 def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
-    """Place of a change of the residuals (data rows of `design`), as `where` of diagnosis.json (docs: files)."""
+    """Place of a change of the residuals (data rows of `design`), as `where` of diagnosis.json (docs: files).
+
+    None where its shares are those that the same change of every row would have: that is the plan, not the change.
+    """
     cube = design.cube(rows)
     square = cube**2
     e, names = design.fit.calset.exposures, design.fit.model.template.cameras.names
-    by_exposure = square.sum(axis=(0, 2))
+    by_exposure, seen = square.sum(axis=(0, 2)), design.measured.used.sum(axis=0)
 
-    def grouped(labels: np.ndarray) -> dict[str, float]:
-        return {str(label): float(by_exposure[labels == label].sum()) for label in np.unique(labels)}
+    def grouped(labels: np.ndarray) -> str | None:
+        found, plan = (
+            {str(label): float(of[labels == label].sum()) for label in np.unique(labels)}
+            for of in (by_exposure, seen)
+        )
+        return _differing(found, plan)
 
     stood = {prefix: positions_of(e, prefix) for prefix in design.measured.likelihood.plan.moving}
     harmonics, field = _harmonics(design, cube)
-    order = np.argsort(e.mjd)
-    rms = np.sqrt(by_exposure / np.maximum(len(names) * design.measured.used.sum(axis=0), 1))
-    trend = float(np.corrcoef(np.arange(len(e)), rms[order])[0, 1]) if len(e) > 2 and rms.std() > 0 else 0.0
+    settings = np.unique(
+        [e.kind, e.filter, *(at.astype(str) for at in stood.values())], axis=1, return_inverse=True
+    )[1]
+    trend = _trend(e, settings.ravel(), np.sqrt(by_exposure / np.maximum(len(names) * seen, 1)))
+    cameras = dict(zip(names, square.sum(axis=(0, 1)).tolist(), strict=True))
     return {
-        "camera": _named(dict(zip(names, square.sum(axis=(0, 1)).tolist(), strict=True))),
+        "camera": _differing(cameras, dict.fromkeys(names, 1.0)),
         "field": _field_words(design, field),
-        "clp_harmonic": _named(harmonics) if harmonics else "no polariser exposures",
-        "wavelength": _named(grouped(e.filter)),
-        "kind": _named(grouped(e.kind)),
-        "time": "grows with time" if trend > 0.7 else "shrinks with time" if trend < -0.7 else "no trend",
-    } | {prefix: _named(grouped(at)) for prefix, at in stood.items() if len(np.unique(at)) > 1}
+        "clp_harmonic": _differing(harmonics, {name: 1.0 if name == "0θ" else 2.0 for name in harmonics}),
+        "wavelength": grouped(e.filter),
+        "kind": grouped(e.kind),
+        "time": "grows with time" if trend > 0.7 else "shrinks with time" if trend < -0.7 else None,
+    } | {prefix: grouped(at) for prefix, at in stood.items() if len(np.unique(at)) > 1}
+
+
+def _differing(groups: dict[str, float], plan: dict[str, float]) -> str | None:
+    """Shares of groups in words where a tenth of the whole lies elsewhere than in the plan."""
+    total, whole = sum(groups.values()) or 1.0, sum(plan.values()) or 1.0
+    moved = 0.5 * sum(abs(groups[name] / total - plan[name] / whole) for name in groups)
+    return _named(groups) if moved > DIFFERENT else None
+
+
+def _trend(e: Exposures, settings: Int[np.ndarray, " e"], rms: Float[np.ndarray, " e"]) -> float:
+    """Correlation of the rms of exposures with their order in time, among those that a plan has alike.
+
+    What kind, setting and angle of the polariser (first and second harmonic of 2θ) explain of either is taken out: a
+    plan goes through them in order, so that they are not told from time.
+    """
+    alike = [settings == number for number in np.unique(settings)]
+    through = e.clp_in & np.isfinite(e.clp_angle)
+    angle = np.deg2rad(np.where(through, e.clp_angle, 0.0))
+    waves = [np.where(through, wave(n * angle), 0.0) for n in (2, 4) for wave in (np.cos, np.sin)]
+    columns = np.stack([*alike, *waves], axis=1).astype(float)
+    base = np.linalg.svd(columns, full_matrices=False)
+    base = base[0][:, base[1] > 1e-9 * base[1][0]]
+    order = np.argsort(np.argsort(e.mjd)).astype(float)
+    left = [one - base @ (base.T @ one) for one in (order, rms)]
+    size = [float(np.linalg.norm(one)) for one in left]
+    free = len(e) - base.shape[1]
+    if free < FEWEST_FREE or size[0] < 1e-9 * len(e) or size[1] < DIFFERENT * float(np.linalg.norm(rms)):
+        return 0.0
+    return float(left[0] @ left[1]) / (size[0] * size[1])
 
 
 # -------------------------------------------------------------------------------------------------------- what is found
@@ -416,7 +457,9 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
         size = f"{100 * step['change_of_qu']:.2g} %"
         yield f"{name} changes calibrated q and u by up to {size}{', which is negligible' * bool(step['negligible'])}"
     places = {
-        key: str(value) for key, value in step.get("where", {}).items() if not str(value).endswith(" 100%")
+        key: str(value)
+        for key, value in step.get("where", {}).items()
+        if value is not None and not str(value).endswith(" 100%")
     }
     if places:
         words = (f"{key}: {value}".replace("_", " ").replace("%", " %") for key, value in places.items())

@@ -145,7 +145,7 @@ def diagnose(
         ended=judge.ended,
     )
     del first, last  # the columns of all candidates, gigabytes of a large set
-    return _examined(found)
+    return _examined(found, seed)
 
 
 def _left(first: Examination, judge: Refit, policy: Policy) -> Examination:
@@ -156,9 +156,9 @@ def _left(first: Examination, judge: Refit, policy: Policy) -> Examination:
     return last
 
 
-def _examined(found: Diagnosis) -> Diagnosis:
+def _examined(found: Diagnosis, seed: int) -> Diagnosis:
     """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked."""
-    after = examined(with_honest_errors(found.after), as_written=True, policy=found.policy)
+    after = examined(with_honest_errors(found.after), seed, as_written=True, policy=found.policy)
     if found.before is found.after:
         return dataclasses.replace(found, before=after, after=after)
     for sentence in rival_conditions(Design.of(found.before), found.after.chi2, found.policy):
@@ -167,7 +167,7 @@ def _examined(found: Diagnosis) -> Diagnosis:
     explained = found.before.explains_data or found.before.nearly_explains_data
     before = found.before.judged()
     if explained:
-        before = examined(found.before, as_written=True, policy=found.policy)
+        before = examined(found.before, seed, as_written=True, policy=found.policy)
     return dataclasses.replace(found, before=before, after=after)
 
 
@@ -518,8 +518,10 @@ def unexplained(state: Examination, patterns: tuple[tuple[str, float], ...]) -> 
         p = state.table.corrected(nearest.score)
         text += f". Nearest comes '{nearest.probe.name}' (p = {p:.1g}), which was not confirmed"
     where = describe(state.design, state.design.residual)
-    moving = "".join(f"; {p} {where[p]}" for p in state.design.measured.likelihood.plan.moving if p in where)
-    text += f". Residuals sit in: cameras {where['camera']}; kinds {where['kind']}; field {where['field']}{moving}"
+    words = {"cameras": "camera", "kinds": "kind", "field": "field"}
+    words |= {prefix: prefix for prefix in state.design.measured.likelihood.plan.moving}
+    told = (f"{name} {where[key]}" for name, key in words.items() if where.get(key) is not None)
+    text += f". Residuals sit in: {'; '.join(told)}"
     return Unexplained(state.table.p_global, text, patterns)
 
 

@@ -1,1 +1,1 @@
-"""Finding the best parameters and carrying them to the sky: fit, gates, covariance, instrument matrix."""
+"""The best parameters: model files, the search for the minimum, covariance, misfit, outliers, verdict."""

@@ -1,1 +1,1 @@
-"""Files: opened, checked, written whole or not at all. Nothing here knows what a calibration set is."""
+"""Files, opened, checked, written whole or not at all; errors, progress, and tables and text on a terminal."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import importlib.util
 import os
@@ -39,6 +40,15 @@ def classes_of(path: str | os.PathLike[str], base: type[T], advice: str) -> dict
         for name, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, base) and value.__module__ == module_name
     }
+
+
+def blank(kind: type[T]) -> T:
+    """An object without its fields, for `__reduce__`: float64 is on before its arrays are read, which would lose half.
+
+    Whoever unpickles a result may not have asked the package for anything yet.
+    """
+    importlib.import_module("walop_jax")._switch_on_float64()
+    return object.__new__(kind)
 
 
 SOFTWARE = ("walop-jax", "jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy", "scipy", "astropy")

@@ -11,6 +11,8 @@ import re
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
+from walop_jax.io.code import blank
+
 MOST_LINES = 25
 """Of what a result shows of itself unasked."""
 
@@ -103,6 +105,9 @@ class Displayed(abc.ABC):
     @abc.abstractmethod
     def display(self) -> Display:
         """Title, facts, table and notes to show."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return blank, (type(self),), self.__getstate__()
 
     def __repr__(self) -> str:
         return self.display().shortened(MOST_LINES).text()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import difflib
 import os
-from collections.abc import Iterable, Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
 
 _SHOWN = 5
 """Number of rows or names that a message spells out before it only counts the rest."""
+_ALIKE, _SHORT = 0.75, 3
+"""Likeness of a name that is misspelt; letters of a word that says nothing by itself."""
 
 
 class DataError(ValueError):
@@ -60,11 +63,20 @@ def rows_text(rows: Sequence[int] | np.ndarray) -> str:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Advise on a name that does not exist: the names most like it, or some of those that there are."""
+    """Advise on a name that does not exist: the names most like it, or some of those that there are.
+
+    Of a mapping the values are what the names mean: where none is much like it, those are taken that have a word of it.
+    """
+    meanings = known if isinstance(known, Mapping) else {}
     known = sorted(set(known))
     if not known:
         return "there are none to choose from"
-    close = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    close = difflib.get_close_matches(name, known, n=3, cutoff=_ALIKE if meanings else 0.4)
+    if meanings and not close:
+        words = [word for word in re.split(r"[\W_]+", name.lower()) if len(word) > _SHORT]
+        texts = {one: f"{one} {meaning}".lower() for one, meaning in meanings.items()}
+        close = [one for one, text in texts.items() if any(word in text for word in words)][:_SHOWN]
+        close = close or difflib.get_close_matches(name, known, n=3, cutoff=0.4)
     if not close:
         lowered = {entry.lower(): entry for entry in known}
         close = [lowered[m] for m in difflib.get_close_matches(name.lower(), lowered, n=3, cutoff=0.4)]

@@ -1,1 +1,1 @@
-"""Probability of data: noise that scores and draws, the flux eliminated, priors, a set in memory or read anew."""
+"""χ² of data with its gradient and matrix: fluxes eliminated, priors, tables, frames, threads and processes."""

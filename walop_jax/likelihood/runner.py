@@ -270,6 +270,10 @@ class Runner:
     progress: Progress | None = None
     journal: Journal | None = None
 
+    def __getstate__(self) -> dict[str, object]:
+        """Parts that a copy in another process can use: it works alone there, and is listened to by nobody."""
+        return vars(dataclasses.replace(self.alone(), progress=None))
+
     def alone(self) -> Runner:
         """The same for work that is neither shared with other processes nor worth keeping."""
         return dataclasses.replace(self, processes=Processes(), journal=None)

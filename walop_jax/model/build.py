@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,13 +40,30 @@ class Parts(NamedTuple):
     cameras: Cameras
 
 
+def made_by(kind: str) -> str:
+    """The beginning of the line of a description that says where the class of a kind of one's own comes from."""
+    return f"# element {kind}: "
+
+
+def with_origins(text: str, elements: Sequence[Element]) -> str:
+    """A description with a line for each kind of element of one's own: whoever reads it elsewhere needs the class."""
+    lines = {}
+    for one in elements:
+        if not any(type(one) is kind for kind in ELEMENTS) and made_by(one.kind) not in text:
+            module = sys.modules.get(type(one).__module__)
+            file = Path(getattr(module, "__file__", None) or "a Python session").name
+            lines[one.kind] = f"{made_by(one.kind)}class {type(one).__qualname__} of {file}"
+    return "\n".join((text.rstrip("\n"), *lines.values(), "")) if lines else text
+
+
 def parts(description: Description, elements: Sequence[type[Element]] = ()) -> Parts:
     """The parts of an instrument that a description describes, at the values that it gives.
 
     `elements` are further kinds of elements that it may name. Raises `DataError`, naming table and key, for what is
     wrong.
     """
-    make = _Maker(description.read, description.source, {kind.kind: kind for kind in (*ELEMENTS, *elements)})
+    kinds = {kind.kind: kind for kind in (*ELEMENTS, *elements)}
+    make = _Maker(description.read, description.source, kinds, description.text)
     common = tuple(make.elements(description.elements, description.path, "elements"))
     arms = tuple(make.arm(name, table) for name, table in description.arms.items())
     coefficients = np.zeros((len(description.cameras), len(legendre.terms(description.degree))))
@@ -79,6 +98,13 @@ class _Maker:
     read: Reader
     source: str
     kinds: Mapping[str, type[Element]]
+    text: str = ""
+
+    def origin(self, kind: str) -> str:
+        """Advice on the class of a kind that is not there, which the description may name."""
+        line = next((line for line in self.text.splitlines() if line.startswith(made_by(kind))), "")
+        where = line.removeprefix(made_by(kind))
+        return f"It is {where}: give --elements FILE.py" if where else "One of your own: --elements FILE.py"
 
     def arm(self, name: str, content: Any) -> Arm:
         place = f"arms.{self.read.name(name, 'arms')}"
@@ -111,7 +137,8 @@ class _Maker:
         kind = self.kinds.get(self.read.text(table["kind"], "kind", place))
         if kind is None:
             what = f"there is no kind of element {table['kind']!r}; {nearest(table['kind'], self.kinds)} "
-            what += f"Kinds are {', '.join(self.kinds)}; walop-jax docs element says what each is"
+            what += f"Kinds are {', '.join(self.kinds)}; walop-jax docs element says what each is. "
+            what += f"{self.origin(table['kind'])}, in Python elements=[CLASS] or a FILE.py"
             raise self.read.fault(place, what)
         moves, layers = table.get("moves"), table.get("layers", [])
         values = {k: v for k, v in table.items() if k not in ("kind", "moves", "layers")}

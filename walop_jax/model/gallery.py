@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import re
 import sys
 from collections.abc import Iterator, Mapping
 from importlib.resources import files
@@ -17,7 +16,7 @@ from walop_jax.model.elements.base import Element
 from walop_jax.model.parameters import field_declarations, numbers_of, unknown_name
 
 NUMBERS = "gallery.json"
-_SHORT, _MOST = 3, 4  # letters of a word that says little; names that are offered
+
 _UNSEEN = 3.0  # standard deviations below which one effect may be taken for another
 _NOTHING = 5e-4  # per cent of the matrix: not worth a number
 
@@ -37,13 +36,8 @@ def page(topic: str, name: str) -> str:
     known = TOPICS[topic]
     if name not in known:
         every = f"walop-jax docs {topic} lists all"
-        words = [word for word in re.split(r"[\W_]+", name.lower()) if len(word) > _SHORT]
-        about = {one: f"{one} {_about(kind)}".lower() for one, kind in known.items()}
-        found = [one for one, text in about.items() if any(word in text for word in words)]
-        if found:
-            meant = " or ".join(map(repr, found[:_MOST]))
-            raise ValueError(f"there is no {topic} {name!r}; did you mean {meant}? ({every})")
-        raise ValueError(f"{unknown_name(topic, name, known)} ({every})")
+        meanings = {one: _about(kind) for one, kind in known.items()}
+        raise ValueError(f"{unknown_name(topic, name, meanings)} ({every})")
     made = _effect(known[name]) if topic == "effect" else _element(known[name])
     return "\n\n".join(made) + "\n"
 

@@ -32,7 +32,7 @@ from walop_jax.instruments.description import (
 )
 from walop_jax.io.errors import nearest
 from walop_jax.model import fold, legendre
-from walop_jax.model.build import parts
+from walop_jax.model.build import parts, with_origins
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.compiled import array
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH, Units
@@ -364,6 +364,7 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
     for what does not exist or would do nothing where it stands.
     """
     made = parts(description, elements)
+    every = (*made.elements, *(element for _, inside, _ in made.arms for element in inside))
     instrument = Instrument(
         name=description.name,
         sources=sources(),
@@ -375,7 +376,7 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
         field_limit=description.field_limit,
         site=description.place,
         raster=(description.raster, description.edge),
-        description="" if description.name in shipped() else description.text,
+        description="" if description.name in shipped() else with_origins(description.text, every),
         wavelength=description.wavelength or REFERENCE_WAVELENGTH,
         source=description.source if description.source != NO_SOURCE else "",
     )

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from walop_jax.io.code import blank
 from walop_jax.io.errors import nearest
 from walop_jax.model.compiled import array, float64
 
@@ -144,6 +145,9 @@ def check_names(what: str, names: Iterable[str], known: Collection[str]) -> None
 
 class Component(eqx.Module):
     """A piece of the instrument; what it declares is what a fit may vary."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return blank, (type(self),), self.__getstate__()
 
     def labels(self, field: str) -> Sequence[str]:
         """Names, within this component, of the elements of the parameter `field`; "" is the component's own name."""

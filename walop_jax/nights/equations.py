@@ -34,6 +34,7 @@ from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, used_rows
 from walop_jax.likelihood.runner import fingerprint
 from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects.catalogue import applies
 from walop_jax.model.parameters import Parameter, leaves
 from walop_jax.model.specification import Model, effect_context
 from walop_jax.nights.algebra import Equations
@@ -159,7 +160,7 @@ def candidates_of(
         if kind.is_structural() or kind.name in (*OF_ONE_SET, *model.effect_names):
             continue
         groups = kind.probes(context)
-        if len(groups) > MOST_SHAPES or not kind.neutral(context).fits(model.template):
+        if len(groups) > MOST_SHAPES or not applies(kind.neutral(context), model.template):
             continue
         for g, group in enumerate(groups):
             for m, member in enumerate(group):

@@ -51,7 +51,7 @@ from walop_jax.nights.equations import (
 )
 from walop_jax.nights.night_file import NIGHTS, nights_in, read_nights, write_nights
 from walop_jax.nights.survey import Survey
-from walop_jax.posterior.files import Run
+from walop_jax.posterior.files import SURVEY, Run
 
 Given = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
 """Sources of nights: a fit, a set, a night, or a path: of a set, of a RUN, of a SURVEY or of its nights."""
@@ -66,7 +66,7 @@ SKETCH, COPIED = (
 )  # measurements by which sets are compared, and their share that no two have by chance
 MANY = 20  # sets from which on programs are better compiled for longer
 REFERENCE = "reference.fits"
-TRACKS, SURVEY = "tracks.fits", "survey.json"
+TRACKS = "tracks.fits"
 FILES = (NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY)
 """The files of a survey."""
 

@@ -32,7 +32,7 @@ from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
 from walop_jax.model.compiled import compiled
-from walop_jax.model.effects import Effect, effect_by_name
+from walop_jax.model.effects import EFFECTS, Effect, effect_by_name
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import Model, effect_context, with_effects
@@ -109,13 +109,15 @@ def candidates(
     around: Calibration | None = None,
     angles: int = ANGLES,
     effects: Sequence[str | Effect] = (),
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> Candidates:
     """The exposures that could be taken, each with its information in `draws` draws of the instrument.
 
     Instruments are drawn from the priors, or from the posterior of the calibration `around`; `angles`, an odd number,
-    are those of the polariser. `effects` may be there as well, at their values; those given by name alone at the size
-    of their scale. Raises ValueError where nothing is left to be observed, and for effects that do not act on light.
+    are those of the polariser. `effects` of the `catalogue` may be there as well, at their values; those given by
+    name alone at the size of their scale. Raises ValueError where nothing is left to be observed, and for effects
+    that do not act on light.
     """
     tell = progress or (lambda text: None)
     choices, notes = could.choices()
@@ -130,7 +132,8 @@ def candidates(
     tell("expected counts")
     calset = simulate(plan, seed=seed, noiseless=True, steady=True).calset
     model = base_model(calset, plan.design, throughput_degree=plan.throughput_degree)
-    model, stated = _with(model, calset, effects)
+    kinds = (*catalogue, *(type(effect) for effect in effects if isinstance(effect, Effect)))
+    model, stated = _with(dataclasses.replace(model, catalogue=kinds), calset, effects)
     values = drawn(model, draws, seed, around)
     for i in (model.index(name) for name in model.names if _effect_of(name, stated)):
         values[:, i] = model.parameters[i].start
@@ -172,17 +175,20 @@ def _with(
     """The model with effects at their values, and which of them have one."""
     context, stated, whole = effect_context(model.template, calset.exposures), {}, model
     for one in given:
-        effect = effect_from_text(one, context) if isinstance(one, str) and "=" in one else one
+        effect = one
+        if isinstance(one, str) and "=" in one:
+            effect = effect_from_text(one, context, model.catalogue)
         alone = isinstance(effect, str)
         name = effect.strip() if isinstance(effect, str) else effect.name
         whole = with_effects(whole, (name if alone else effect,), context)
-        if effect_by_name(name).is_structural():
+        kind = effect_by_name(name, model.catalogue)
+        if kind.is_structural():
             raise ValueError(
                 f"{name} is there or it is not, and has no size that could be planned for; leave it out"
             )
         stated[name] = not alone
         for p in whole.parameters if alone else ():
-            if _effect_of(p.name, (name,)) and p.name.split(".")[1] not in effect_by_name(name).shape:
+            if _effect_of(p.name, (name,)) and p.name.split(".")[1] not in kind.shape:
                 whole = whole.change(p.name, start=p.start + p.scale)
     if given and not light.is_linear(whole.template):
         raise ValueError("effects of the detectors cannot be planned for: only those that act on light")

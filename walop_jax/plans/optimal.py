@@ -143,7 +143,7 @@ class Bound:
     here: float
     known: float
     ratio: float
-    tops: tuple[tuple[int, Float[np.ndarray, " d"]], ...]
+    tops: tuple[tuple[int, Float[np.ndarray, " _"]], ...]
 
     def value(self, budget: float) -> float:
         """The least criterion of any plan of a budget."""
@@ -163,7 +163,7 @@ class Allocation:
     """
 
     family: Int[np.ndarray, " s"]
-    place: list[Float[np.ndarray, " d"]]
+    place: list[Float[np.ndarray, " _"]]
     weight: Float[np.ndarray, " s"]
     value: float
     bound: float
@@ -185,7 +185,7 @@ class Allocation:
 class _Some:
     """The problem for a few candidates: their matrices laid out, and the barrier method on them."""
 
-    def __init__(self, experiment: Experiment, chosen: Sequence[tuple[int, Float[np.ndarray, " d"]]]) -> None:
+    def __init__(self, experiment: Experiment, chosen: Sequence[tuple[int, Float[np.ndarray, " _"]]]) -> None:
         self.experiment, self.chosen = experiment, list(chosen)
         matrices, costs = [], []
         for number, place in self.chosen:
@@ -437,7 +437,7 @@ def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | Non
     return plan
 
 
-def _same(one: tuple[int, Float[np.ndarray, " d"]], other: tuple[int, Float[np.ndarray, " d"]]) -> bool:
+def _same(one: tuple[int, Float[np.ndarray, " _"]], other: tuple[int, Float[np.ndarray, " _"]]) -> bool:
     return one[0] == other[0] and bool(np.allclose(one[1], other[1], atol=1e-9, rtol=0.0))
 
 

@@ -26,7 +26,7 @@ from walop_jax.data.user_tables import InputTable
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
 from walop_jax.likelihood.inverses import pseudo_inverse
-from walop_jax.model.effects import Effect
+from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.plans.could import Could, separation
 from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
 from walop_jax.plans.optimal import (
@@ -39,11 +39,19 @@ from walop_jax.plans.optimal import (
     rounded,
     worth,
 )
-from walop_jax.plans.wanted import APART, NAMED, WORST, FieldErrors, Wanted, field_errors, wanted
+from walop_jax.plans.wanted import (
+    APART,
+    NAMED,
+    WORST,
+    FieldErrors,
+    Wanted,
+    check_wishes,
+    field_errors,
+    wanted,
+)
 from walop_jax.science.star_errors import GOAL
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 
-PLANNED = "plan.json"
 _NOTHING = 1e-6  # of what is known: less of it makes no plan
 _ALIKE = 3.0  # deg: angles of the plate that are taken as one
 _TRIES = 6  # budgets, until the exposures and the changes between them fit into the time
@@ -238,19 +246,28 @@ def plan_exposures(
     seed: int = 0,
     gap: float = GAP,
     apart: Sequence[str | Effect] = (),
+    catalogue: Sequence[type[Effect]] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> ExposurePlan:
     """The calibration exposures of `minutes` that make a criterion (`wanted`) best.
 
-    `known` is a calibration that is there already; `goal` a value of the criterion, as it is told, to which the time is
-    found. `apart` are effects that are to be told apart (`wanted.APART`), each with its value or by name
-    alone; their goal is `NAMED` unless another is given. Raises ValueError for a time that pays for nothing,
-    NotEstimableError where nothing that could be observed, or too little in that time, determines what is asked.
+    `known` is a calibration that is there already; `goal` a value of the criterion, as it is told, to which the time
+    is found. `apart` are effects that are to be told apart (`wanted.APART`), each with its value or by name alone, of
+    the `catalogue`; their goal is `NAMED` unless another is given. Raises ValueError as `check_wishes` and for a time
+    that pays for nothing, NotEstimableError where nothing that could be observed, or too little in that time,
+    determines what is asked.
     """
+    check_wishes(minutes, goal, draws)
     if apart:
         criterion, goal = APART, NAMED if goal is None else goal
     found = candidates(
-        Could.of(could), draws=draws, seed=seed, around=known, effects=apart, progress=progress
+        Could.of(could),
+        draws=draws,
+        seed=seed,
+        around=known,
+        effects=apart,
+        catalogue=catalogue,
+        progress=progress,
     )
     if progress is not None:
         progress("what is wanted")
@@ -277,8 +294,7 @@ def plan_from(
 ) -> ExposurePlan:
     """As `plan_exposures`, from candidates that are there; `known` is the information of what was measured before."""
     tell = progress or (lambda text: None)
-    if not minutes > 0:
-        raise ValueError(f"{minutes:g} minutes: nothing can be observed in no time")
+    check_wishes(minutes, goal)
     shortest = min(choice.seconds + found.could.costs.of(choice.kind) for choice in found.choices)
     if 60.0 * minutes < shortest:
         raise ValueError(

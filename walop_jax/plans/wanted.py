@@ -31,6 +31,8 @@ from walop_jax.model.parameters import check_names
 from walop_jax.plans.exposures import Candidates
 from walop_jax.plans.optimal import root_of
 
+LONGEST = 1440.0
+"""Minutes of a plan at most. It is one of a night, in which the sky stands still and the instrument does not change."""
 WORST, MEAN, APART = "worst", "mean", "apart"
 _SURE = 1.645  # standard deviations above which 95 % of a normal distribution lie, below zero
 NAMED = _SURE + float(np.sqrt(_SURE**2 + 2.0 * POLICY.improbable))
@@ -98,6 +100,21 @@ class FieldErrors:
         c = np.einsum("rpif,rfg,rpjg->rpij", self.slopes, covariance, self.slopes, optimize=True)
         square = np.einsum("rpij,rpij->rp", self.forms, c)
         return np.sqrt(np.where(self.forms.any(axis=(2, 3)), square, np.nan))
+
+
+def check_wishes(minutes: float, goal: float | None = None, draws: int = 1) -> None:
+    """Raise ValueError for a time, a goal or a number of draws that no plan can have."""
+    if not minutes > 0:
+        raise ValueError(f"{minutes:g} minutes: nothing can be observed in no time; give --minutes")
+    if not minutes <= LONGEST:
+        raise ValueError(
+            f"{minutes:g} minutes: a plan is one of a night, of {LONGEST:g} minutes at most; for what is longer plan "
+            "a night, and add to its calibration with --after RUN"
+        )
+    if goal is not None and not 0 < goal < np.inf:
+        raise ValueError(f"goal = {goal:g}: no time reaches it; give a value above 0, in % for errors of p")
+    if draws < 1:
+        raise ValueError(f"draws = {draws}: give 1 or more")
 
 
 def field_errors(
@@ -203,9 +220,10 @@ def _apart(found: Candidates) -> Wanted:
         raise ValueError("give two or more effects to be distinguished, and the size of one: NAME=VALUE")
     base = np.setdiff1d(np.arange(len(names)), np.concatenate(list(of.values())))
     size = np.zeros(len(names))
+    shapes = {effect: effect_by_name(effect, found.model.catalogue).shape for effect in effects}
     for effect, i in ((effect, i) for effect, places in of.items() for i in places):
         p = found.model.parameters[found.model.index(names[i])]
-        size[i] = 0.0 if names[i].split(".")[1] in effect_by_name(effect).shape else p.start
+        size[i] = 0.0 if names[i].split(".")[1] in shapes[effect] else p.start
         if size[i] and p.prior is not None:
             size[i] -= p.prior[0]
     widest, blocks = max(map(len, of.values())), []

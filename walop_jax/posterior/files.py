@@ -285,7 +285,7 @@ class Checkpoints:
 
 
 DIAGNOSIS, COMPARISON, EPOCH, LIMITS = "diagnosis.json", "comparison.json", "epoch.json", "limits.json"
-COMMISSIONING = "commissioning.json"
+COMMISSIONING, PLANNED, SURVEY, WATCHED = "commissioning.json", "plan.json", "survey.json", "watch.json"
 POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "posterior_corner.png", "sample.json"
 DOCUMENTS = {
     "summary": SUMMARY,
@@ -294,8 +294,24 @@ DOCUMENTS = {
     "comparison": COMPARISON,
     "epoch": EPOCH,
     "limits": LIMITS,
+    "commissioning": COMMISSIONING,
+    "plan": PLANNED,
+    "survey": SURVEY,
+    "watch": WATCHED,
 }
 """The documents that a run may hold, and their files."""
+
+VERDICTS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "diagnosis": lambda d: str(d["verdict"]),
+    "commissioning": lambda d: "go" if d["go"] else "no-go",
+    "epoch": lambda d: (
+        f"the old calibration {'still holds' if d.get('fits') and d.get('new_trusted') else 'does not hold'}"
+    ),
+    "survey": lambda d: "trusted" if d["trusted"] else "not trusted",
+    "watch": lambda d: "the calibration holds" if d["holds"] else "the calibration is not known to hold",
+    "plan": lambda d: f"{d['what']}: {d['value']:.3g} {d['unit']}".rstrip(),
+}
+"""Documents in a few words."""
 
 SAME_FIT = 0.05  # standard errors
 
@@ -352,7 +368,7 @@ class Run(Result):
 
     @functools.cached_property
     def documents(self) -> dict[str, dict[str, Any]]:
-        """The JSON documents of the run by name: summary, diagnosis, sample, comparison, epoch, limits."""
+        """The JSON documents of the run by name: those of `DOCUMENTS` that are there."""
         return {name: read_json(self.folder / file) for name, file in DOCUMENTS.items() if file in self}
 
     @functools.cached_property
@@ -441,8 +457,7 @@ class Run(Result):
             facts.append(
                 ("p of a star", f"{two_digits(100 * known['median'])} % (median of the field), {share}")
             )
-        if "diagnosis" in found:
-            facts.append(("verdict", str(found["diagnosis"].get("verdict"))))
+        facts += [(name, VERDICTS[name](found[name])) for name in VERDICTS if name in found]
         inner = Display("") if self.calibration is None else self.calibration.display()
         return dataclasses.replace(
             inner, title=f"Run {self.folder}. {inner.title}".removesuffix(". "), facts=(*facts, *inner.facts)

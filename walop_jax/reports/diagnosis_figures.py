@@ -37,6 +37,7 @@ from walop_jax.reports.style import (
     pixel_map,
     plain_ticks,
     point_map,
+    styled,
 )
 
 SIGN_BEYOND = 3.0  # σ beyond which a tile carries its sign
@@ -46,6 +47,7 @@ _MODELS = ("starting\nmodel", "final\nmodel")
 EXPLAINS = 5.0  # standard deviations of χ² within which a model counts as explaining the data
 
 
+@styled
 def residual_maps(
     points: Points, maps: Mapping[str, PointMap], cameras: Sequence[str], on: Canvas = PAGE
 ) -> AnyFigure:
@@ -60,6 +62,7 @@ def residual_maps(
     )
 
 
+@styled
 def effect_figure(data: DiagnosisFigureData, number: int = 1, on: Canvas = PAGE) -> AnyFigure:
     """Residuals without the effect of a comparison, what it explains, and with it; of 0: starting and final model."""
     one = data.comparisons[number]
@@ -68,6 +71,7 @@ def effect_figure(data: DiagnosisFigureData, number: int = 1, on: Canvas = PAGE)
     return residual_maps(data.points, rows, data.cameras, on)
 
 
+@styled
 def rms_figure(data: DiagnosisFigureData, on: Canvas = PAGE) -> AnyFigure:
     """Rms residuals of the starting and the final model over the field, rows and scale as in `residual_maps`.
 
@@ -120,6 +124,7 @@ def _signs(axis: Axes, points: Points, values: Float[np.ndarray, " p"], norm: No
         axis.text(points.x[i], points.y[i], sign, color=ink, fontsize=5, ha="center", va="center")
 
 
+@styled
 def signature_figure(
     comparison: ResidualComparison, exposures: Table, cameras: Sequence[str], on: Canvas = PAGE
 ) -> AnyFigure:
@@ -185,6 +190,7 @@ def _binned(x: Float[np.ndarray, " e"], *columns: Float[np.ndarray, " e"]) -> li
     return means
 
 
+@styled
 def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
     """χ² per degree of freedom of the starting model and of every model after it, on a logarithmic scale.
 
@@ -221,6 +227,7 @@ def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
     return figure
 
 
+@styled
 def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
     """Mean squared residual by camera, kind, filter and exposure, over what noise alone gives: before and after."""
     groups = [g for g in ("camera", "kind", "filter") if np.count_nonzero(shares["GROUP"] == g) > 1]
@@ -257,6 +264,7 @@ _PIXELS = 121
 _STEPS = (0.0, 1.0, 2.0, POLICY.separation, 4.0, 5.0, 6.0)
 
 
+@styled
 def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     """Largest error of q and u over the field that a single effect can make without being detected.
 
@@ -283,6 +291,7 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     return figure
 
 
+@styled
 def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     """Separation (σ) of each effect (column) from each other one (row) that is present at its detection limit."""
     count = len(found.effects)

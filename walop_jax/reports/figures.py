@@ -40,6 +40,7 @@ from walop_jax.reports.style import (
     plain_ticks,
     point_map,
     rounded_up,
+    styled,
 )
 from walop_jax.science.field_accuracy import FieldAccuracy
 from walop_jax.science.star_errors import GOAL
@@ -48,6 +49,7 @@ FITTED = Normalize(0.7, 1.3)
 """Scale of rms residuals of a fit that explains its data, the same for every run."""
 
 
+@styled
 def residuals_figure(
     likelihood: Likelihood,
     values: Float[np.ndarray, " n"],
@@ -62,6 +64,7 @@ def residuals_figure(
     return figure
 
 
+@styled
 def calibration_figure(
     maps: MatrixMaps,
     likelihood: Likelihood,
@@ -143,6 +146,7 @@ def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n
     axis.legend(frameon=False, fontsize=SMALL, loc="upper right")
 
 
+@styled
 def modulation_figure(
     calset: CalibrationSet, points: Sequence[int], on: Canvas = PAGE, names: Sequence[str] | None = None
 ) -> AnyFigure:
@@ -179,6 +183,7 @@ def modulation_figure(
     return figure
 
 
+@styled
 def matrix_maps_figure(maps: MatrixMaps, kind: int | None = None, on: Canvas = PAGE) -> AnyFigure:
     """The elements of the instrument matrix over the field as `matrix_panels` draws them.
 
@@ -193,6 +198,7 @@ def matrix_maps_figure(maps: MatrixMaps, kind: int | None = None, on: Canvas = P
     return figure
 
 
+@styled
 def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
     """The standard errors of the elements of the instrument matrix over the field, in per cent, one logarithmic scale.
 
@@ -212,6 +218,7 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
     return figure
 
 
+@styled
 def matrix_change_figure(old: MatrixMaps, new: MatrixMaps) -> Figure:
     """By how much the elements of the instrument matrix have changed over the field, in per cent.
 
@@ -231,6 +238,7 @@ def matrix_change_figure(old: MatrixMaps, new: MatrixMaps) -> Figure:
     return figure
 
 
+@styled
 def residual_map_figure(residuals: ResidualMap, cameras: Sequence[str], on: Canvas = PAGE) -> AnyFigure:
     """Residuals of the matrix and of the ratios of the arms (%), and χ²/dof before that correction.
 
@@ -273,6 +281,7 @@ def field_of(maps: MatrixMaps | ResidualMap) -> Field:
 _RANGE = (1e-4, 3.0)  # per cent
 
 
+@styled
 def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     """The error of p over the field (%, logarithmic; a line at 0.1 %), and which share of the field has which error."""
     percent = np.clip(100.0 * np.nan_to_num(accuracy.error, nan=np.inf), *_RANGE)
@@ -299,6 +308,7 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     return figure
 
 
+@styled
 def planned_figure(field: Mapping[str, Sequence[float | None]]) -> Figure:
     """Error of p (%) over the field before a plan and after it, from `field` of plan.json; crosses: no u there."""
     x, y, before, after = (np.array(field[k], float) for k in ("x", "y", "before", "p_error"))

@@ -12,6 +12,7 @@ from walop_jax.calibration import PRODUCT
 from walop_jax.diagnosis.figure_data import FIGURE_DATA
 from walop_jax.io.errors import fail, nearest
 from walop_jax.paper.polynomial import TERMS
+from walop_jax.paper.wavelength import plate_names
 from walop_jax.posterior.files import LIMITS, POSTERIOR
 from walop_jax.reports import diagnosis_figures, figures, paper_figures, posterior_figures
 from walop_jax.reports.run import FigureSource
@@ -121,8 +122,7 @@ def _small(source: FigureSource) -> bool:
 
 def _plates(source: FigureSource) -> list[str]:
     """Plates in the arms as figures call them."""
-    crystals = (name for name in source.stored.fitted.names if name.endswith(("plate.quartz", "plate.mgf2")))
-    return list(dict.fromkeys(PLATES.get(plate := name.rpartition(".")[0], plate) for name in crystals))
+    return [PLATES.get(name, name) for name in plate_names(source.stored.design)]
 
 
 def _angles(fewest: int) -> Callable[[FigureSource], bool]:

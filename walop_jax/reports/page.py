@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jinja2
-import matplotlib
 from matplotlib.figure import Figure
 
-from walop_jax.calibration import SUMMARY, read_calibration
+from walop_jax.calibration import SUMMARY, Calibration, read_calibration
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.findings import sentences
 from walop_jax.diagnosis.limits_found import DetectionLimits
@@ -30,9 +29,8 @@ from walop_jax.io.text import (
     with_error,
     with_minus_sign,
 )
-from walop_jax.nights.stacking import SURVEY, TRACKS
-from walop_jax.plans.plan import PLANNED
-from walop_jax.posterior.files import COMPARISON, EPOCH, LIMITS
+from walop_jax.nights.stacking import TRACKS
+from walop_jax.posterior.files import COMPARISON, EPOCH, LIMITS, PLANNED, SURVEY, WATCHED
 from walop_jax.posterior.result import interval_in_words
 from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import draw
@@ -112,6 +110,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "sentence": sentence,
         "fit_sentence": ": ".join(verdict_of_fit(summary)),
         "good": good,
+        "noise_alone": _noise_alone(run.product),
         "trusted": trusted,
         "quality": quality.meanings,
         "hidden": hidden_in_words(summary),
@@ -139,6 +138,14 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         if run.corner is None
         else symbols_in_words([str(row["NAME"]) for row in run.intervals]),
     }
+
+
+def _noise_alone(product: Calibration | None) -> str:
+    """Mean squared residual of noise: a flux is fitted to the cameras of a row, one of each arm where it is split."""
+    if product is None:
+        return "1 − 1/K, of K cameras,"
+    cameras = product.design.cameras
+    return rounded(1.0 - cameras.fluxes / len(cameras), ".3g")
 
 
 def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
@@ -257,10 +264,7 @@ def _figures(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, str]
 def embedded(figure: Figure) -> str:
     """A figure as a data URI (SVG, letters as outlines): for an image inside a page."""
     stream = io.BytesIO()
-    with matplotlib.rc_context(
-        {"svg.hashsalt": "walop-jax"}
-    ):  # without it no two pages of a run are the same
-        figure.savefig(stream, format="svg", metadata={"Date": None})
+    figure.savefig(stream, format="svg", metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
 
 
@@ -388,8 +392,18 @@ def _of_survey(folder: Path, document: Mapping[str, Any]) -> Pictures:
 
 def _of_comparison(folder: Path, document: Mapping[str, Any]) -> Pictures:
     """The figures that the command has drawn, and those that are not there."""
+    return _drawn_before(folder, PICTURES)
+
+
+def _of_watch(folder: Path, document: Mapping[str, Any]) -> Pictures:
+    """The figure that the command has drawn."""
+    return _drawn_before(folder, {"watch.png": "Gain of every camera since the calibration, group by group."})
+
+
+def _drawn_before(folder: Path, pictures: Mapping[str, str]) -> Pictures:
+    """Pictures of a folder with their captions, and those that are not there."""
     found, missing = [], []
-    for name, caption in PICTURES.items():
+    for name, caption in pictures.items():
         if not (folder / name).exists():
             missing.append(f"{name} is not there.")
             continue
@@ -412,4 +426,5 @@ OTHERS = {
     "plan": OtherPage(PLANNED, ("exposures", "bound", "value", "beside"), _of_plan),
     "limits": OtherPage(LIMITS, ("probability",), _of_limits),
     "survey": OtherPage(SURVEY, ("breaks", "events", "by_night", "advice"), _of_survey),
+    "watch": OtherPage(WATCHED, ("holds", "changes", "groups", "warnings"), _of_watch),
 }

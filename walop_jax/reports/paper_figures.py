@@ -33,6 +33,7 @@ from walop_jax.reports.style import (
     pixel_map,
     plain_ticks,
     point_map,
+    styled,
 )
 from walop_jax.reports.wording import PLATES
 from walop_jax.science.star_errors import GOAL, QUANTITIES, plate_errors, transmitted
@@ -42,6 +43,7 @@ _WAVELENGTH, _WAVELENGTHS = 0.62, (0.5, 0.75)  # µm
 COEFFICIENTS = ("$1$", "$q_m$", "$u_m$", "$q_m^2$", "$u_m^2$")
 
 
+@styled
 def retardance_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
     """Maps of the retardance of every half-wave plate over the field at one wavelength, in degrees modulo 360."""
     instrument = calibration.model.instrument(calibration.values)
@@ -65,6 +67,7 @@ def retardance_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
     return figure
 
 
+@styled
 def retardance_wavelength_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
     """Retardance of every half-wave plate against wavelength at the centre and at the edges of the field."""
     instrument = calibration.model.instrument(calibration.values)
@@ -89,6 +92,7 @@ def retardance_wavelength_figure(calibration: Calibration, on: Canvas = PAGE) ->
     return figure
 
 
+@styled
 def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = PAGE) -> AnyFigure:
     """Maps of the ten coefficients of the method of Paper II, a row for q and one for u."""
     found = fit_paper(calset, filter_name)
@@ -114,6 +118,7 @@ def _most(values: Float[np.ndarray, " p"]) -> tuple[float, float]:
     return max(float(values.min()), median - spread), min(float(values.max()), median + spread)
 
 
+@styled
 def transmission_figure(
     calset: CalibrationSet,
     filter_name: str,
@@ -166,6 +171,7 @@ _RANGE = (1e-3, 10.0)  # per cent
 _PLATE_PIXELS = 49
 
 
+@styled
 def histogram_figure(comparison: Comparison) -> Figure:
     """Distribution over the field of the errors of q, u and p: on the grid points above, between them below."""
     figure, axes = PAGE.panels(9.6, 4.8, 2, 3, sharex=True, sharey="row")
@@ -188,6 +194,7 @@ def histogram_figure(comparison: Comparison) -> Figure:
     return figure
 
 
+@styled
 def map_figure(comparison: Comparison) -> Figure:
     """Maps of the errors of q and u of both methods, on the grid points and between them, a tile for each point."""
     figure, axes = PAGE.panels(10.4, 5.0, 2, 4, sharex=True, sharey=True)
@@ -204,6 +211,7 @@ def map_figure(comparison: Comparison) -> Figure:
     return figure
 
 
+@styled
 def offset_figure(comparison: Comparison) -> Figure:
     """Δq and Δu: against what the weakest direction of the design matrix predicts, and with one exposure more."""
     found = comparison.offsets
@@ -230,6 +238,7 @@ def offset_figure(comparison: Comparison) -> Figure:
     return figure
 
 
+@styled
 def spectral_figure(comparison: Comparison) -> Figure:
     """Efficiencies and cross-talk across the filter at the extreme point; Δq_m, Δu_m of stars of four colours."""
     figure, (left, right) = PAGE.panels(9.6, 3.2, 1, 2)
@@ -251,6 +260,7 @@ def spectral_figure(comparison: Comparison) -> Figure:
     return figure
 
 
+@styled
 def plate_figure(calibration: Calibration, combinations: Sequence[Sequence[float | None]]) -> Figure:
     """Maps of how much worse than an ideal instrument (q, u) are known with some settings of the calibration plate.
 

@@ -15,7 +15,14 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.text import RAISED, with_error
-from walop_jax.reports.style import PAGE, SMALL, AnyFigure, Canvas, PaperFigure
+from walop_jax.reports.style import (
+    PAGE,
+    SMALL,
+    AnyFigure,
+    Canvas,
+    PaperFigure,
+    styled,
+)
 
 SHARES = (0.393, 0.865)  # of the draws: inside 1 and 2 σ of a normal distribution of two coefficients
 BINS = 30  # of a histogram, along each axis
@@ -92,6 +99,7 @@ def correlated(
     return tuple(name for name in names if name in kept)
 
 
+@styled
 def corner_figure(
     draws: Float[np.ndarray, "d k"],
     names: Sequence[str],
@@ -146,6 +154,7 @@ def corner_figure(
     return figure
 
 
+@styled
 def trace_figure(
     chains: Float[np.ndarray, "e n w k"],
     names: Sequence[str],

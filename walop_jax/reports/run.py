@@ -45,7 +45,8 @@ class FigureSource(Run):
     """The run that a figure is drawn from; what it needs and is not there is a `DataError`.
 
     `parameters` are coefficients by name; `place` (deg) is a field point; `step` numbers the effects of a diagnosis;
-    `reference` are values to be marked, by name; `canvas` is where to draw.
+    `reference` are values to be marked, by name; `canvas` is where to draw. `in_memory`: there is no folder, all that
+    there is was put into the cached properties by `of`.
     """
 
     parameters: tuple[str, ...] = ()
@@ -53,13 +54,14 @@ class FigureSource(Run):
     step: int = 1
     reference: Mapping[str, float] | None = None
     canvas: Canvas = PAGE
+    in_memory: bool = False
 
     @classmethod
     def of(cls, given: Drawable, **options: Any) -> FigureSource:
         """Source of the figures of a result in memory, or of the folder of a run."""
         if isinstance(given, Run):
             return cls(given.folder, given.catalogue, given.data, **options)
-        made = cls(Path("in memory"), **options)
+        made = cls(Path("in memory"), in_memory=True, **options)
         held: dict[str, Any] = {"documents": {}, "product": None, "calibration": None, "posterior": None}
         if isinstance(given, PosteriorSample):
             held |= {"posterior": given.to_arviz(), "sample": given}
@@ -80,13 +82,13 @@ class FigureSource(Run):
 
     def __contains__(self, name: str) -> bool:
         """True where a file is there, or what it would hold is in memory."""
-        if "documents" in vars(self):
+        if self.in_memory:
             return vars(self).get(_IN_MEMORY.get(name, "")) is not None
         return super().__contains__(name)
 
     def wanted(self, name: str, advice: str) -> Path:
         """As for any run; what is held in memory has no file."""
-        if "documents" not in vars(self):
+        if not self.in_memory:
             return super().wanted(name, advice)
         if name not in self:
             raise fail(f"there is no {name} of this result in memory", advice=advice)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import functools
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, ParamSpec, TypeVar
 
-import matplotlib
+import matplotlib.style
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
@@ -30,8 +32,10 @@ BEFORE = "#b2182b"  # dark enough to be told from AFTER in grey as well; both ar
 AFTER = "#2166ac"
 QUIET = "0.8"
 MOST_VECTOR = 2000  # points above which tiles are drawn as pixels
-TRUETYPE: dict[Any, int] = {"pdf.fonttype": 42, "ps.fonttype": 42}
+SETTINGS: dict[Any, Any] = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.hashsalt": "walop-jax"}
+"""Beside the defaults of matplotlib; without the last no two pages of a run are the same."""
 
+P, T = ParamSpec("P"), TypeVar("T")
 Map = Float[np.ndarray, "y x"]
 Maps = Float[np.ndarray, "m y x"]
 Field = tuple[float, float, float, float]
@@ -39,13 +43,26 @@ AnyFigure = Any
 """A figure, or the subfigure that took the room of axes: what is drawn on a `Canvas`."""
 
 
+def own_style() -> contextlib.AbstractContextManager[None]:
+    """Settings of matplotlib as this package draws with, whatever a matplotlibrc or a notebook has set."""
+    return matplotlib.style.context(["default", SETTINGS])
+
+
 class PaperFigure(Figure):
-    """A figure that is written with TrueType fonts (PDF, PostScript): journals refuse Type 3, matplotlib's default."""
+    """A figure that is drawn in the style of the package, and written with TrueType fonts (PDF, PostScript).
+
+    Journals refuse Type 3, matplotlib's default.
+    """
 
     def savefig(self, *args: Any, **options: Any) -> None:
         """Write the figure, as any other."""
-        with matplotlib.rc_context(TRUETYPE):
+        with own_style():
             super().savefig(*args, **options)
+
+    def draw(self, renderer: Any) -> None:
+        """Draw the figure, as any other."""
+        with own_style():
+            super().draw(renderer)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +105,20 @@ class Canvas:
 
 
 PAGE = Canvas()
+
+
+def styled(function: Callable[P, T]) -> Callable[P, T]:
+    """A function that makes a figure, in the style of the package; in axes of the caller it is drawn in theirs."""
+
+    @functools.wraps(function)
+    def draw(*args: P.args, **options: P.kwargs) -> T:
+        given = (one.ax for one in (*args, *options.values()) if isinstance(one, Canvas))
+        if any(ax is not None for ax in given):
+            return function(*args, **options)
+        with own_style():
+            return function(*args, **options)
+
+    return draw
 
 
 def field_axes(axis: Axes, title: str = "") -> None:

@@ -9,12 +9,21 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
-from walop_jax.reports.style import AFTER, BEFORE, FONT, PAGE, QUIET, SMALL
+from walop_jax.reports.style import (
+    AFTER,
+    BEFORE,
+    FONT,
+    PAGE,
+    QUIET,
+    SMALL,
+    styled,
+)
 from walop_jax.science.watch_found import Watch
 
 MOST = 8  # parameters in a figure
 
 
+@styled
 def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
     """Parameters whose law lets them change, against time; None where there is none.
 
@@ -48,6 +57,7 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
     return figure
 
 
+@styled
 def nights_figure(document: Mapping[str, Any]) -> Figure:
     """Distance of χ² of every night from its expectation, in standard deviations."""
     nights: Sequence[Mapping[str, Any]] = document["by_night"]
@@ -62,6 +72,7 @@ def nights_figure(document: Mapping[str, Any]) -> Figure:
     return figure
 
 
+@styled
 def watch_figure(found: Watch) -> Figure:
     """Gain of every camera (per cent, since the calibration, that camera alone) by exposure group.
 

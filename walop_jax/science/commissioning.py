@@ -55,7 +55,11 @@ class Commissioning(Displayed):
     def display(self) -> Display:
         """Go or no-go, a line for each requirement, and what is missing."""
         rows = tuple(
-            ("yes" if one.met else "NO" if one.needed else "no", one.what, one.found)
+            (
+                "yes" if one.met else "NO" if one.needed else "no",
+                f"{one.what} (required)" if one.needed else one.what,
+                one.found,
+            )
             for one in self.requirements
         )
         title = f"Commissioning of {self.fit.model.name}: {'go' if self.go else 'NO GO'}"

@@ -148,8 +148,22 @@ def judged(without_u: float) -> str:
 
 def answered(result: FitResult) -> FitResult:
     """The fit, able to say how well stars are known with it; worked out when it is first asked."""
-    made = functools.cache(lambda: field_accuracy(Calibration.from_fit(result)))
-    return dataclasses.replace(result, answer=made)
+    return dataclasses.replace(result, answer=_Answer(result))
+
+
+@dataclasses.dataclass
+class _Answer:
+    """The accuracy of p of a fit, worked out once; a class, so that fits can be pickled."""
+
+    result: FitResult
+
+    def __call__(self) -> FieldAccuracy | None:
+        return self.known
+
+    @functools.cached_property
+    def known(self) -> FieldAccuracy | None:
+        """See `field_accuracy`."""
+        return field_accuracy(Calibration.from_fit(self.result))
 
 
 def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy | None:

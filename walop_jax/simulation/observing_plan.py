@@ -25,6 +25,7 @@ from walop_jax.instruments.description import Reader, default_name, described, s
 from walop_jax.io.errors import errors_naming, nearest
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.effects.base import Context
+from walop_jax.model.elements import defined_elements
 from walop_jax.model.instrument import Instrument, as_designed, nominal_instrument
 from walop_jax.model.parameters import check_names, unknown_name
 from walop_jax.sky.moon import body_direction, local_sidereal_time, offset_direction
@@ -496,7 +497,9 @@ def plan_of(
                 raise ValueError(f"{unknown_name('entry of a stop', name, _STOP_HINTS)}{position}")
         _check(stop, _STOP_HINTS, "stops")
     values["stops"] = tuple(Stop(**_value(stop)) for stop in stops)
-    return ObservingPlan(None if instrument is None else Instrument.read(instrument), **values)
+    return ObservingPlan(
+        None if instrument is None else Instrument.read(instrument, elements=defined_elements()), **values
+    )
 
 
 def _check(table: Mapping[str, Any], hints: Mapping[str, str], place: str = "") -> None:

@@ -20,7 +20,7 @@ def effect_by_name(name: str, catalogue: Sequence[type[Effect]] = EFFECTS) -> ty
     for effect in (*catalogue, Described, FreeForm, OtherDescription):
         if effect.name == name:
             return effect
-    error = unknown_name("effect", name, [effect.name for effect in catalogue])
+    error = unknown_name("effect", name, {effect.name: effect.__doc__ or "" for effect in catalogue})
     raise ValueError(
         f"{error} (walop-jax docs effect lists all; --effects FILE, in Python effects=, adds your own)"
     )

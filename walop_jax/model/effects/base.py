@@ -160,13 +160,13 @@ class Effect(Component):
         """The same effect with positive amplitude and with angles in their principal range."""
         return self
 
-    def fits(self, instrument: Instrument) -> bool:
-        """True if the instrument has what the effect acts on."""
+    def lacks(self, instrument: Instrument) -> str:
+        """The part that the effect acts on and the instrument does not have, in words; empty where it fits."""
         try:
             jax.eval_shape(lambda: self.patch(dataclasses.replace(instrument, effects=())))
-        except NoSuchPlaceError:
-            return False
-        return True
+        except NoSuchPlaceError as error:
+            return str(error)
+        return ""
 
 
 def with_amplitudes(

@@ -78,6 +78,7 @@ PARAMETER_KEYS = (
     "loose",
 )  # fmt: skip
 EACH = ("camera", "moon exposure")
+NO_STANDARD = "there is no standard star"
 
 
 EVERY: Mapping[str, Callable[[Instrument], Sequence[str]]] = {
@@ -184,13 +185,14 @@ class Entry(Effect):
         """Those of the entry; exposures belong to the data."""
         return {name: getattr(self, name) for name in self.options}
 
-    def fits(self, instrument: Instrument) -> bool:
-        """True if the instrument has what the effect acts on; there may be no star that a choice could name."""
+    def lacks(self, instrument: Instrument) -> str:
+        """As for any effect; there may be no star that a choice could name."""
         if "" in self.choices().values():
-            return False
+            return NO_STANDARD
         if not self.arrangement:
-            return super().fits(instrument)
-        return self.arrangement in alternatives(dataclasses.replace(instrument, effects=()))
+            return super().lacks(instrument)
+        known = alternatives(dataclasses.replace(instrument, effects=()))
+        return "" if self.arrangement in known else str(unknown_name("arrangement", self.arrangement, known))
 
     # ------------------------------------------------------------------------------------ what it does
 
@@ -449,6 +451,18 @@ def own_entries(path: str | os.PathLike[str]) -> tuple[type[Effect], ...]:
 
 EFFECTS = entries(parse_toml((files("walop_jax.model.effects") / FILE).read_text(encoding="utf-8")), __name__)
 """All effects, in the order in which light meets them."""
+
+
+def applies(effect: Effect, instrument: Instrument) -> bool:
+    """True if an instrument has what an effect of a catalogue acts on.
+
+    Raises ValueError, with the nearest names, for an effect that does not come with the package: whoever wrote it meant
+    this instrument.
+    """
+    lacking = effect.lacks(instrument)
+    if lacking and lacking != NO_STANDARD and type(effect) not in EFFECTS:
+        raise ValueError(f"effect {effect.name!r}: {lacking}")
+    return not lacking
 
 
 def is_own(effect: Effect) -> TypeGuard[Entry]:

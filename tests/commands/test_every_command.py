@@ -1,0 +1,249 @@
+"""Every command of the program and of the README, with `-o`, on the set that comes with the package; and back.
+
+Each line is typed in a folder that holds what users have. What it writes is read with `walop.read` or as a table, a
+folder is reported, and the commands that the program suggests next are typed as they are printed.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from command import Call
+from frame_run import frame_run
+from frames_file import write_frames
+from own_instrument import OWN
+from zemax_exports import write_folder
+
+import walop_jax as walop
+from walop_jax.commands import COMMANDS
+from walop_jax.commands.program import NEXT, UNTRUSTED
+from walop_jax.data import Grid
+from walop_jax.likelihood import limits
+from walop_jax.simulation.simulate import simulate
+
+ROOT = Path(__file__).resolve().parents[2]
+SET = ROOT / "fits_data" / "walop_south_small.fits"
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+class Line(NamedTuple):
+    """A line of words: its exit code, the document that its folder must hold, and how long it takes."""
+
+    words: str
+    document: str = ""
+    takes: str = ""  # "seconds": not with --fast, "minutes": with --long alone
+
+
+LINES = {
+    "demo": [Line("demo -o DEMO", "summary", "seconds")],
+    "inspect": [Line("inspect set.fits")],
+    "simulate": [
+        Line(
+            "simulate --grid 3 --standard-grid 1 --angles 4 -o made.fits --truth truth.json", takes="seconds"
+        ),
+        Line("simulate plan.toml -o made.fits", takes="seconds"),
+    ],
+    "refit": [Line("refit set.fits -o FIT", "summary", "seconds")],
+    "commission": [Line("commission set.fits -o NIGHT", "commissioning", "seconds")],
+    "compress": [Line("compress frames.fits -o small.fits", takes="minutes")],
+    "clip": [Line("clip set.fits -o clipped.fits", takes="seconds")],
+    "diagnose": [Line("diagnose set.fits -o FOUND", "diagnosis", "seconds")],
+    "limits": [
+        Line("limits set.fits -o LIMITS", "limits", "seconds"),
+        Line("limits plan.toml -o LIMITS", "limits", "minutes"),
+    ],
+    "plan": [
+        Line("plan bench.toml --minutes 10 --draws 1 --criterion window.delta -o PLAN", "plan"),
+        Line("plan plan.toml --minutes 20 --draws 1 -o PLAN", "plan", "seconds"),
+        Line("plan WALOP-SOUTH --minutes 20 --draws 1 -o PLAN", "plan", "minutes"),
+        Line("plan RUN --minutes 10 --draws 1 -o PLAN", "plan", "minutes"),
+    ],
+    "sample": [Line("sample SAMPLED", takes="minutes")],
+    "report": [Line("report RUN"), Line("report RUN -o page.html")],
+    "plot": [Line("plot RUN matrix -o matrix.pdf"), Line("plot RUN")],
+    "matrix": [Line("matrix RUN --points points.csv -o matrix.fits"), Line("matrix RUN --x 0.1 --y 0.2")],
+    "apply": [Line("apply RUN stars.fits -o corrected.fits", takes="seconds")],
+    "compare": [Line("compare set.fits -o COMPARED", "comparison", "minutes")],
+    "certify": [Line("certify RUN")],
+    "epoch": [Line("epoch RUN set.fits -o LATER", "epoch", "seconds"), Line("epoch RUN set.fits")],
+    "watch": [Line("watch RUN stars.fits -o WATCHED", "watch")],
+    "stack": [Line("stack RUN -o SURVEY", "survey", "seconds")],
+    "model": [Line("model set.fits --effect clp_zero -o model.toml", takes="seconds")],
+    "instrument": [Line("instrument WALOP-SOUTH")],
+    "import-zemax": [Line("import-zemax exports -o design.fits", takes="seconds")],
+    "trace": [Line("trace RUN --x 0.1 --y 0.2 --q 0.01")],
+    "cite": [Line("cite RUN"), Line("cite RUN --bibtex")],
+    "conformance": [Line("conformance --make PACK")],
+    "docs": [Line("docs files"), Line("docs")],
+}
+"""What is typed for each command; a new one needs its line here."""
+
+PLACEHOLDERS = {
+    "CALSET": "set.fits",
+    "STARS.fits": "stars.fits",
+    "NEW.fits": "set.fits",
+    "TABLE": "points.csv",
+    "OUT.fits": "out.fits",
+}
+"""What users put in the place of words in README and suggestions."""
+
+PLAN = "grid = 3\nstandard_grid = 1\npolariser_angles = 4\nmoon_patches = 2\nstandards = 3\n"
+BENCH = (
+    'instrument = "own.toml"\ngrid = 3\npolariser_angles = 4\nmoon_patches = 0\nstandards = 0\n'
+    "moving = { WIN = [0, 45] }\n"
+)
+
+
+def lines(takes: str) -> list[Any]:
+    """Those that take so long, as parameters of a test."""
+    return [
+        pytest.param(one, id=one.words) for typed in LINES.values() for one in typed if one.takes == takes
+    ]
+
+
+def readme_lines() -> list[str]:
+    """The commands of README, without the name of the program."""
+    shown = re.findall(r"walop-jax ((?:[a-z][a-z-]+)[^`\n]*)", README)
+    return list(dict.fromkeys(line.strip() for line in shown if line.split()[0] in COMMANDS))
+
+
+def test_every_command_has_a_line():
+    assert set(LINES) == set(COMMANDS)
+    assert all(line.words.split()[0] == name for name, typed in LINES.items() for line in typed)
+
+
+def test_every_command_of_the_readme_is_among_them():
+    """The same options and as many arguments."""
+
+    def shape(line: str) -> tuple[str, ...]:
+        return tuple(word if k == 0 or word.startswith("-") else "" for k, word in enumerate(line.split()))
+
+    typed = {shape(line.words) for several in LINES.values() for line in several}
+    assert len(readme_lines()) > 8
+    for line in readme_lines():
+        assert any(one[: len(shape(line))] == shape(line) for one in typed), line
+
+
+@pytest.fixture(scope="module")
+def home(call: Call, tmp_path_factory) -> Path:
+    """A folder with what users have: a set and its fit, stars, points, plans, exports of a design program."""
+    folder = tmp_path_factory.mktemp("home")
+    shutil.copyfile(SET, folder / "set.fits")
+    assert call("refit", folder / "set.fits", "-o", folder / "RUN", "--quiet").exit_code == 0
+    (folder / "plan.toml").write_text(PLAN)
+    (folder / "own.toml").write_text(OWN)
+    (folder / "bench.toml").write_text(BENCH)
+    (folder / "points.csv").write_text("X,Y\n0,0\n0.2,-0.1\n")
+    write_folder(folder / "exports")
+    _stars(folder / "RUN").write(folder / "stars.fits")
+    return folder
+
+
+def _stars(run: Path) -> Table:
+    """Stars of two nights with the counts that a calibration expects of them."""
+    places = [(-0.2, 0.1), (-0.1, -0.2), (0.05, 0.15), (0.2, 0.2), (0.15, -0.1)]
+    at = [walop.trace(run, x=x, y=y, q=0.01, u=-0.004)[-1].value.ravel() for x, y in places]
+    counts = 1e6 * np.array(at * 2)
+    x, y = np.array(places * 2).T
+    mjd = np.repeat([61220.8, 61221.0], len(places))
+    return Table({"X": x, "Y": y, "N": counts, "N_ERR": np.sqrt(counts), "MJD": mjd})
+
+
+@pytest.fixture
+def here(home: Path, tmp_path: Path, monkeypatch) -> Path:
+    """A copy of that folder, in which commands are typed."""
+    monkeypatch.chdir(shutil.copytree(home, tmp_path / "here"))
+    return tmp_path / "here"
+
+
+@pytest.mark.parametrize("line", lines(""))
+def test_what_is_written_is_read_and_gone_on_with(line: Line, call, here: Path):
+    _type(line, call)
+
+
+@pytest.mark.parametrize("line", lines("seconds"))
+def test_so_is_what_takes_seconds(line: Line, call, here: Path):
+    _type(line, call)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("line", lines("minutes"))
+def test_so_is_what_takes_minutes(line: Line, call, here: Path):
+    if line.words.startswith("sample"):
+        shutil.copytree("RUN", "SAMPLED")
+    if line.words.startswith("compress"):
+        _frames(here / "frames.fits")
+    _type(line, call)
+
+
+def test_suggestions_have_no_words_but_commands():
+    """What is printed after `Next:` can be typed, but for the one thing that no program does."""
+    told = [line for several in NEXT.values() for line in several]
+    assert [line for line in told if not line.startswith("walop-jax ")] == ["open the page in a browser"]
+    assert not [line for line in told if "," in line or len(line.split()) < 3]
+
+
+def _type(line: Line, call: Call) -> None:
+    words = shlex.split(line.words)
+    done = call(*words)
+    assert done.exit_code == 0, done.output
+    assert done.stdout.strip()
+    output = words[words.index("-o") + 1] if "-o" in words else ""
+    if output:
+        _read_back(Path(output if words[0] != "demo" else f"{output}/RUN"), line, call)
+    for following in _suggested(done.stderr):
+        _typed(following, call)
+
+
+def _frames(path: Path) -> None:
+    """Whole frames, so large that they are fitted by sums over cells."""
+    side = int(limits.LARGE_ABOVE**0.5) + 8
+    run = frame_run(side)
+    step = 2 * run.field / (side - 1)
+    grid = Grid(side, side, (1.0, 1.0), (-run.field, -run.field), ((step, 0.0), (0.0, step)))
+    write_frames(path, simulate(run, seed=6).calset, grid)
+
+
+def _read_back(output: Path, line: Line, call: Call) -> None:
+    """What a command has written, as whoever comes next reads it; each file of a folder is on the page of files."""
+    if output.is_dir():
+        run = walop.read(output)
+        assert line.document in run.documents
+        assert str(output) in repr(run)
+        done = call("report", output)
+        assert done.exit_code == 0, done.output
+        assert (output / "report.html").stat().st_size > 5000
+        documented = (ROOT / "walop_jax" / "docs" / "files.md").read_text(encoding="utf-8")
+        assert [entry.name for entry in output.iterdir() if entry.name not in documented] == []
+    elif output.suffix == ".fits":
+        with fits.open(output) as hdus:
+            is_set = "EXPOSURES" in hdus
+        assert len(walop.read(output).points if is_set else Table.read(output)) > 0
+    else:
+        assert output.stat().st_size > 200
+
+
+def _suggested(told: str) -> list[str]:
+    """The commands of the line `Next: …`."""
+    match = re.search(r"Next: (.*)", told)
+    return [] if match is None else [one for one in match[1].split(" or ") if one.startswith("walop-jax ")]
+
+
+def _typed(line: str, call: Call) -> None:
+    """A command as it is printed, with the words in capitals replaced by what is there."""
+    words = [PLACEHOLDERS.get(word, word) for word in shlex.split(line)[1:]]
+    if "-o" in words:
+        at = words.index("-o") + 1
+        words[at] = f"next_{Path(words[at]).name}"
+    if words[0] == "plan":
+        words += ["--draws", "1"]  # as good a plan takes twenty times as long
+    done = call(*words)
+    assert done.exit_code in (0, UNTRUSTED), f"{line}: {done.output}"

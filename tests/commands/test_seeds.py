@@ -1,0 +1,57 @@
+"""The seed of a command is that of the Monte Carlo behind its verdict, not a number that is only written down."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from small_run import small_fit
+
+import walop_jax as walop
+from walop_jax.diagnosis import workflow
+
+from .conftest import FittedSet
+
+
+class Examined(Exception):
+    """The fit is about to be examined with this seed."""
+
+
+CALLS = {
+    "refit": lambda g, **k: walop.refit(g.calset, **k),
+    "commission": lambda g, **k: walop.commission(g.calset, **k),
+    "limits": lambda g, **k: walop.limits(g.calset, **k),
+    "compare": lambda g, **k: walop.compare(g.calset, **k),
+    "epoch": lambda g, **k: walop.epoch(g.run, g.calset, **k),
+    "clip": lambda g, **k: walop.clip(g.calset, **k),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_the_seed_reaches_the_verdict(name: str, fitted: FittedSet, monkeypatch):
+    def stop(result: Any, seed: int = 0, **more: Any) -> None:
+        raise Examined(seed)
+
+    monkeypatch.setattr("walop_jax.diagnosis.trust.examined", stop)
+    with pytest.raises(Examined, match=r"^5$"):
+        CALLS[name](fitted, seed=5)
+
+
+def test_so_does_that_of_a_diagnosis(monkeypatch):
+    """Of both of its fits."""
+    seeds = []
+
+    def note(result: Any, seed: int = 0, **more: Any) -> Any:
+        seeds.append(seed)
+        return result.judged()
+
+    monkeypatch.setattr(workflow, "examined", note)
+    fit = small_fit().judged()
+    workflow.diagnose(fit.calset, fit.model, catalogue=(), seed=7, minutes=0.0)
+    assert set(seeds) == {7}
+
+
+def test_it_is_written_down(fitted: FittedSet, tmp_path: Path):
+    walop.refit(fitted.calset, output=tmp_path / "RUN", seed=5)
+    assert walop.read(tmp_path / "RUN").documents["summary"]["seed"] == 5
