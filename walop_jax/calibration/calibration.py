@@ -42,7 +42,7 @@ from walop_jax.data.settings import (
 from walop_jax.fit.model_file import model_without_data, render, standard_names
 from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
 from walop_jax.fit.refit import FitResult, Matrix, Vector
-from walop_jax.fit.verdict import NOT_MEASURED, STATED, Hidden, Quality, Verdict
+from walop_jax.fit.verdict import NOT_MEASURED, Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
 from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display
@@ -254,7 +254,7 @@ class Calibration(Fitted):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A sentence if the calibration is not to be trusted, not checked, or does not hold all that matters to stars."""
+        """Sentences if the calibration is not to be trusted, not checked, or lacks something that matters to stars."""
         where = "" if self.path is None else f"{self.path}: "
         if self.verdict.trusted:
             unchecked = (UNCHECKED,) if UNCHECKED in self.verdict.warnings else ()
