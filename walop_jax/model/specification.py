@@ -6,7 +6,7 @@ Three things of one shape: values, freedom and priors. Names come from the tree 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -139,8 +139,8 @@ class Model:
         behind: dict[int, Layer] = {}
         inside: dict[int, Layer] = {}
         masters, free, marked = self.masters, set(self.free.tolist()), float("nan")
-        for place in self.template.places(WavePlate):
-            layers = self.template.element(place).layers
+        for place, plate in _wave_plates(self.template):
+            layers = plate.layers
             for i, layer in enumerate(layers):
                 new = (*layers[:i], dataclasses.replace(layer, thickness=marked), *layers[i + 1 :])
                 at = np.flatnonzero(np.isnan(values_of(self.template.changed(place, layers=new))))
@@ -150,18 +150,16 @@ class Model:
 
     def gaps(self) -> tuple[int, ...]:
         """Positions of the free thicknesses of air gaps ahead of plates, which effects alone have."""
-        instrument = self.template.patched()
-        if not any(instrument.element(place).air_gaps for place in instrument.places(WavePlate)):
+        if not any(plate.air_gaps for _, plate in _wave_plates(self.template.patched())):
             return ()
 
         def moves_one(position: int) -> bool:
             marked = self.start
             marked[position] = np.nan
-            there = self.instrument(marked[self.masters]).patched()
-            plates = (there.element(place) for place in there.places(WavePlate))
-            return any(bool(np.isnan(gap.gap)) for plate in plates for gap in plate.air_gaps)
+            there = _wave_plates(self.instrument(marked[self.masters]).patched())
+            return any(bool(np.isnan(gap.gap)) for _, plate in there for gap in plate.air_gaps)
 
-        of_effects = np.concatenate([self.positions(name) for name in self.effect_names])
+        of_effects = {i for name in self.effect_names for i in self.positions(name).tolist()}
         return tuple(i for i in self.free.tolist() if i in of_effects and moves_one(i))
 
     def named(self, values: Float[Any, " n"]) -> dict[str, Any]:
@@ -173,6 +171,14 @@ class Model:
         if values is None or not isinstance(values, jax.Array):
             values = np.asarray(self.start if values is None else values, float)
         return with_values(self.template)(values)
+
+
+def _wave_plates(instrument: Instrument) -> Iterator[tuple[str, WavePlate]]:
+    """The wave plates of an instrument with their places."""
+    for place in instrument.places(WavePlate):
+        plate = instrument.element(place)
+        assert isinstance(plate, WavePlate)
+        yield place, plate
 
 
 def series_indices(instrument: Instrument) -> Int[np.ndarray, " kt"]:
