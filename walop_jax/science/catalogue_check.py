@@ -28,7 +28,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import some, with_error, with_minus_sign
 from walop_jax.likelihood.inverses import whitening
-from walop_jax.science.places import Place, places_of
+from walop_jax.science.places import DisagreeingPlace, places_of
 from walop_jax.science.star_residuals import (
     ABOUT_GAINS,
     CROWDED,
@@ -175,7 +175,7 @@ class CatalogueCheck(Displayed):
     changes: tuple[InstrumentChange, ...]
     smallest: float
     growth: Growth = IN_UNITS
-    places: tuple[Place, ...] = ()
+    places: tuple[DisagreeingPlace, ...] = ()
 
     @property
     def alarm(self) -> float:
@@ -461,7 +461,7 @@ class CatalogueSearch:
 
     def _places(
         self, found: CatalogueCheck, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int]
-    ) -> tuple[Place, ...]:
+    ) -> tuple[DisagreeingPlace, ...]:
         """Places where stars disagree together, behind the changes and the errors of the calibration."""
         cameras = [question.name for question in self.questions if question.kind == "gain"]
         single, several = (max(scale, found.noise, 1.0) for scale in found.scale)
