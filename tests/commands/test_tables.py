@@ -12,8 +12,11 @@ from astropy.table import Table
 
 import walop_jax as walop
 from walop_jax.calibration import write_calibration
+from walop_jax.data.catalogue import field_points
+from walop_jax.data.user_tables import in_memory
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError
+from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.specification import effect_context, with_effects
 
 from .conftest import FittedSet
@@ -128,3 +131,32 @@ def test_a_filter_that_the_calibration_does_not_cover_is_refused_unless_forced(
     flag = Table.read(tmp_path / "o.fits")["FLAG"]
     both = int(Quality.VALIDITY_FORCED | Quality.BEYOND_SETTINGS)
     assert (flag & both).tolist() == [0, 0, 0, both, 0, 0]
+
+
+def test_a_point_beyond_the_field_is_refused_and_bits_have_words(call, fitted: FittedSet):
+    refused = call("matrix", fitted.run, "--x", "3", "--y", "1")
+    assert refused.exit_code == 1
+    assert "X, Y: beyond the field of WALOP-SOUTH (±0.35°); give degrees; are these arcmin?" in refused.stderr
+    shown = str(walop.matrix(fitted.calibration, x=0.34, y=0.34))
+    assert "FLAG 32: extrapolated in the field" in shown
+
+
+def test_an_angle_that_is_missing_is_asked_for_as_it_can_be_given():
+    instrument = nominal_instrument("WALOP-SOUTH")
+    with pytest.raises(DataError, match=r"--at CHWP=0"):
+        field_points(in_memory({"X": 0.0, "Y": 0.0}), instrument, always_in=("CHWP",))
+
+
+def test_columns_that_are_not_used_or_replaced_are_named(call, fitted: FittedSet, tmp_path: Path):
+    given = Table({"x": [0.1], "Y": [0.0], "FLAG": [3], "mag": [12.5]})
+    given.write(tmp_path / "p.csv")
+    told = call("matrix", fitted.run, "--points", tmp_path / "p.csv", "-o", tmp_path / "o.fits", "--json")
+    assert told.exit_code == 0, told.output
+    expected = ["column FLAG is replaced by the result", "column MAG is not used"]
+    assert json.loads(told.stdout)["remarks"] == expected
+    assert Table.read(tmp_path / "o.fits").meta["REMARK"] == expected
+    for sentence in expected:
+        assert f"p.csv: {sentence}" in told.stderr
+    made = walop.matrix(fitted.calibration, given)
+    made["x"] *= 60.0
+    assert given["x"][0] == 0.1

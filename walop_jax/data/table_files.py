@@ -209,7 +209,7 @@ def _body(text: str) -> tuple[str, list[str], str]:
 
 
 def _separator_of(header: str, needed: Collection[str]) -> str:
-    """What separates the names in a line so that those needed are among them; else what occurs, a comma first."""
+    """Separator of the names in a line such that those needed are among them; else one that occurs, a comma first."""
     for separator in _SEPARATORS:
         if set(needed) <= {name.strip(" \"'").upper() for name in header.split(separator)}:
             return separator

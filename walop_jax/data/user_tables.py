@@ -84,7 +84,7 @@ def _columns(names: Sequence[str]) -> str:
 
 
 def _hints(names: Sequence[str], lacking: Collection[str]) -> str:
-    """What columns that are not used may have been meant to be."""
+    """Names that columns that are not used may have been meant to have."""
     hints = []
     for name in names:
         if "FLAG" in name and "N_FLAG" in lacking:

@@ -28,7 +28,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import some, with_error, with_minus_sign
 from walop_jax.likelihood.inverses import whitening
-from walop_jax.science.places import Place, places_of
+from walop_jax.science.places import DisagreeingPlace, places_of
 from walop_jax.science.star_residuals import (
     ABOUT_GAINS,
     CROWDED,
@@ -175,7 +175,7 @@ class CatalogueCheck(Displayed):
     changes: tuple[InstrumentChange, ...]
     smallest: float
     growth: Growth = IN_UNITS
-    places: tuple[Place, ...] = ()
+    places: tuple[DisagreeingPlace, ...] = ()
 
     @property
     def alarm(self) -> float:
@@ -346,6 +346,7 @@ class CatalogueSearch:
         self.start = np.zeros(len(self.prior))
         if at is not None:
             self.start[asked : asked + known] = at[self.matters]
+        self.nearest = self.start
 
     def _columns(self, part: StarResiduals) -> Float[np.ndarray, "r k c"]:
         cameras = part.model.shape[1]
@@ -426,6 +427,7 @@ class CatalogueSearch:
             if explained is not None and by_errors is not None and not is_off(by_errors.noise, self._alarm):
                 look, sizes = by_errors, explained
             look, sizes = self._settled(look, sizes, chosen)
+            self.nearest = sizes if explained is None else explained
             tests = self._beside(look.matrix, look.score, chosen)
         smallest = self._smallest(tests)
         answers = tests
@@ -461,7 +463,7 @@ class CatalogueSearch:
 
     def _places(
         self, found: CatalogueCheck, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int]
-    ) -> tuple[Place, ...]:
+    ) -> tuple[DisagreeingPlace, ...]:
         """Places where stars disagree together, behind the changes and the errors of the calibration."""
         cameras = [question.name for question in self.questions if question.kind == "gain"]
         single, several = (max(scale, found.noise, 1.0) for scale in found.scale)
@@ -483,13 +485,10 @@ class CatalogueSearch:
     def errors_of_calibration(self) -> Float[np.ndarray, " n"] | None:
         """Errors of the calibration, in units of `root`, that explain the stars best; None if they cannot be.
 
-        With N_ERR as stated, else with errors as large as the scatter.
+        Known once there is an `answer`: with N_ERR as stated, else with errors as large as the scatter.
         """
-        sizes = self._explained()
-        if sizes is None:
-            sizes = self._settled(self._looked(self.start), self.start, [])[1]
         errors = np.zeros(len(self.matters))
-        errors[self.matters] = sizes[self.asked : -2]
+        errors[self.matters] = self.nearest[self.asked : -2]
         return errors if errors @ errors <= _FARTHEST**2 * self.matters.sum() else None
 
     def bend(self, errors: Float[np.ndarray, " n"], residual: Float[np.ndarray, "r k"]) -> float:

@@ -53,7 +53,7 @@ class CameraAtPlace(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Place:
+class DisagreeingPlace:
     """A place where stars disagree: centre and size (deg), significance, stars, cameras that it may be (best first)."""
 
     x: float
@@ -103,7 +103,7 @@ def places_of(
     residual: Float[np.ndarray, "r k"] | None = None,
     variance: Float[np.ndarray, " s"] | None = None,
     alarm: float = ALARM,
-) -> tuple[Place, ...]:
+) -> tuple[DisagreeingPlace, ...]:
     """Places of the field where stars disagree together, the most significant first; none in `alarm` of catalogues.
 
     `cameras` are names. `residual` is that of `stars` or what is left of it behind changes, `variance` that of the
@@ -115,7 +115,7 @@ def places_of(
         own_variance(stars) if variance is None else variance,
     )
     extent = max(float(np.abs([seen.x, seen.y]).max(initial=0.0)), 1e-9)
-    found: list[Place] = []
+    found: list[DisagreeingPlace] = []
     there = np.ones(len(seen.x), bool)
     while len(found) < _MOST and there.sum() > 1:
         part = _Seen(*(values[there] for values in seen))
@@ -182,7 +182,7 @@ def _strongest(seen: _Seen, extent: float) -> tuple[tuple[float, float, float], 
         place = np.floor(np.stack([seen.x, seen.y]) / cell).astype(int)
         place -= place.min(axis=1, keepdims=True)
         shape = tuple(int(n) + 1 for n in place.max(axis=1))
-        index = np.ravel_multi_index(tuple(place), shape)
+        index = np.asarray(np.ravel_multi_index(tuple(place), shape))
         occupied = np.unique(index)
         for k in range(seen.z.shape[1]):
             for weight in (seen.alpha[:, k], sees[:, k]):
@@ -212,14 +212,16 @@ def _smoothed(
 
 def _described(
     seen: _Seen, centre: tuple[float, float, float], sigma: float, cameras: Sequence[str]
-) -> Place:
+) -> DisagreeingPlace:
     """The place about a centre, with the cameras that describe its stars as well as the best one."""
-    near = Place(centre[0], centre[1], _WIDER * centre[2], sigma, 0, ()).profile(seen.x, seen.y) > 0
+    near = (
+        DisagreeingPlace(centre[0], centre[1], _WIDER * centre[2], sigma, 0, ()).profile(seen.x, seen.y) > 0
+    )
     part = _Seen(*(values[near] for values in seen))
     fits = []
     for k, name in enumerate(cameras):
         x, y, size = _fitted(part, k, centre)
-        place = Place(x, y, size, sigma, 0, ())
+        place = DisagreeingPlace(x, y, size, sigma, 0, ())
         share, error, gain = _share(part, k, place.profile(part.x, part.y))
         fits.append((gain, place, CameraAtPlace(k, name, share, error)))
     fits.sort(key=lambda fit: -fit[0])
@@ -238,7 +240,7 @@ def _fitted(seen: _Seen, camera: int, centre: tuple[float, float, float]) -> tup
         return x + size * moved[0], y + size * moved[1], size * float(np.exp(moved[2]))
 
     def misfit(moved: Float[np.ndarray, " 3"]) -> float:
-        g = Place(*place(moved), 0.0, 0, ()).profile(seen.x, seen.y)
+        g = DisagreeingPlace(*place(moved), 0.0, 0, ()).profile(seen.x, seen.y)
         return float(moved @ moved) - _share(seen, camera, g)[2]
 
     bounds = [(-_WIDER, _WIDER)] * 2 + [(-1.0, np.log(_WIDER))]
