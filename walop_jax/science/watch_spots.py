@@ -34,7 +34,7 @@ def profile(x: Float[np.ndarray, " r"], y: Float[np.ndarray, " r"], place: Place
     return (1.0 - np.minimum(distance, 1.0) ** place[3]) ** 2
 
 
-class Spot(NamedTuple):
+class SpotFound(NamedTuple):
     """A spot that stands out: T, the number of the camera or arm, and (x, y, R in degrees, m)."""
 
     strength: float
@@ -67,8 +67,8 @@ class Spots:
     def __len__(self) -> int:
         return len(self.places)
 
-    def strongest(self, z: Float[np.ndarray, "s k"]) -> Spot | None:
-        """Where T is largest; `z` is 0 for stars that do not see a camera. None without a place of enough stars."""
+    def strongest(self, z: Float[np.ndarray, "s k"]) -> SpotFound | None:
+        """The place of the largest T; `z` is 0 for stars that do not see a camera. None without a place of enough stars."""
         seen = (z != 0).astype(float)
         enough = self.within @ seen >= FEW
         heavy = np.sqrt(np.maximum(self.square @ seen, 1e-300))
@@ -76,10 +76,10 @@ class Spots:
         if not strength.any():
             return None
         place, unit = np.unravel_index(strength.argmax(), strength.shape)
-        return Spot(float(strength[place, unit]), int(unit), self.places[int(place)])
+        return SpotFound(float(strength[place, unit]), int(unit), self.places[int(place)])
 
     def refined(
-        self, spot: Spot, z: Float[np.ndarray, " s"], root: Float[np.ndarray, " s"]
+        self, spot: SpotFound, z: Float[np.ndarray, " s"], root: Float[np.ndarray, " s"]
     ) -> tuple[Place, Bool[np.ndarray, " s"]]:
         """The place near which a spot fits best, and the stars that it describes; `root` is 1/σ of each star's gain."""
         near = np.flatnonzero(
