@@ -68,7 +68,7 @@ class Spots:
         return len(self.places)
 
     def strongest(self, z: Float[np.ndarray, "s k"]) -> SpotFound | None:
-        """The place of the largest T; `z` is 0 for stars that do not see a camera. None without a place of enough stars."""
+        """The place of the largest T; `z` is 0 for stars that do not see a camera. None where stars are too few."""
         seen = (z != 0).astype(float)
         enough = self.within @ seen >= FEW
         heavy = np.sqrt(np.maximum(self.square @ seen, 1e-300))
