@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -262,7 +263,7 @@ def test_bad_input(quiet, single):
     with pytest.raises(DataError, match="do not explain its scatter"):
         stack([scattered])
     # The file to leave out is named, not what was typed into it.
-    kept = dataclasses.replace(Calibration.from_fit(scattered), path="RUN7/calibration.fits")
+    kept = dataclasses.replace(Calibration.from_fit(scattered), path=Path("RUN7/calibration.fits"))
     with pytest.raises(DataError, match=r"errors of RUN7/calibration\.fits do not explain"):
         stack([one, two], like=kept)
 
