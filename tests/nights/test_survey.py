@@ -263,7 +263,9 @@ def test_bad_input(quiet, single):
     with pytest.raises(DataError, match="do not explain its scatter"):
         stack([scattered])
     # The file to leave out is named, not what was typed into it.
-    kept = dataclasses.replace(Calibration.from_fit(scattered), path=Path("RUN7/calibration.fits"))
+    kept = Calibration.from_fit(single)
+    verdict = dataclasses.replace(kept.verdict, errors_from="residuals")
+    kept = dataclasses.replace(kept, verdict=verdict, path=Path("RUN7/calibration.fits"))
     with pytest.raises(DataError, match=r"errors of RUN7/calibration\.fits do not explain"):
         stack([one, two], like=kept)
 

@@ -26,6 +26,7 @@ Place = tuple[float, ...]
 
 
 EDGES = (2.0, 8.0)
+NO_SPOT = 1e12  # χ², above all that stars have
 
 
 def profile(x: Float[np.ndarray, " r"], y: Float[np.ndarray, " r"], place: Place) -> Float[np.ndarray, " r"]:
@@ -98,7 +99,7 @@ class Spots:
 
         def cost(values: Float[np.ndarray, " v"], edge: float) -> float:
             if abs(values[2]) > widest or np.abs(values[:2] * unit).max() > self.edge:
-                return np.inf  # what covers the field is no spot
+                return NO_SPOT  # what covers the field
             return float(np.minimum(off(values, edge), CLIPPED**2).sum())
 
         begin = [spot.place[0] / unit, spot.place[1] / unit]
