@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from walop_jax.nights import night_file, stacking
 from walop_jax.nights.equations import night_equations
 from walop_jax.nights.stacking import stack
 from walop_jax.science import apply as application
+from walop_jax.science.field_accuracy import field_accuracy
 from walop_jax.simulation.simulate import simulate
 
 TURN = 0.1  # deg, of the axis of a half-wave plate, between the third night and the fourth
@@ -72,6 +74,15 @@ def test_a_stack_is_the_joint_fit(sets, quiet):
     assert quiet.verdict.chi2 == pytest.approx(joint.chi2, abs=0.01)
     assert (quiet.verdict.dof, quiet.verdict.n_data) == (joint.dof, joint.n_data)
     assert quiet.trusted
+
+
+def test_a_night_alone_knows_p_as_well_as_its_fit_does(single):
+    """The same quantity, of the same part of the field, in the same words."""
+    survey = stack([single], find=False)
+    alone = field_accuracy(Calibration.from_fit(single))
+    assert survey.error_of_p(survey.last) == pytest.approx(alone.reached, rel=1e-3)
+    assert f"in {alone.judged}, on the last night" in survey.display().text()
+    assert survey.document()["without_u"] == pytest.approx(alone.without_u)
 
 
 def test_nights_that_share_nothing_are_single_fits(sets, single):
@@ -252,7 +263,9 @@ def test_bad_input(quiet, single):
     with pytest.raises(DataError, match="do not explain its scatter"):
         stack([scattered])
     # The file to leave out is named, not what was typed into it.
-    kept = dataclasses.replace(Calibration.from_fit(scattered), path="RUN7/calibration.fits")
+    kept = Calibration.from_fit(single)
+    verdict = dataclasses.replace(kept.verdict, errors_from="residuals")
+    kept = dataclasses.replace(kept, verdict=verdict, path=Path("RUN7/calibration.fits"))
     with pytest.raises(DataError, match=r"errors of RUN7/calibration\.fits do not explain"):
         stack([one, two], like=kept)
 

@@ -69,6 +69,19 @@ def test_the_edge_of_the_field_is_told():
     assert any(text.startswith("0.075 %") and "walop-jax stack" in text for text in found.missing)
 
 
+def test_the_strip_without_u_is_left_out_and_said():
+    """A fifth of the field has errors of 1 %: 95 % of the rest is known as if the strip were not there."""
+    with_u = np.ones((10, 10), bool)
+    with_u[:, 4:6] = False
+    error = np.where(with_u, FIELD, 1e-2)
+    found = accuracy(error=error, without_u=0.2, with_u=with_u)
+    assert found.reached == pytest.approx(np.quantile(FIELD[with_u], 0.95))
+    assert found.reached < 5e-4
+    said = commissioning(small_fit(), found).display().text()
+    assert "in 95 % of the field where one exposure measures u (80 % of it)" in said
+    assert np.quantile(error, 0.95) == pytest.approx(1e-2)
+
+
 def test_where_one_exposure_holds_no_u_more_light_is_no_cure():
     """8 % of the field in the strip: the edge of the field is its matter, half of the field is not."""
     found = commissioning(small_fit(), accuracy(error=1.6 * FIELD, without_u=0.08))

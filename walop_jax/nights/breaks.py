@@ -39,7 +39,7 @@ MOST = 40  # breaks that are looked for
 ROUNDS = 3  # in which all are named again
 KINDS = ("step", "bad night", "drift")
 Carried = Callable[[str], bool]
-"""Whether stars can be corrected for a candidate."""
+"""True for a candidate that stars can be corrected for."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 _FARTHEST = 40.0  # of the tail in units of 1/u, beyond which nothing is left of it
 

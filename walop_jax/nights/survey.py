@@ -147,7 +147,11 @@ class Survey(Displayed):
         return reached(p_errors(matrix, covariance, sample_stars()))
 
     @functools.cached_property
-    def _matrix(self) -> tuple[Matrix, Float[np.ndarray, "p 6 k"], Float[np.ndarray, "p 6 6"], float] | None:
+    def _matrix(
+        self,
+    ) -> (
+        tuple[Float[np.ndarray, "p 6"], Float[np.ndarray, "p 6 k"], Float[np.ndarray, "p 6 6"], float] | None
+    ):
         """Matrix, derivatives and covariance of structure where one exposure measures u; the share where it does not.
 
         None where p is not measured.

@@ -127,7 +127,7 @@ class FieldAccuracy:
 
 
 def measures_u(matrix: Float[np.ndarray, "p 6"]) -> Bool[np.ndarray, " p"]:
-    """Where one exposure measures q and u, by the determinant of the 2 × 2 part of its matrix."""
+    """Places where one exposure measures q and u, by the determinant of the 2 × 2 part of its matrix."""
     return np.abs(np.linalg.det(matrix.reshape(-1, 2, 3)[:, :, 1:])) >= SMALLEST_DETERMINANT
 
 

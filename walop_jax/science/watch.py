@@ -61,7 +61,7 @@ from walop_jax.science.star_residuals import (
 )
 from walop_jax.science.watch_found import UNNAMED, History, Suspect, Watch, WatchedChange
 from walop_jax.science.watch_readings import Answers, Readings
-from walop_jax.science.watch_spots import Spot, Spots, of_stars, profile
+from walop_jax.science.watch_spots import SpotFound, Spots, of_stars, profile
 
 SEEN = 2.33
 """Standard deviations above the alarm from which 99 % are found."""
@@ -465,7 +465,7 @@ class Watching:
         common = np.zeros(len(self.time) + 1)
         np.maximum.at(common, self.pool, weight * self.variance)
         every, members = common[self.pool] / self.variance, self.readings.members
-        strongest: tuple[Spot, int, Any, Any] | None = None
+        strongest: tuple[SpotFound, int, Any, Any] | None = None
         for start, (z, root) in enumerate(of_stars(self.stars, self.group, members, residual, every, share)):
             z[self.spoilt] = 0.0
             spot = self.spots.strongest(z)

@@ -68,7 +68,7 @@ class Suspect(NamedTuple):
 
     @property
     def thing(self) -> tuple[str, str, History]:
-        """What has changed, and how in time."""
+        """Kind and name of the change, and its course in time."""
         return self.kind, self.name, self.history
 
     @property

@@ -1,4 +1,4 @@
-"""What stars that are watched may say has changed: cameras, arms, gradients over the field, numbers of the optics.
+"""Changes that stars can show: cameras, arms, gradients over the field, numbers of the optics.
 
 A reading is a sum of columns of the counts; a gradient has a second one, and any direction φ in the field:
 
@@ -29,7 +29,7 @@ Sum = dict[int, float]
 
 
 class Reading(NamedTuple):
-    """What may have changed, as a sum of `Readings.columns`; `across` is that along Y, of a gradient.
+    """A possible change, as a sum of `Readings.columns`; `across` is that along Y, of a gradient.
 
     `widest` is the largest size that it may have.
     """

@@ -26,6 +26,7 @@ Place = tuple[float, ...]
 
 
 EDGES = (2.0, 8.0)
+NO_SPOT = 1e12  # χ², above all that stars have
 
 
 def profile(x: Float[np.ndarray, " r"], y: Float[np.ndarray, " r"], place: Place) -> Float[np.ndarray, " r"]:
@@ -34,7 +35,7 @@ def profile(x: Float[np.ndarray, " r"], y: Float[np.ndarray, " r"], place: Place
     return (1.0 - np.minimum(distance, 1.0) ** place[3]) ** 2
 
 
-class Spot(NamedTuple):
+class SpotFound(NamedTuple):
     """A spot that stands out: T, the number of the camera or arm, and (x, y, R in degrees, m)."""
 
     strength: float
@@ -67,8 +68,8 @@ class Spots:
     def __len__(self) -> int:
         return len(self.places)
 
-    def strongest(self, z: Float[np.ndarray, "s k"]) -> Spot | None:
-        """Where T is largest; `z` is 0 for stars that do not see a camera. None without a place of enough stars."""
+    def strongest(self, z: Float[np.ndarray, "s k"]) -> SpotFound | None:
+        """The place of the largest T; `z` is 0 for stars that do not see a camera. None where stars are too few."""
         seen = (z != 0).astype(float)
         enough = self.within @ seen >= FEW
         heavy = np.sqrt(np.maximum(self.square @ seen, 1e-300))
@@ -76,10 +77,10 @@ class Spots:
         if not strength.any():
             return None
         place, unit = np.unravel_index(strength.argmax(), strength.shape)
-        return Spot(float(strength[place, unit]), int(unit), self.places[int(place)])
+        return SpotFound(float(strength[place, unit]), int(unit), self.places[int(place)])
 
     def refined(
-        self, spot: Spot, z: Float[np.ndarray, " s"], root: Float[np.ndarray, " s"]
+        self, spot: SpotFound, z: Float[np.ndarray, " s"], root: Float[np.ndarray, " s"]
     ) -> tuple[Place, Bool[np.ndarray, " s"]]:
         """The place near which a spot fits best, and the stars that it describes; `root` is 1/σ of each star's gain."""
         near = np.flatnonzero(
@@ -98,7 +99,7 @@ class Spots:
 
         def cost(values: Float[np.ndarray, " v"], edge: float) -> float:
             if abs(values[2]) > widest or np.abs(values[:2] * unit).max() > self.edge:
-                return np.inf  # what covers the field is no spot
+                return NO_SPOT  # what covers the field
             return float(np.minimum(off(values, edge), CLIPPED**2).sum())
 
         begin = [spot.place[0] / unit, spot.place[1] / unit]

@@ -28,5 +28,5 @@ def night_of(mjd: Float[np.ndarray, " e"], longitude: float) -> Float[np.ndarray
 
 
 def first_of_nights(mjd: Float[np.ndarray, " e"]) -> Int[np.ndarray, " n"]:
-    """Where nights begin among times in their order (days), by the gaps between them."""
+    """The first exposures of nights among times in their order (days), by the gaps between them."""
     return np.flatnonzero(np.diff(mjd, prepend=-np.inf) > GAP / 24.0)
