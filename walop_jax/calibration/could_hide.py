@@ -93,7 +93,8 @@ def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
     if hidden is None or not len(hidden):
         return ()
     settings = calibration.usual_settings(filter_name=calibration.usual_filter)
-    errors = hidden_errors(calibration, *calibration.raster(PLACES), settings)
+    x, y = calibration.raster(PLACES)
+    errors = hidden_errors(calibration, x, y, settings)
     errors = errors[:, np.isfinite(errors).all(axis=0)]
     if not errors.size:
         return ()

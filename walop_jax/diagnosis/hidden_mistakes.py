@@ -82,7 +82,7 @@ def hidden_mistakes(design: Design, singles: Singles, policy: Policy = POLICY) -
     best: dict[str, tuple[int, bool, bool]] = {}
     for i in np.argsort(-errors, kind="stable").tolist():
         one = found[i]
-        acts = one.acts or turns[i] > 0.0
+        acts = one.acts or bool(turns[i] > 0.0)
         # In the usual setting it is out of the beam; stars that are seen through it have it.
         elsewhere = not (acts or one.informed or one.effect is None) and bool(
             moves_with(one.effect, instrument)
