@@ -45,7 +45,7 @@ class CouldHide(NamedTuple):
     """One mistake that could hide: `error` of q and u (stars with p ≤ 5 %) at `size`, median, largest over the field.
 
     `kind` is `EFFECT` or `DATA` (`fit.verdict`); it is not `measured` where the data hold no information on it. One
-    that is `ahead` is of the light from the sky before it meets the polariser.
+    that is not, and is `ahead`, is of the light from the sky before it meets the polariser.
     """
 
     name: str
@@ -93,12 +93,16 @@ def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
     if hidden is None or not len(hidden):
         return ()
     settings = calibration.usual_settings(filter_name=calibration.usual_filter)
-    errors = hidden_errors(calibration, *calibration.raster(PLACES), settings)
+    x, y = calibration.raster(PLACES)
+    errors = hidden_errors(calibration, x, y, settings)
     errors = errors[:, np.isfinite(errors).all(axis=0)]
     if not errors.size:
         return ()
     acting = acting_effects(calibration)
-    ahead = [number in acting and is_ahead(calibration, acting[number]) for number in range(len(hidden))]
+    ahead = [  # asked of what is not measured alone
+        not measured and number in acting and is_ahead(calibration, acting[number])
+        for number, measured in enumerate(hidden.measured)
+    ]
     columns = zip(
         *(hidden.names, hidden.kinds, hidden.sizes, hidden.units, hidden.remedies, hidden.measured, ahead),
         zip(np.median(errors, axis=1).tolist(), errors.max(axis=1).tolist(), strict=True),

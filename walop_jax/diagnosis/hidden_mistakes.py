@@ -40,7 +40,7 @@ from walop_jax.model.parameters import field_declarations
 
 STAR_POINTS = 16  # field points at which stars are asked what a mistake does to them
 MOST_HIDDEN = 12  # mistakes that a product keeps: what a star needs for each is a product of two vectors
-_FAINT = 0.1  # of the worst mistake, below which an effect that the data measure is not kept
+_FAINT = 0.5  # of the worst mistake, below which an effect that the data measure is not kept
 _NOTHING = 1e-9  # change of the analysis vectors that is none
 
 
@@ -68,7 +68,7 @@ def hidden_mistakes(design: Design, singles: Singles, policy: Policy = POLICY) -
 
     Kept are those that move the parameters by more than their standard errors, and effects that act on starlight; first
     those that make q and u of stars most wrong, in the median over the field. An effect that data show below its usual
-    size does little to stars, which see what the polariser sees: it stays if it does a tenth of what the worst does.
+    size does little to stars, which see what the polariser sees: it stays if it does half of what the worst does.
     """
     fit = design.fit
     usual = _usual(fit.calset, fit.model.template)
@@ -82,7 +82,7 @@ def hidden_mistakes(design: Design, singles: Singles, policy: Policy = POLICY) -
     best: dict[str, tuple[int, bool, bool]] = {}
     for i in np.argsort(-errors, kind="stable").tolist():
         one = found[i]
-        acts = one.acts or turns[i] > 0.0
+        acts = one.acts or bool(turns[i] > 0.0)
         # In the usual setting it is out of the beam; stars that are seen through it have it.
         elsewhere = not (acts or one.informed or one.effect is None) and bool(
             moves_with(one.effect, instrument)

@@ -119,7 +119,7 @@ class DetectionLimits(Displayed):
             },
             "untestable": list(self.untestable),
             "conditions": [dataclasses.asdict(entry) for entry in self.conditions],
-            "could_hide": [one._asdict() for one in self.mistakes],
+            "could_hide": [one._asdict() for one in self.could_hide],
         }
 
     @classmethod

@@ -38,7 +38,7 @@ def _at_points(
     block: ResponseBlock, changes: Sequence[Sequence[Piece]], exposure: int
 ) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
     every, band = np.arange(len(block.x)), block.band[:, exposure]
-    vectors = block.found.vectors.vectors[every, 0, band]  # p k 4
+    vectors = np.asarray(block.found.vectors.vectors)[every, 0, band]  # p k 4
     added = np.zeros((*vectors.shape[:-1], 3, len(changes)))
     at = Laid(block.of.likelihood, block.x[:, None], block.y[:, None])
     for a, pieces in enumerate(changes):
