@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from types import SimpleNamespace
 
 import handmade_run
 import numpy as np
@@ -197,7 +196,7 @@ def test_noise_alone_depends_on_the_number_of_cameras(tmp_path):
     (tmp_path / "own.toml").write_text(OWN)
     two, four = Instrument.read(tmp_path / "own.toml"), nominal_instrument()
     for design, left in ((two, "0.5"), (four, "0.75")):
-        assert _noise_alone(SimpleNamespace(design=design)) == left
+        assert _noise_alone(design.cameras) == left
 
 
 def test_page_of_a_watch(tmp_path):
