@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from html_page import Page
+from own_instrument import OWN
 
 from walop_jax.io.errors import DataError
-from walop_jax.reports.page import kind_of_run, render, render_other
+from walop_jax.model.instrument import Instrument, nominal_instrument
+from walop_jax.reports.page import _noise_alone, kind_of_run, render, render_other
 from walop_jax.reports.run import read_limits, read_run
 from walop_jax.science.field_accuracy import FieldAccuracy
 
@@ -231,3 +233,27 @@ def test_limits_of_the_same_data_stand_beside_the_accuracy(tmp_path):
     found = read_run(tmp_path)
     assert found.limits is None
     assert any("of other data" in sentence for sentence in found.missing)
+
+
+def test_noise_alone_depends_on_the_number_of_cameras(tmp_path):
+    """A flux is fitted to the cameras of a row: 1 − 1/K is left, whatever the page said of four."""
+    (tmp_path / "own.toml").write_text(OWN)
+    two, four = Instrument.read(tmp_path / "own.toml"), nominal_instrument()
+    for design, left in ((two, "0.5"), (four, "0.75")):
+        assert _noise_alone(design.cameras) == left
+
+
+def test_page_of_a_watch(tmp_path):
+    group = {
+        "time": 61220.8, "stars": 40, "chi2_per_dof": 1.02,
+        "gain": {"O1": 0.0093, "E1": None}, "error": {"O1": 0.0004, "E1": None},
+    }  # fmt: skip
+    document = {"holds": False, "changes": [{}], "groups": [group], "warnings": ["O1 is brighter by 0.93 %"]}
+    (tmp_path / "watch.json").write_text(json.dumps(document))
+    assert kind_of_run(tmp_path) == "watch"
+    text, missing = render_other(tmp_path, "watch")
+    page = Page(text)
+    assert "The calibration has changed" in page.text
+    assert "O1 is brighter by 0.93" in page.text
+    assert "+0.93 ± 0.04" in text.replace("\N{NO-BREAK SPACE}", " ")
+    assert missing == ("watch.png is not there.",)

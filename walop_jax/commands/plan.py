@@ -127,7 +127,7 @@ def plan(
     job.tell("information of exposures", "information")
     with job.repeated() as say:
         found = plan_exposures(
-            Could.of(could),
+            Could.of(could),  # pyright: ignore[reportArgumentType]
             minutes,
             criterion=wanted,
             known=known,

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jinja2
 from matplotlib.figure import Figure
 
-from walop_jax.calibration import SUMMARY, Calibration, read_calibration
+from walop_jax.calibration import SUMMARY, read_calibration
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.findings import sentences
 from walop_jax.diagnosis.limits_found import DetectionLimits
@@ -29,6 +29,7 @@ from walop_jax.io.text import (
     with_error,
     with_minus_sign,
 )
+from walop_jax.model.cameras import Cameras
 from walop_jax.nights.stacking import TRACKS
 from walop_jax.posterior.files import COMPARISON, EPOCH, LIMITS, PLANNED, SURVEY, WATCHED
 from walop_jax.posterior.result import interval_in_words
@@ -110,7 +111,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "sentence": sentence,
         "fit_sentence": ": ".join(verdict_of_fit(summary)),
         "good": good,
-        "noise_alone": _noise_alone(run.product),
+        "noise_alone": _noise_alone(None if run.product is None else run.product.design.cameras),
         "trusted": trusted,
         "quality": quality.meanings,
         "hidden": hidden_in_words(summary),
@@ -140,11 +141,10 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
     }
 
 
-def _noise_alone(product: Calibration | None) -> str:
+def _noise_alone(cameras: Cameras | None) -> str:
     """Mean squared residual of noise: a flux is fitted to the cameras of a row, one of each arm where it is split."""
-    if product is None:
+    if cameras is None:
         return "1 − 1/K, of K cameras,"
-    cameras = product.design.cameras
     return rounded(1.0 - cameras.fluxes / len(cameras), ".3g")
 
 

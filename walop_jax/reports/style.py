@@ -35,7 +35,8 @@ MOST_VECTOR = 2000  # points above which tiles are drawn as pixels
 SETTINGS: dict[Any, Any] = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.hashsalt": "walop-jax"}
 """Beside the defaults of matplotlib; without the last no two pages of a run are the same."""
 
-P, T = ParamSpec("P"), TypeVar("T")
+P = ParamSpec("P")
+T = TypeVar("T")
 Map = Float[np.ndarray, "y x"]
 Maps = Float[np.ndarray, "m y x"]
 Field = tuple[float, float, float, float]
