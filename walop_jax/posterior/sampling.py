@@ -214,7 +214,8 @@ def sample(
             found, result.model, stated.covariance, result.covariance, result.errors_from
         )
     sampler, target = options.make_sampler(), Target(result)
-    chain = Chain(folder, fingerprint(target, options)) if folder is not None and sampler.resumes else None
+    marks = {} if folder is None else fingerprint(target, options)
+    chain = Chain(folder, marks) if folder is not None and sampler.resumes else None
     if chain is not None and chain.path.exists():
         if not resume:
             raise fail("holds a chain already", file=folder, advice="go on with --resume, or --overwrite it")
@@ -230,7 +231,7 @@ def sample(
     report(Progress("comparing with the exact posterior", 1.0, *numbers_of(verdict)))
     finished = _finish(target, posterior, ensembles, verdict, seconds)
     fit = digest_of_fit(result.calset.inputs, result.model.names, result.values)
-    return dataclasses.replace(finished, of_trusted_fit=trusted, fit=fit)
+    return dataclasses.replace(finished, of_trusted_fit=trusted, fit=fit, fingerprint=marks)
 
 
 def _surrogate(target: Target, options: Options, report: Report) -> tuple[Surrogate, float]:
@@ -271,7 +272,6 @@ def _finish(
     mean, spread = posterior.moments(z.reshape(-1, d)[:: max(1, e * n * w // 50_000)])
     select = target.model.selection()
     shown = len(posterior.sampled) + int(posterior.inflate)
-    chain = ensembles.chain
     return PosteriorSample(
         sampler=ensembles.sampler.name,
         names=target.model.names,
@@ -289,7 +289,7 @@ def _finish(
         acceptance=ensembles.acceptance,
         counts=ensembles.counts,
         seconds=seconds + ensembles.seconds,
-        fingerprint={} if chain is None else chain.fingerprint,
+        fingerprint={},
         likelihood=target.likelihood,
         noise_scale=target.noise_scale,
     )
