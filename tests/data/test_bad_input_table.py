@@ -233,7 +233,7 @@ ELSEWHERE = {
     "43": "diagnosis/test_detection_limits.py::test_two_effects_that_do_the_same_are_told_as_a_class",
     "44": "commands/test_refit_run.py::test_a_fit_that_does_not_converge_leaves_no_calibration",
     "45": "posterior/test_chains.py::test_a_killed_run_loses_one_block_and_ends_up_the_same",
-    "46": "posterior/test_chains.py::test_checkpoints_come_back_and_refuse_what_is_not_theirs",
+    "46": "posterior/test_chains.py::test_a_chain_comes_back_and_refuses_what_is_not_its_own",
     "47": "posterior/test_full_disk.py::test_full_disk_is_an_error_and_leaves_nothing_half_written",
     "48": "io/test_folder.py::test_the_second_of_two_writers_is_told_who_the_first_is",
     "49": "io/test_folder.py::test_a_read_only_folder_is_refused",

@@ -1,4 +1,4 @@
-"""Moves, convergence and checkpoints: everything between a log-posterior and a verdict."""
+"""Moves, convergence and chains that are kept: everything between a log-posterior and a verdict."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from walop_jax.io.errors import DataError
-from walop_jax.posterior import MOVES, Checkpoints, Density, Emcee, Surrogate, assess, r_hat
+from walop_jax.posterior import MOVES, Chain, Density, Emcee, assess, r_hat
 
 MARK = {"data": "a", "model": "b"}
 
@@ -123,61 +123,41 @@ def test_a_stuck_coordinate_is_found_out() -> None:
     assert "b never moved" in assess(chains, ("a", "b")).message()
 
 
-def test_checkpoints_come_back_and_refuse_what_is_not_theirs(gaussian: Surrogate, tmp_path: Path) -> None:
-    there = Checkpoints(tmp_path / "chain", MARK)
-    assert not there.exists()
-    there.save_surrogate(gaussian, {"seconds": 1.5})
-    loaded, extra = there.load_surrogate()
-    assert loaded.names == gaussian.names
-    assert extra["seconds"] == 1.5
-    np.testing.assert_array_equal(loaded.data, gaussian.data)
+def test_a_chain_comes_back_and_refuses_what_is_not_its_own(tmp_path: Path) -> None:
+    there = Chain(tmp_path / "sampling", MARK)
     sampler, density = Emcee(walkers=16), unit(4)
     state, stretch = sampler.advance(density, sampler.start(density, (7, 0)), 10)
-    stretch = stretch._replace(counts={"fruit": 3})
-    there.save_block(1, [state, state], [stretch, stretch], 0.1)
-    again, blocks, seconds = there.load_block(1)
-    assert (there.count(), seconds) == (1, 0.1)
-    for name in ("positions", "log_density", "acceptance"):
-        np.testing.assert_array_equal(getattr(blocks[1], name), getattr(stretch, name))
-    assert blocks[0].counts == {"fruit": 3}
+    there.save([state, state], [stretch, stretch], 0.1)
+    again, stretches, seconds = there.load()
+    assert (len(stretches), seconds) == (2, 0.1)
+    np.testing.assert_array_equal(stretches[1].positions, stretch.positions)
+    np.testing.assert_array_equal(stretches[1].log_density, stretch.log_density)
+    np.testing.assert_allclose(stretches[1].acceptance.sum(axis=0), stretch.acceptance.sum(axis=0))
     assert set(again[0]) == set(state)
     for name, value in state.items():
         np.testing.assert_array_equal(again[1][name], value)
-        assert again[1][name].dtype == value.dtype
+    # For emcee it is one of its own files.
+    kept = emcee.backends.HDFBackend(str(there.path), name="ensemble1", read_only=True)
+    np.testing.assert_array_equal(kept.get_chain(), stretch.positions)
+    np.testing.assert_array_equal(kept.get_last_sample().coords, state["positions"])
 
     with pytest.raises(DataError, match=r"other data \(a → z\)"):
-        Checkpoints(tmp_path / "chain", {"data": "z", "model": "b"}).load_surrogate()
-    with pytest.raises(DataError, match="exists already"):
-        there.save_block(1, [state], [stretch], 0.1)
-    path = there.block_path(1)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
+        Chain(there.path.parent, {"data": "z", "model": "b"}).load()
+    whole = there.path.read_bytes()
+    there.path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DataError, match="cannot be read"):
-        there.load_block(1)
-    spoilt = bytearray(whole)
-    spoilt[whole.index(stretch.positions[3].tobytes())] ^= 1
-    path.write_bytes(bytes(spoilt))
-    with pytest.raises(DataError, match="not what was written"):
-        there.load_block(1)
-    there.clear()
-    assert not there.exists()
+        there.load()
 
 
 SCRIPT = """
 import sys, numpy as np
-from walop_jax.posterior import Checkpoints, Density, Emcee
+from walop_jax.posterior import Chain, Density, Emcee, Ensembles, Options
 f = Density(4, lambda z: -0.5 * z @ z, batch=lambda z: -0.5 * np.sum(z**2, axis=1))
-there = Checkpoints(sys.argv[1], {"data": "a"})
-there.folder.mkdir(exist_ok=True)
-sampler = Emcee(walkers=16, moves="de")
-states = [sampler.start(f, (7, n)) for n in range(2)]
-for number in range(1, there.count() + 1):
-    states, _, _ = there.load_block(number)
-for number in range(there.count() + 1, 13):
-    both = [sampler.advance(f, state, 50) for state in states]
-    states = [state for state, _ in both]
-    there.save_block(number, states, [stretch for _, stretch in both], 0.0)
-    print(number, flush=True)
+options = Options(walkers=16, moves="de", interval=50, seed=7)
+run = Ensembles(options.make_sampler(), f, options, Chain(sys.argv[1], {"data": "a"}))
+while run.steps < 600:
+    run.go_on()
+    print(run.steps // 50, flush=True)
 """
 
 
@@ -196,10 +176,8 @@ def test_a_killed_run_loses_one_block_and_ends_up_the_same(tmp_path: Path) -> No
 
     run("whole")
     run("killed", kill_after=4)
-    killed = Checkpoints(tmp_path / "killed", {"data": "a"})
-    assert 4 <= killed.count() < 12
+    killed, whole = (Chain(tmp_path / name, {"data": "a"}) for name in ("killed", "whole"))
+    assert 4 * 25 <= len(killed.load()[1][0].positions) < 12 * 25  # every second step is stored
     run("killed")
-    whole = Checkpoints(tmp_path / "whole", {"data": "a"})
-    for number in range(1, 13):
-        for ours, theirs in zip(killed.load_block(number)[1], whole.load_block(number)[1], strict=True):
-            np.testing.assert_array_equal(ours.positions, theirs.positions)
+    for ours, theirs in zip(killed.load()[1], whole.load()[1], strict=True):
+        np.testing.assert_array_equal(ours.positions, theirs.positions)

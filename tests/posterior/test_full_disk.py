@@ -1,4 +1,4 @@
-"""A disk that is full, or a quota that is used up, while a posterior or a checkpoint is written."""
+"""A disk that is full, or a quota that is used up, while a posterior or a chain is written."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ WRITERS = {
                 return arviz.from_dict(posterior={"a": np.ones((4, 20000))})
         write = lambda path: write_posterior(path, Sample())
     """,
-    "checkpoint": """
-        from walop_jax.posterior import Checkpoints
+    "chain": """
+        from walop_jax.posterior import Chain, Emcee, Stretch
         def write(path):
-            there = Checkpoints(path.parent, {})
-            there.block_path = lambda number: path
-            there._write(path, {"a": np.zeros((4, 20000))}, {})
+            there, state = Chain(path.parent, {}), {"random_keys": np.zeros(624), "random_rest": np.zeros(3)}
+            there.path = path
+            there.save([state], [Stretch(np.zeros((4, 4, 20000)), np.zeros((4, 4)), np.zeros((4, 4)))], 0.0)
     """,
 }
 LIMITED = """

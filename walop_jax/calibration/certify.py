@@ -75,7 +75,7 @@ def certify(product: Calibration) -> list[Check]:
 
 
 def _content(product: Calibration) -> list[Check]:
-    """What is read is what was written (`read_calibration`), but for products of an earlier rule."""
+    """A failure for products of an earlier rule; the content of others was checked when they were read."""
     return [Check("content", False, UNCHECKED)] if UNCHECKED in product.verdict.warnings else []
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 RUN = Argument("Folder of a `walop-jax refit`.", "RUN", Path)
 STEPS = Option("Stop there at the latest, converged or not; a multiple of --interval.", least=1)
 CHAINS = "sampling"
-"""Folder, in that of the run, of the checkpoints."""
+"""Folder, in that of the run, of the chain that is kept."""
 OUTPUTS = (
     "posterior.nc", "posterior.fits", "posterior.ecsv", "posterior_corner.png", "posterior_trace.png", "sample.json",
 )  # fmt: skip
@@ -31,7 +31,7 @@ def sample(
     job: Job,
     fit: Annotated[FitResult | Run | PathLike, RUN],
     *,
-    resume: Annotated[bool, Option("Go on from the checkpoints in RUN/sampling.")] = False,
+    resume: Annotated[bool, Option("Go on from the chain in RUN/sampling (emcee).")] = False,
     model: ModelLike = None,
     data: DataOf = None,
     effects: Effects = None,
@@ -39,16 +39,18 @@ def sample(
     inflate: Annotated[bool, Option("Sample a factor on the errors of the data.")] = False,
     maximum_steps: Annotated[int, STEPS] = 100_000,
     walkers: Annotated[int, Option("Walkers of an emcee ensemble; 0: at least 64.", least=0)] = 0,
-    interval: Annotated[int, Option("Steps between checkpoints.", least=1)] = 500,
+    interval: Annotated[
+        int, Option("Steps after which convergence is judged and the chain kept.", least=1)
+    ] = 500,
     moves: Annotated[str, Option("Moves of emcee: laplace, de or stretch.")] = "laplace",
     parameters: Sequence[str] | None = None,
     **more: Any,
 ) -> Outcome[PosteriorSample]:
     """Sample the posterior: RUN/posterior.nc, intervals and figures; the covariance goes into calibration.fits.
 
-    Checkpoints lie in RUN/sampling: an interrupted run goes on with --resume, bit for bit, and refuses if
-    data, model, priors, sampler, settings or versions have changed. A chain that has not converged is written and
-    marked so, with exit code 1; the covariance of the fit then stays in calibration.fits.
+    The chain of emcee is kept in RUN/sampling: an interrupted run goes on with --resume, and refuses if data, model,
+    priors, sampler, settings or versions have changed. Other samplers start anew. A chain that has not converged is
+    written and marked so, with exit code 1; the covariance of the fit then stays in calibration.fits.
 
     In Python: a `PosteriorSample`, of a fit in memory or of a run, which is then written. `parameters` names what is
     sampled (None: the physics coefficients); other keywords are the fields of `walop.Options`. Raises `DataError` if
@@ -78,11 +80,13 @@ def sample(
         numbers = "" if math.isnan(progress.tau) else f", τ {progress.tau:.1f}, ESS {progress.ess:.0f}"
         job.tell(f"{progress.stage}: {100 * progress.share:.0f} %{numbers}")
 
+    name = options.make_sampler().name
+    anew = () if not resume or options.make_sampler().resumes else (
+        f"the chain of {name} is not kept: it started anew, resume was of no use",
+    )  # fmt: skip
     if isinstance(fit, FitResult):
         if resume or model is not None:
-            raise ValueError(
-                "a fit in memory has its model and keeps no checkpoints: leave model and resume out"
-            )
+            raise ValueError("a fit in memory has its model and keeps no chain: leave model and resume out")
         posterior = sample_fit(fit, options, report=tell)
         where = "the fit"
     else:
@@ -91,7 +95,7 @@ def sample(
         posterior = _sampled_run(job, run, options, tell, model, resume)
     return Outcome(
         posterior,
-        warnings=posterior.warnings,
+        warnings=(*anew, *posterior.warnings),
         failure=""
         if posterior.sampled_well
         else f"{where}: the posterior has not converged; calibration.fits keeps its covariance",
@@ -106,7 +110,7 @@ def _sampled_run(
     from walop_jax import Model
     from walop_jax.calibration import PRODUCT, read_calibration
     from walop_jax.io.folder import output_folder
-    from walop_jax.posterior import Checkpoints, digest_of_fit
+    from walop_jax.posterior import Chain, digest_of_fit
     from walop_jax.posterior import sample as sample_fit
 
     folder = run.folder
@@ -122,7 +126,7 @@ def _sampled_run(
         product = read_calibration(folder / PRODUCT, run.catalogue, rebuild=False)
         result = run.fit(text)
         if job.overwrite and not resume:
-            Checkpoints(folder / CHAINS, {}).clear()
+            Chain(folder / CHAINS, {}).path.unlink(missing_ok=True)
         posterior = sample_fit(result, options, folder=folder / CHAINS, resume=resume, report=tell)
         fitted = digest_of_fit(product.inputs, product.fitted.names, product.values)
         posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)

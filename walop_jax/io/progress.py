@@ -1,9 +1,8 @@
 """While compiled code keeps the main thread busy, for many seconds at times: progress is told again, Ctrl-C answered.
 
 Python tells its main thread of a signal between two of its own instructions; compiling a program or decomposing a large
-matrix is one. So a thread of its own hears of the signal as well, by `signal.set_wakeup_fd`, and ends the process where
-the main thread has not by then. Files are written beside their place and moved there when they are whole, and finished
-parts of a large fit are kept: nothing is lost that a fresh start would not make again.
+matrix is one. So a second thread is told as well (`signal.set_wakeup_fd`), and ends the process where the main thread
+has not by then. Files are written beside their place and moved there when they are whole: nothing is half-written.
 """
 
 from __future__ import annotations
@@ -82,22 +81,18 @@ def interrupts_answered(end: Callable[[], int]) -> Iterator[None]:
         return
     hears, told = socket.socketpair()
     told.setblocking(False)
-    over = threading.Event()
 
     def listen() -> None:
-        while not over.is_set():
-            if signal.SIGINT in hears.recv(64) and not over.wait(PATIENCE):
-                os._exit(end())
+        with hears:
+            if signal.SIGINT in hears.recv(64):
+                time.sleep(PATIENCE)
+                if told.fileno() >= 0:  # the block has not ended
+                    os._exit(end())
 
-    thread = threading.Thread(target=listen, daemon=True)
     before = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
-    thread.start()
+    threading.Thread(target=listen, daemon=True).start()
     try:
         yield
     finally:
-        over.set()
         signal.set_wakeup_fd(before)
-        told.send(b"\0")  # any other byte than that of the signal
-        thread.join()
-        hears.close()
         told.close()

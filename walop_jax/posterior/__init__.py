@@ -5,7 +5,7 @@ This room samples and says how far to believe it. It draws no figures, and knows
 
 from walop_jax.posterior.emcee import MOVES, Emcee
 from walop_jax.posterior.files import (
-    Checkpoints,
+    Chain,
     Run,
     digest_of_fit,
     read_draws,

@@ -40,6 +40,7 @@ class Emcee(Sampler):
     name: ClassVar[str] = "emcee"
     software: ClassVar[tuple[str, ...]] = ("emcee",)
     thin: ClassVar[int] = 2
+    resumes: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         mixture(self.moves)
@@ -57,7 +58,7 @@ class Emcee(Sampler):
         value = density.log_density(positions)
         if not np.all(np.isfinite(value)):
             raise ValueError("the posterior is not finite around the fit")
-        return _state(positions, value, random.get_state(legacy=True))
+        return emcee_state(positions, value, random.get_state(legacy=True))
 
     def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
         """Go on for that many steps of all walkers."""
@@ -67,8 +68,7 @@ class Emcee(Sampler):
         sampler = emcee.EnsembleSampler(
             count, dimension, density.log_density, vectorize=True, moves=mixture(self.moves)
         )
-        keys, (place, has_gauss, gauss) = state["random_keys"], state["random_rest"]
-        random = ("MT19937", keys, int(place), int(has_gauss), float(gauss))
+        random = tuple(random_attributes(state).values())
         now = emcee.State(state["positions"], log_prob=state["log_density"], random_state=random)
         positions, value = np.empty((steps, count, dimension)), np.empty((steps, count))
         accepted = np.zeros((steps + 1, count))
@@ -76,18 +76,25 @@ class Emcee(Sampler):
         for i, now in enumerate(run):
             positions[i], value[i] = now.coords, now.log_prob
             accepted[i + 1] = sampler.backend.accepted
-        last = _state(positions[-1].copy(), value[-1].copy(), sampler.random_state)
+        last = emcee_state(positions[-1].copy(), value[-1].copy(), sampler.random_state)
         return last, Stretch(positions, value, np.diff(accepted, axis=0))
 
 
-def _state(positions: Float[np.ndarray, "w k"], value: Float[np.ndarray, " w"], random: Any) -> State:
-    """`random` is the state of a Mersenne twister."""
+def emcee_state(positions: Float[np.ndarray, "w k"], value: Float[np.ndarray, " w"], random: Any) -> State:
+    """The state of an ensemble; `random` is that of a Mersenne twister."""
     return {
         "positions": positions,
         "log_density": value,
         "random_keys": random[1],
         "random_rest": np.array(random[2:], float),
     }
+
+
+def random_attributes(state: State) -> dict[str, Any]:
+    """The random numbers of a state as emcee's back end keeps them."""
+    rest = state["random_rest"]
+    parts = ("MT19937", state["random_keys"], int(rest[0]), int(rest[1]), float(rest[2]))
+    return {f"random_state_{number}": part for number, part in enumerate(parts)}
 
 
 def _laplace_draws(

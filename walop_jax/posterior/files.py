@@ -1,16 +1,11 @@
-"""Files: `posterior.nc`, which is ArviZ InferenceData, the folder of its checkpoints, and the folder of a run.
+"""Files: `posterior.nc`, which is ArviZ InferenceData, the chain of emcee, and the folder of a run.
 
 posterior.nc   draws of every coefficient that varies. Walkers of an ensemble are not independent chains, so a chain
                here is an ensemble: its draws are all walkers at steps spread evenly over the run. R-hat and effective
                sample sizes are those of `result`, kept as attributes.
-Checkpoints    a folder of HDF5 files, one per block of steps, each appearing whole or not at all.
-
-    surrogate.h5       the surrogate, where that is sampled, so that a resumed run samples the very same function
-    block-000001.h5    positions and ln p of all ensembles; the state of the sampler at its end
-
-Every checkpoint carries the fingerprint of data, model, priors, sampler, settings and versions. It is written beside
-its place, flushed and renamed, and never touched again: a kill at any moment loses the block being computed.
-Nothing is ever overwritten by a run with another fingerprint.
+Chain          `sampling/chain.h5`: the chains of emcee so far, as its own back end reads them, so that an interrupted
+               run can go on. With the fingerprint of data, model, priors, sampler, settings and versions. It is written
+               anew after every block of steps: a kill at any moment loses the block being computed.
 """
 
 from __future__ import annotations
@@ -45,16 +40,13 @@ from walop_jax.io.text import read_json, two_digits
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.posterior.emcee import emcee_state, random_attributes
 from walop_jax.posterior.result import PosteriorSample, arviz
 from walop_jax.posterior.samplers import State, Stretch
-from walop_jax.posterior.surrogate import Surrogate
 from walop_jax.posterior.target import INFLATION
 
 DRAWS = 200  # of a posterior, that stand for it in matrices
-FORMAT = 2  # of the checkpoints
-SURROGATE = "surrogate.h5"
-_STATE = "state."
-_ARRAYS = ("positions", "log_density", "acceptance")
+CHAIN = "chain.h5"
 _ADVICE = "sample into another folder, or start anew with --overwrite"
 _AGAIN = "run walop-jax sample again"
 
@@ -97,12 +89,14 @@ def write_posterior(path: str | os.PathLike[str], sample: PosteriorSample) -> No
     _write_hdf5(path, fill)
 
 
-def _write_hdf5(path: str | os.PathLike[str], fill: Callable[[h5py.File], None]) -> None:
+def _write_hdf5(
+    path: str | os.PathLike[str], fill: Callable[[h5py.File], None], overwrite: bool = False
+) -> None:
     """Write an HDF5 file that `fill` fills, in memory first: HDF5 does not survive a disk that is full."""
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
         fill(file)
-    with atomic_path(path) as temporary:
+    with atomic_path(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(buffer.getbuffer())
 
 
@@ -170,109 +164,60 @@ def _draws_of(calibration: Calibration, path: str | os.PathLike[str]) -> Float[n
     return read_draws(path, names, digest_of_fit(calibration.inputs, names, calibration.values))
 
 
-# -------------------------------------------------------------------------------------------- checkpoints
+# -------------------------------------------------------------------------------------------------- the chain
 
 
-class Checkpoints:
-    """The checkpoint folder of one run."""
+class Chain:
+    """The chain of emcee in the folder of a run: `emcee.backends.HDFBackend(path, name="ensemble0")`, … reads it.
+
+    `fingerprint` says what it was sampled from, and with.
+    """
 
     def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, str]) -> None:
-        self.folder = Path(folder)
-        self.fingerprint = dict(fingerprint)
+        self.path, self.fingerprint = Path(folder) / CHAIN, dict(fingerprint)
 
-    def block_path(self, number: int) -> Path:
-        """The file of block `number`, counted from 1."""
-        return self.folder / f"block-{number:06d}.h5"
-
-    def count(self) -> int:
-        """Number of blocks up to the first gap."""
-        number = 0
-        while self.block_path(number + 1).exists():
-            number += 1
-        return number
-
-    def exists(self) -> bool:
-        """True where a run has left a surrogate or a block."""
-        return (self.folder / SURROGATE).exists() or self.count() > 0
-
-    def clear(self) -> None:
-        """Remove the checkpoints of an earlier run.
-
-        The surrogate last, so that what is left is still whole.
-        """
-        blocks = sorted(self.folder.glob("block-*.h5"), reverse=True)
-        unfinished = self.folder.glob(".walop-*.h5")  # what a kill in the middle of writing leaves
-        for path in (*blocks, *unfinished, self.folder / SURROGATE):
-            path.unlink(missing_ok=True)
-
-    # --------------------------------------------------------------------------------------- the surrogate
-
-    def save_surrogate(self, surrogate: Surrogate, extra: Mapping[str, float]) -> None:
-        """Write the surrogate, and numbers about its making."""
-        arrays = {f.name: getattr(surrogate, f.name) for f in dataclasses.fields(surrogate)}
-        names = json.dumps(list(arrays.pop("names")))
-        self._write(self.folder / SURROGATE, arrays, {"names": names, **extra})
-
-    def load_surrogate(self) -> tuple[Surrogate, dict[str, Any]]:
-        """The surrogate as it was saved, and the numbers beside it."""
-        arrays, extra = self._read(self.folder / SURROGATE)
-        names = tuple(json.loads(extra.pop("names")))
-        scalars = {"measured": int(arrays.pop("measured")), "inflate": bool(arrays.pop("inflate"))}
-        return Surrogate(names=names, **scalars, **arrays), extra
-
-    # ------------------------------------------------------------------------------------------- the blocks
-
-    def save_block(
-        self, number: int, states: Sequence[State], stretches: Sequence[Stretch], seconds: float
-    ) -> None:
-        """Write one block of all ensembles, with their states at its end."""
-        arrays = {name: np.stack([getattr(s, name) for s in stretches]) for name in _ARRAYS}
-        arrays |= {f"{_STATE}{name}": np.stack([state[name] for state in states]) for name in states[0]}
-        counts = json.dumps([dict(stretch.counts) for stretch in stretches])
-        self._write(self.block_path(number), arrays, {"seconds": seconds, "counts": counts})
-
-    def load_block(self, number: int) -> tuple[list[State], list[Stretch], float]:
-        """One block of all ensembles, their states at its end, and the seconds that it took."""
-        arrays, extra = self._read(self.block_path(number))
-        counts = json.loads(extra["counts"])
-        stretches = [
-            Stretch(*(arrays[name][i] for name in _ARRAYS), counts=counts[i]) for i in range(len(counts))
-        ]
-        kept = {name.removeprefix(_STATE): a for name, a in arrays.items() if name.startswith(_STATE)}
-        states: list[State] = [{name: array[i] for name, array in kept.items()} for i in range(len(counts))]
-        return states, stretches, float(extra["seconds"])
-
-    def check(self) -> None:
-        """Raise `DataError` if what is here was sampled from, or with, anything else."""
-        surrogate = self.folder / SURROGATE
-        self._read(surrogate if surrogate.exists() else self.block_path(1))
-
-    # -------------------------------------------------------------------------------------------- the files
-
-    def _write(self, path: Path, arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        content = digest(*(np.asarray(arrays[name]) for name in sorted(arrays)))
-        own = {"format": FORMAT, "fingerprint": json.dumps(self.fingerprint), "content": content}
+    def save(self, states: Sequence[State], stretches: Sequence[Stretch], seconds: float) -> None:
+        """Write all ensembles with their states at the end, in the place of what is there."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
 
         def fill(file: h5py.File) -> None:
-            file.attrs.update(own | dict(attributes))
-            for name, value in arrays.items():
-                file.create_dataset(name, data=value)
+            file.attrs.update({"fingerprint": json.dumps(self.fingerprint), "seconds": seconds})
+            for number, (state, stretch) in enumerate(zip(states, stretches, strict=True)):
+                steps, walkers, dimension = stretch.positions.shape
+                group = file.create_group(f"ensemble{number}")
+                group.attrs.update(
+                    {"version": "3", "nwalkers": walkers, "ndim": dimension, "has_blobs": False}
+                )
+                group.attrs.update({"iteration": steps, **random_attributes(state)})
+                group["chain"], group["log_prob"] = stretch.positions, stretch.log_density
+                group["accepted"] = stretch.acceptance.sum(axis=0)
 
-        _write_hdf5(path, fill)
+        _write_hdf5(self.path, fill, overwrite=True)
 
-    def _read(self, path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    def load(self) -> tuple[list[State], list[Stretch], float]:
+        """All ensembles, their states at the end, and the seconds that they took.
+
+        `DataError` for a file that cannot be read, and for one of anything else.
+        """
+        from emcee.backends import HDFBackend
+
         try:
-            with h5py.File(path, "r") as file:
-                attributes: dict[str, Any] = {str(key): value for key, value in file.attrs.items()}
-                arrays = {str(name): np.asarray(file[str(name)]) for name in file}
-        except (OSError, RuntimeError, KeyError) as error:
-            raise fail(f"cannot be read: {error}", file=path, advice=_ADVICE) from error
-        if attributes.pop("format", None) != FORMAT:
-            raise fail("is a checkpoint of another format", file=path, advice=_ADVICE)
-        if attributes.pop("content", None) != digest(*(arrays[name] for name in sorted(arrays))):
-            raise fail("the content is not what was written", file=path, advice=_ADVICE)
-        before: dict[str, str] = json.loads(str(attributes.pop("fingerprint", "{}")))
+            with h5py.File(self.path, "r") as file:
+                before, seconds = (
+                    json.loads(str(file.attrs["fingerprint"])),
+                    float(str(file.attrs["seconds"])),
+                )
+                count = len(file)
+            kept: list[Any] = [
+                HDFBackend(str(self.path), name=f"ensemble{n}", read_only=True) for n in range(count)
+            ]
+            stretches = [Stretch(k.get_chain(), k.get_log_prob(), _shares(k)) for k in kept]
+            states = [
+                emcee_state(s.positions[-1], s.log_density[-1], k.random_state)
+                for s, k in zip(stretches, kept, strict=True)
+            ]
+        except Exception as error:  # whatever a damaged file brings about
+            raise fail(f"cannot be read: {error}", file=self.path, advice=_ADVICE) from error
         keys = sorted({*before, *self.fingerprint})
         changed = [key for key in keys if before.get(key) != self.fingerprint.get(key)]
         if changed:
@@ -280,8 +225,13 @@ class Checkpoints:
                 f"{k} ({before.get(k, 'none')[:12]} → {self.fingerprint.get(k, 'none')[:12]})"
                 for k in changed
             )
-            raise fail(f"was sampled with other {what}", file=path, advice=_ADVICE)
-        return arrays, attributes
+            raise fail(f"was sampled with other {what}", file=self.path, advice=_ADVICE)
+        return states, stretches, seconds
+
+
+def _shares(kept: Any) -> Float[np.ndarray, "n w"]:
+    """Shares of proposals accepted: of a chain that was kept, the mean of each walker."""
+    return np.repeat(kept.accepted[None] / kept.iteration, kept.iteration, axis=0)
 
 
 DIAGNOSIS, COMPARISON, EPOCH, LIMITS = "diagnosis.json", "comparison.json", "epoch.json", "limits.json"

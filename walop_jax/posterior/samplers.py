@@ -1,7 +1,7 @@
 """The interface of a sampler, the density that it samples, and the samplers by name.
 
 A sampler is a class with a name and two methods. Independent ensembles of it (of one walker or of many) are started and
-taken further, stretch by stretch, by `Ensembles`, which also keeps checkpoints and judges convergence. A sampler of
+taken further, stretch by stretch, by `Ensembles`, which also judges convergence. A sampler of
 one's own is one file, given by its place (`my_sampler.py:MySampler`) or in Python (`Options(sampler=MySampler())`).
 """
 
@@ -33,7 +33,7 @@ Positions = Float[np.ndarray, "n k"]
 Batch = Callable[[Positions], Float[np.ndarray, " n"]]
 
 State = Mapping[str, np.ndarray]
-"""All there is to an ensemble between two steps, as named arrays: what a checkpoint keeps."""
+"""All there is to an ensemble between two steps, as named arrays."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +94,8 @@ class Sampler(abc.ABC):
 
     Without `exact` it is given the surrogate, in which throughput coefficients and catalogue values are marginalised;
     with it the exact posterior of all free parameters. `software` are the packages whose versions its draws depend on;
-    of its steps every `thin`-th is stored, unless something else is asked for.
+    of its steps every `thin`-th is stored, unless something else is asked for. The chains of emcee are kept, so that an
+    interrupted run `resumes`; those of others start anew.
 
     The same state and number of steps must always give the same stretch, whatever has been computed before: random
     numbers come from the state.
@@ -104,6 +105,7 @@ class Sampler(abc.ABC):
     exact: ClassVar[bool] = False
     software: ClassVar[tuple[str, ...]] = ()
     thin: ClassVar[int] = 1
+    resumes: ClassVar[bool] = False
 
     @abc.abstractmethod
     def start(self, density: Density, seed: Sequence[int]) -> State:

@@ -1,4 +1,4 @@
-"""`sample`: from a fit to a posterior, by independent ensembles of one sampler, with checkpoints and a verdict."""
+"""`sample`: from a fit to a posterior, by independent ensembles of one sampler, with a verdict."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import inspect
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -20,7 +19,7 @@ from walop_jax.fit.verdict import STATED
 from walop_jax.io.code import versions_of
 from walop_jax.io.errors import fail
 from walop_jax.model.specification import Model
-from walop_jax.posterior.files import Checkpoints, digest, digest_of_fit
+from walop_jax.posterior.files import Chain, digest, digest_of_fit
 from walop_jax.posterior.result import (
     BURN_IN,
     Chains,
@@ -45,34 +44,40 @@ class Ensembles:
     """The ensembles of a run and what they have stored so far: every `thin`-th step of blocks of `interval` steps."""
 
     def __init__(
-        self, sampler: Sampler, density: Density, options: Options, checkpoints: Checkpoints | None = None
+        self, sampler: Sampler, density: Density, options: Options, chain: Chain | None = None
     ) -> None:
-        """Takes up what is in `checkpoints`, or starts."""
+        """Takes up what is in `chain`, or starts."""
         self.sampler, self.density = sampler, density
-        self.options, self.checkpoints = options, checkpoints
+        self.options, self.chain = options, chain
         self.thin = options.thin or sampler.thin
         self.blocks: list[list[Stretch]] = []
-        self.seconds = 0.0
-        for number in range(1, 1 + (0 if checkpoints is None else checkpoints.count())):
-            assert checkpoints is not None
-            self.states, blocks, seconds = checkpoints.load_block(number)
-            self.blocks.append(blocks)
-            self.seconds += seconds
-        if not self.blocks:
+        if chain is not None and chain.path.exists():
+            self.states, stretches, self.seconds = chain.load()
+            self.blocks.append(stretches)
+        else:
             began = time.perf_counter()
             seeds = [(options.seed, number) for number in range(options.ensembles)]
-            self.states: list[State] = [_arrays(sampler.start(density, seed)) for seed in seeds]
+            self.states: list[State] = [dict(sampler.start(density, seed)) for seed in seeds]
             self.seconds = time.perf_counter() - began
 
     @property
     def steps(self) -> int:
         """Number of steps done, burn-in included."""
-        return len(self.blocks) * self.options.interval
+        return self.thin * sum(len(block[0].positions) for block in self.blocks)
 
     @property
     def acceptance(self) -> float:
         """Share of proposals accepted in the steps that are stored."""
-        return float(np.mean([stretch.acceptance for block in self.blocks for stretch in block]))
+        return float(np.mean([stretch.acceptance for stretch in self.stretches]))
+
+    @property
+    def stretches(self) -> list[Stretch]:
+        """All stored steps, of every ensemble."""
+        whole = []
+        for one in zip(*self.blocks, strict=True):
+            positions, values, shares = (np.concatenate([s[part] for s in one]) for part in range(3))
+            whole.append(Stretch(positions, values, shares))
+        return whole
 
     @property
     def counts(self) -> dict[str, int]:
@@ -89,13 +94,13 @@ class Ensembles:
         states, stretches = [], []
         for state in self.states:
             state, stretch = self.sampler.advance(self.density, state, options.interval)
-            states.append(_arrays(state))
+            states.append(dict(state))
             stretches.append(self._stored(stretch))
         seconds = time.perf_counter() - began
         self.states, self.seconds = states, self.seconds + seconds
         self.blocks.append(stretches)
-        if self.checkpoints is not None:
-            self.checkpoints.save_block(len(self.blocks), states, stretches, seconds)
+        if self.chain is not None:
+            self.chain.save(self.states, self.stretches, self.seconds)
 
     def _stored(self, stretch: Stretch) -> Stretch:
         n, k = self.options.interval, self.density.dimension
@@ -112,8 +117,7 @@ class Ensembles:
 
     def kept(self) -> tuple[Chains, Float[np.ndarray, "e t w"]]:
         """Stored positions and ln p after burn-in."""
-        z = np.concatenate([np.stack([s.positions for s in block]) for block in self.blocks], axis=1)
-        lnp = np.concatenate([np.stack([s.log_density for s in block]) for block in self.blocks], axis=1)
+        z, lnp, _ = (np.stack(parts) for parts in zip(*(s[:3] for s in self.stretches), strict=True))
         first = int(BURN_IN * z.shape[1])
         return z[:, first:], lnp[:, first:]
 
@@ -135,11 +139,6 @@ class Ensembles:
                 done = min(self.steps / max(goal, 1), 1.0)
                 report(Progress("sampling", done, *numbers_of(verdict)))
             self.go_on()
-
-
-def _arrays(state: Mapping[str, Any]) -> State:
-    """A state as it comes back from a checkpoint."""
-    return {name: np.asarray(value) for name, value in state.items()}
 
 
 def numbers_of(verdict: Convergence | None) -> tuple[float, float]:
@@ -196,9 +195,9 @@ def sample(
 ) -> PosteriorSample:
     """Sample the posterior around a fit until it has converged or `maximum_steps` are done.
 
-    With `folder`, checkpoints are kept there; `resume` goes on from them, bit for bit as if there had been no
-    interruption. Raises `DataError` for a folder that holds a run already while `resume` is False, or one of
-    other data, model, priors, sampler, settings or versions; ValueError where there is nothing to sample;
+    With `folder`, the chain of emcee is kept there; `resume` goes on from it as if there had been no interruption
+    (other samplers start anew). Raises `DataError` for a folder that holds a run already while `resume` is False, or
+    one of other data, model, priors, sampler, settings or versions; ValueError where there is nothing to sample;
     RuntimeError for a fit that nobody has examined.
 
     Around a fit whose errors come from its residuals (`errors_from`), chains are those of the stated errors, and draws
@@ -215,33 +214,27 @@ def sample(
             found, result.model, stated.covariance, result.covariance, result.errors_from
         )
     sampler, target = options.make_sampler(), Target(result)
-    checkpoints = None
-    if folder is not None:
-        checkpoints = Checkpoints(folder, fingerprint(target, options))
-        if checkpoints.exists() and not resume:
+    marks = {} if folder is None else fingerprint(target, options)
+    chain = Chain(folder, marks) if folder is not None and sampler.resumes else None
+    if chain is not None and chain.path.exists():
+        if not resume:
             raise fail("holds a chain already", file=folder, advice="go on with --resume, or --overwrite it")
-        if checkpoints.exists():
-            checkpoints.check()
+        chain.load()  # what is not of this fit is refused before the work
     if sampler.exact:
         posterior = ExactPosterior(target, choose_sampled(target, options.parameters), options.inflate)
         seconds = 0.0
     else:
-        posterior, seconds = _surrogate(target, options, checkpoints, report)
+        posterior, seconds = _surrogate(target, options, report)
     report(Progress("starting", 0.0))
-    ensembles = Ensembles(sampler, posterior.density(), options, checkpoints)
+    ensembles = Ensembles(sampler, posterior.density(), options, chain)
     verdict = ensembles.until_converged(posterior.monitored_names, posterior.monitored, report)
     report(Progress("comparing with the exact posterior", 1.0, *numbers_of(verdict)))
     finished = _finish(target, posterior, ensembles, verdict, seconds)
     fit = digest_of_fit(result.calset.inputs, result.model.names, result.values)
-    return dataclasses.replace(finished, of_trusted_fit=trusted, fit=fit)
+    return dataclasses.replace(finished, of_trusted_fit=trusted, fit=fit, fingerprint=marks)
 
 
-def _surrogate(
-    target: Target, options: Options, checkpoints: Checkpoints | None, report: Report
-) -> tuple[Surrogate, float]:
-    if checkpoints is not None and checkpoints.exists():
-        surrogate, extra = checkpoints.load_surrogate()
-        return surrogate, float(extra["seconds"])
+def _surrogate(target: Target, options: Options, report: Report) -> tuple[Surrogate, float]:
     began = time.perf_counter()
     surrogate = build_surrogate(
         target,
@@ -251,10 +244,7 @@ def _surrogate(
         seed=options.seed,
         progress=lambda done, total: report(Progress("tabulating the model", done / total)),
     )
-    seconds = time.perf_counter() - began
-    if checkpoints is not None:
-        checkpoints.save_surrogate(surrogate, {"seconds": seconds})
-    return surrogate, seconds
+    return surrogate, time.perf_counter() - began
 
 
 def _evenly(count: int, wanted: int) -> Int[np.ndarray, " m"]:
@@ -282,7 +272,6 @@ def _finish(
     mean, spread = posterior.moments(z.reshape(-1, d)[:: max(1, e * n * w // 50_000)])
     select = target.model.selection()
     shown = len(posterior.sampled) + int(posterior.inflate)
-    checkpoints = ensembles.checkpoints
     return PosteriorSample(
         sampler=ensembles.sampler.name,
         names=target.model.names,
@@ -300,7 +289,7 @@ def _finish(
         acceptance=ensembles.acceptance,
         counts=ensembles.counts,
         seconds=seconds + ensembles.seconds,
-        fingerprint={} if checkpoints is None else dict(checkpoints.fingerprint),
+        fingerprint={},
         likelihood=target.likelihood,
         noise_scale=target.noise_scale,
     )
