@@ -18,7 +18,7 @@ from jaxtyping import Float
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.columns import SLOTS, Change, Columns, Laid, ResponseBlock, generator
 from walop_jax.likelihood.pieces import Piece
-from walop_jax.model.effects.factors import FIELD, factor
+from walop_jax.model.effects.factors import FIELD, Units, factor
 
 
 def added_to_starlight(
@@ -51,12 +51,12 @@ def _at_points(
                 change = vectors * np.asarray(piece.at)[:, None]
             else:
                 continue
-            size = _for_stars(piece.factors, at, exposure) * piece.size
+            size = _for_stars(piece.factors, at, exposure, block.of.patched.units) * piece.size
             added[..., a] += size[:, None, None] * change[..., :3]
     return vectors[..., :3], added
 
 
-def _for_stars(factors: Sequence[Any], at: Laid, exposure: int) -> Float[np.ndarray, " p"]:
+def _for_stars(factors: Sequence[Any], at: Laid, exposure: int, units: Units) -> Float[np.ndarray, " p"]:
     """Product of factors for stars in the setting of an exposure: at its time, temperature and angles nothing grows."""
     points, product = len(at.x), np.ones(len(at.x))
     for one in factors:
@@ -64,7 +64,7 @@ def _for_stars(factors: Sequence[Any], at: Laid, exposure: int) -> Float[np.ndar
             shape = (points, len(at.likelihood.flux_known))
             product = product * np.broadcast_to(one(at), shape)[:, exposure]
         elif (known := factor(one)).depends_on == FIELD:
-            product = product * np.broadcast_to(known.value(at), (points, 1))[:, 0]
+            product = product * np.broadcast_to(known.value(at, units), (points, 1))[:, 0]
         else:
             return np.zeros(points)
     return product

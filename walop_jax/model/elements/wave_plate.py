@@ -27,6 +27,7 @@ from walop_jax.io.errors import nearest
 from walop_jax.model import materials, mueller, plates
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
+from walop_jax.model.materials import REFERENCE_TEMPERATURE
 from walop_jax.model.parameters import Component, Parameter, number
 from walop_jax.model.ray import Conditions, Ray, Real
 
@@ -157,7 +158,7 @@ class WavePlate(Element):
                 extraordinary = ordinary + (extraordinary - ordinary) * factor
             thermal = _number(self, "thermal", ray)
             if thermal is not None:
-                warmer = thermal * (ray.conditions.temperature - materials.REFERENCE_TEMPERATURE)
+                warmer = thermal * (ray.conditions.temperature - REFERENCE_TEMPERATURE)
                 extraordinary = ordinary + (extraordinary - ordinary) * (1.0 - crystal.thermal * warmer)
             axis = jnp.deg2rad(_number(self, "axis", ray) + _number(layer, "axis", ray))
             cut = _number(layer, "cut", ray)
@@ -174,7 +175,7 @@ class WavePlate(Element):
         incidence: ArrayLike,
         azimuth: ArrayLike,
         wavelength: ArrayLike,
-        temperature: float = materials.REFERENCE_TEMPERATURE,
+        temperature: float = REFERENCE_TEMPERATURE,
     ) -> Real:
         """Retardance (deg, not modulo 360) for rays in air at an angle `incidence` (deg) to the normal, differentiable.
 
