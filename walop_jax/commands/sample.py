@@ -132,7 +132,8 @@ def _sampled_run(
         posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)
         with out.filled(((PRODUCT,) if posterior.trusted else ()) + OUTPUTS) as temporary:
             for name, write in _writers(product, posterior).items():
-                write(temporary / name)
+                if write is not None:
+                    write(temporary / name)
     return posterior
 
 
