@@ -81,8 +81,8 @@ def simulate(
 
     In Python: the set and the true instrument. `effect` may be a dict, {"hwp1_axis": 0.3}, or `Effect` objects; with a
     plan, an `Instrument` as `instrument` is the true one, not drawn. `noiseless`: expected counts, with the errors that
-    they would have. The same plan, seed and effects give the same set, bit for bit. `catalogue_seed` draws the standards
-    apart from the rest: nights of one survey have theirs in common.
+    they would have. The same plan, seed and effects give the same set, bit for bit. `catalogue_seed` draws the
+    standards apart from the rest: nights of one survey have theirs in common.
 
     >>> calset, truth = walop.simulate(grid=4, effects={"hwp1_axis": 0.3}, seed=1)  # doctest: +SKIP
     """
