@@ -54,15 +54,15 @@ def student_density(steps, forward, centre, root, degrees=4.0):
     return jnp.sum(log_t) + forward.log_prior(values)
 
 
-def least_squares(forward, centre, root):
+def least_squares(forward, start, scale):
     """The minimum by Levenberg-Marquardt of optimistix; values of the free parameters, and the number of steps."""
 
     def rows(steps, forward):
-        return forward_rows(centre + root @ steps, forward)
+        return forward_rows(start + scale * steps, forward)
 
     solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-    solution = optimistix.least_squares(rows, solver, jnp.zeros(len(centre)), args=forward)
-    return centre + root @ solution.value, int(solution.stats["num_steps"])
+    solution = optimistix.least_squares(rows, solver, jnp.zeros(len(start)), args=forward)
+    return start + scale * solution.value, int(solution.stats["num_steps"])
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
@@ -74,7 +74,7 @@ def maximised(log_density, solver, steps, forward, centre, root):
 
     def step(state, _):
         at, memory = state
-        value, gradient = optax.value_and_grad_from_state(loss)(at, state=memory)
+        value, gradient = jax.value_and_grad(loss)(at)
         update, memory = solver.update(gradient, memory, at, value=value, grad=gradient, value_fn=loss)
         return (optax.apply_updates(at, update), memory), -value
 
@@ -83,8 +83,8 @@ def maximised(log_density, solver, steps, forward, centre, root):
     return centre + root @ at, history
 
 
-def nuts(forward, centre, root, draws, seed=0, step_size=0.35):
-    """Draws of the free parameters by the NUTS of blackjax, and how often steps were accepted."""
+def nuts(forward, centre, root, draws, seed=0, step_size=0.5):
+    """Draws of the free parameters by the NUTS of blackjax, acceptance, and leaps of a draw."""
 
     @jax.jit
     def run(forward, key):
