@@ -24,6 +24,13 @@ def m32_of_plate(thickness, x, y, wavelength, instrument):
     return m32(instrument.changed("half2.plate.mgf2", thickness=thickness), x, y, wavelength)
 
 
+def retardance(quartz, mgf2, instrument, wavelength):
+    """Retardance (deg) of the plate of the second half at normal incidence, for two thicknesses (µm)."""
+    built = instrument.changed("half2.plate.quartz", thickness=quartz)
+    built = built.changed("half2.plate.mgf2", thickness=mgf2)
+    return built.element("half2.plate").retardance(0.0, 0.0, wavelength)
+
+
 def m32_of_values(values, x, y, wavelength, forward):
     """The same for the vector of all parameters."""
     return m32(forward.instrument(values), x, y, wavelength)

@@ -72,7 +72,7 @@ def test_it_runs(title: str, first, request: pytest.FixtureRequest):
     name = OPTIONAL.get(title)
     if name and importlib.util.find_spec(name) is None:
         pytest.skip(f"{name} is not installed")
-    needs_units = re.search(r"\broot\b", SCRIPTS[title]) and title != UNITS
+    needs_units = title != UNITS and re.search(r"\broot\b|\brows\(|\bdensity\(", SCRIPTS[title])
     names = dict(request.getfixturevalue("in_units") if needs_units else first)
     exec(compile(SCRIPTS[title], title, "exec"), names)
     checks(title, names)
@@ -85,6 +85,10 @@ def checks(title: str, names: dict[str, Any]) -> None:
 
     result = small_fit()
     free, sigma = result.model.free, np.sqrt(np.diag(result.covariance))
+    if title == "Gradient and Jacobian":
+        i, h = names["model"].index("half2.plate.mgf2"), names["h"]
+        slope = float(names["up"] - names["down"]) / (2.0 * h)
+        assert float(names["gradient"][i]) == pytest.approx(slope, rel=1e-6)
     if title == "A fit by optimistix":
         assert np.abs((np.asarray(names["values"]) - result.values)[free] / sigma[free]).max() < 1e-3
     if title == "A fit by optax":
