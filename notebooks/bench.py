@@ -10,21 +10,15 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+import walop_jax as walop
+from walop_jax import Calibration, FitResult, Instrument, Likelihood, ObservingPlan, Settings
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.calibration.calibration import Calibration
-from walop_jax.data.settings import Settings
-from walop_jax.fit.model_file import base_model
-from walop_jax.fit.refit import refit
-from walop_jax.model.instrument import Instrument, adapted
 from walop_jax.paper.polynomial import fit_paper, measured_qu, sample_stars, transmitted, with_test_stars
 from walop_jax.science.star_errors import joint_errors, star_errors
-from walop_jax.simulation.observing_plan import ObservingPlan
-from walop_jax.simulation.simulate import simulate, truth_values
 
 TILTS = (12.0, 14.0, 16.0, 18.0, 20.0)
 PAPER_CROSS_TALK = (0.16, 0.27, 0.43, 0.62, 0.81)
@@ -58,13 +52,13 @@ def bench_table(seed: int = 0, electrons: float = 1e6) -> list[BenchRow]:
     """
     plan = dataclasses.replace(ObservingPlan.bench(11), electrons=electrons)  # 0, 2, … 20 deg
     truth = _as_built(np.random.default_rng([seed, 1]))
-    run = simulate(plan, seed=seed, instrument=truth)
-    model = base_model(run.calset, throughput_degree=0)
+    run = walop.simulate(plan, seed=seed, instrument=truth)
+    model = walop.base_model(run.calset, throughput_degree=0)
     for p in model.parameters:
         if p.part in _ABSENT:
             model = model.change(p.name, free=False)
-    fitted = Calibration.from_fit(refit(run.calset, model).judged())
-    true = dataclasses.replace(fitted, values=np.array([truth_values(run.truth)[n] for n in model.names]))
+    fitted = Calibration.from_fit(FitResult.of(Likelihood.of(run.calset, model)).judged())
+    true = dataclasses.replace(fitted, values=np.array([run.values[n] for n in model.names]))
     made, stars = fit_paper(run.calset), sample_stars(seed=seed)
     at = [int(np.flatnonzero(np.isclose(made.x, tilt))[0]) for tilt in TILTS]
     x, y = made.x[at], made.y[at]
@@ -84,12 +78,13 @@ def _as_built(rng: np.random.Generator) -> Instrument:
 
     (A plate of zero order that is off by 1 µm has 7° of retardance too much.)
     """
-    nominal = adapted(ObservingPlan.bench().design, throughput_degree=0)
+    nominal = ObservingPlan.bench().design
     throughput = 0.5 + 0.03 * rng.standard_normal((4, 1))
     for arm in nominal.arms:
         off = 0.1 * rng.standard_normal()
         nominal = nominal.changed(f"{arm.name}.plate.mgf2", thickness=lambda d, off=off: d + off)
-    return eqx.tree_at(lambda i: i.throughput.coefficients, nominal, jnp.asarray(throughput))
+    series = dataclasses.replace(nominal.throughput, degree=0, coefficients=jnp.asarray(throughput))
+    return dataclasses.replace(nominal, throughput=series)
 
 
 def _vectors(

@@ -10,7 +10,7 @@ from astropy.table import Table
 from scipy.optimize import least_squares
 from tables import bench_set
 
-from walop_jax.data.records import CalibrationSet, FilterCurve
+from walop_jax import CalibrationSet, FilterCurve
 
 RESOLUTION = 19.0  # λ/FWHM of the low-resolution mode: wider than the step between bins
 

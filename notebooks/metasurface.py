@@ -8,7 +8,7 @@ import numpy as np
 from astropy.table import Table
 from tables import bench_set
 
-from walop_jax.data.records import CalibrationSet, FilterCurve
+from walop_jax import CalibrationSet, FilterCurve
 
 SCALE = 1e6  # counts of one volt, and of one milliwatt
 LASER = FilterCurve("532nm", np.array([0.532]), np.ones(1))

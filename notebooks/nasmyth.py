@@ -11,7 +11,7 @@ import numpy as np
 from astropy.table import Table
 from tables import bench_set
 
-from walop_jax.data.records import CalibrationSet, FilterCurve
+from walop_jax import CalibrationSet, FilterCurve
 
 SCALE = 1e6  # counts of an arm: nothing depends on it
 

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import CalibrationSet, Exposures, FilterCurve, Points, Position, Site, Sources
-from walop_jax.data.table_intensities import TableIntensities
+import walop_jax as walop
+from walop_jax import CalibrationSet, FilterCurve
 from walop_jax.model.effects.described import Described
-from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.model.specification import effect_context
 
 
 def bench_set(
@@ -27,48 +27,22 @@ def bench_set(
     mjd: Float[np.ndarray, " e"] | float = 60000.0,
 ) -> CalibrationSet:
     """A set of exposures of one KIND; `of_filter` numbers their filters, angles are in deg, NaN: out of the beam."""
-    n = len(counts)
-    no, always = np.full(n, np.nan), np.ones(n, bool)
-    exposures = Exposures(
-        exposure=np.arange(n),
-        kind=np.full(n, kind),
-        mjd=np.broadcast_to(np.asarray(mjd, float), n).copy(),
-        exptime=np.ones(n),
-        filter=np.array([curve.name for curve in filters])[of_filter],
-        clp_in=always if polariser is not None else ~always,
-        clp_angle=no if polariser is None else np.asarray(polariser, float),
-        chwp_in=~always,
-        chwp_angle=no,
-        temp=no,
-        ha=no,
-        ra=no,
-        dec=no,
-        rotator=no,
-        teff=no,
-        moving={
-            prefix: Position(np.isfinite(angle), np.asarray(angle, float)) for prefix, angle in moving.items()
-        },
-    )
-    points, none = Points(np.array([0]), np.zeros(1), np.zeros(1)), np.zeros(0)
-    return CalibrationSet(
+    names = np.array([curve.name for curve in filters])
+    return walop.from_arrays(
+        np.asarray(counts, float)[None],
+        np.asarray(sigma, float)[None],
+        [0.0],
+        [0.0],
+        np.full(len(counts), np.nan) if polariser is None else polariser,
+        kind,
         instrument=instrument,
-        site=Site("", np.nan, np.nan, np.nan),
         origin=origin,
-        exposures=exposures,
-        points=points,
-        sources=Sources(np.zeros(0, int), np.zeros(0, str), none, none, none, none, none),
         filters={curve.name: curve for curve in filters},
-        intensities=TableIntensities(
-            n,
-            points,
-            exposure=np.arange(n),
-            point=np.zeros(n, int),
-            source=np.full(n, -1),
-            counts=np.asarray(counts, float),
-            sigma=np.asarray(sigma, float),
-            flag=np.zeros(n, int),
-            used=always,
-        ),
+        filter=names[of_filter],
+        mjd=mjd,
+        exptime=1.0,
+        **{f"{prefix}_in".lower(): np.isfinite(angle) for prefix, angle in moving.items()},
+        **{f"{prefix}_angle".lower(): angle for prefix, angle in moving.items()},
     )
 
 
@@ -82,7 +56,7 @@ def left_over(result, values=None):
 def saying(model, calset, sentences):
     """The model with what sentences say of it, for a fit to find the amplitudes of, without their priors."""
     said = Described.of(effect_context(model.template, calset.exposures), sentences=tuple(sentences))
-    made = with_effects(model, [said], effect_context(model.template, calset.exposures))
+    made = walop.with_effects(model, [said], effect_context(model.template, calset.exposures))
     for name in made.names:
         if name not in model.names:
             made = made.change(name, prior=None, loose=1.0)

@@ -8,7 +8,7 @@ import numpy as np
 from astropy.table import Table
 from tables import bench_set
 
-from walop_jax.data.records import CalibrationSet, FilterCurve
+from walop_jax import CalibrationSet, FilterCurve
 
 SCALE = 1e6  # counts of the mean of a bin: nothing depends on it
 HOURS = 1.0 / 60.0  # from one state to the next; not said in the table

@@ -10,12 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import walop_jax as walop
-from walop_jax.data import read_calibration_set
-from walop_jax.data.records import CalibrationSet
-from walop_jax.data.settings import Settings
-from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.diagnosis.trust import examined
-from walop_jax.fit.refit import FitResult
+from walop_jax import CalibrationSet, FitResult, Settings
 
 REPOSITORY = "https://github.com/HeisenbergK/NewWALOPCalibrate2Dens"
 ELEMENTS = ("m22", "m23", "m32", "m33")
@@ -52,7 +47,7 @@ def design_set(folder: str | Path = "walop_north_design") -> CalibrationSet:
     """
     named = os.environ.get("NORTH_DESIGN")
     if named:
-        return read_calibration_set(named)
+        return walop.read(named)
     folder = Path(folder)
     made = folder / "walop_north_design.fits"
     if not made.exists():
@@ -63,7 +58,7 @@ def design_set(folder: str | Path = "walop_north_design") -> CalibrationSet:
             path.parent for path in sorted(source.rglob("Config_1")) if path.parent.name != "Unpol"
         )
         walop.import_zemax(exports, output=made, instrument="WALOP-NORTH")
-    return read_calibration_set(made)
+    return walop.read(made)
 
 
 def cube(calset: CalibrationSet) -> np.ndarray:
@@ -112,7 +107,7 @@ def measured_matrix(calset: CalibrationSet) -> tuple[np.ndarray, np.ndarray]:
 
 def calibration_of(result: FitResult) -> walop.Calibration:
     """The calibration of a fit, whatever it leaves: that is what the notebook is about."""
-    return walop.Calibration.from_fit(examined(result, as_written=True))
+    return walop.Calibration.from_fit(result.judged())
 
 
 def predicted_matrix(calibration, x, y, wavelengths):
@@ -141,7 +136,6 @@ def part(
 ) -> CalibrationSet:
     """The set without the points where `points` is False, or without a wavelength (um)."""
     rows = calset.intensities
-    assert isinstance(rows, TableIntensities)
     used = np.ones(len(rows.point), bool)
     if points is not None:
         used &= points[rows.point]

@@ -31,6 +31,7 @@ TOPICS = (
     "adding-an-instrument",
     "coming-from",
     "conventions",
+    "differentiate",
     "effects",
     "files",
     "large-sets",

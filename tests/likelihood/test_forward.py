@@ -9,6 +9,7 @@ import builders
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 import pytest
 from oracle import forward as oracle
 from small_run import SEED, SMALL, small_fit
@@ -90,6 +91,26 @@ def test_a_fit_minimises_the_density(scene: Forward):
         away = at.at[result.model.free].add(root @ step)
         # Half of the squared distance in standard errors, up to what is not linear.
         assert float(density(at) - density(away)) == pytest.approx(0.125, rel=0.05)
+
+
+def test_another_solver_ends_where_a_fit_ends(scene: Forward):
+    """Levenberg-Marquardt of optimistix on residuals and prior rows, from the start, to 1e-3 standard errors."""
+    result = small_fit()
+    scale = jnp.array([p.scale for p in result.model.parameters])[scene.free]
+    index, mean, width = scene.prior
+
+    def rows(steps: Any, scene: Any) -> Any:
+        values = scene.full(scene.start[scene.free] + scale * steps)
+        return jnp.concatenate([scene.residuals(values), (values[index] - mean) / width])
+
+    solver = optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
+    solution = optimistix.least_squares(rows, solver, jnp.zeros(scale.size), args=scene, max_steps=64)
+    values = scene.full(scene.start[scene.free] + scale * solution.value)
+    free = result.model.free
+    away = (np.asarray(values) - result.values)[free] / np.sqrt(np.diag(result.covariance))[free]
+    assert np.abs(away).max() < 1e-3
+    started = (np.asarray(scene.start) - result.values)[free] / np.sqrt(np.diag(result.covariance))[free]
+    assert np.abs(started).max() > 1.0  # it had some way to go
 
 
 def test_gradients_of_the_instrument_come_back_as_one(scene: Forward):

@@ -73,6 +73,7 @@ def simulate(
     narrow_bands: Annotated[bool, Option("Polariser in two narrow bands as well.")] = False,
     truth: Annotated[PathLike | None, Option("Write the true parameters here.", "FILE.json", Path)] = None,
     noiseless: bool = False,
+    catalogue_seed: int | None = None,
 ) -> Outcome[Simulated]:
     """Make a calibration set of an instrument whose as-built values are drawn from their priors.
 
@@ -80,7 +81,8 @@ def simulate(
 
     In Python: the set and the true instrument. `effect` may be a dict, {"hwp1_axis": 0.3}, or `Effect` objects; with a
     plan, an `Instrument` as `instrument` is the true one, not drawn. `noiseless`: expected counts, with the errors that
-    they would have. The same plan, seed and effects give the same set, bit for bit.
+    they would have. The same plan, seed and effects give the same set, bit for bit. `catalogue_seed` draws the
+    standards apart from the rest: nights of one survey have theirs in common.
 
     >>> calset, truth = walop.simulate(grid=4, effects={"hwp1_axis": 0.3}, seed=1)  # doctest: +SKIP
     """
@@ -122,7 +124,14 @@ def simulate(
     if truth is not None:
         check_output(truth, overwrite=job.overwrite)
     job.tell("following the light", "following")
-    made = simulated(plan, job.seed, instrument=true, effects=hidden, noiseless=noiseless)
+    made = simulated(
+        plan,
+        job.seed,
+        instrument=true,
+        effects=hidden,
+        noiseless=noiseless,
+        catalogue_seed=catalogue_seed,
+    )
     job.begin("writing")
     with contextlib.ExitStack() as stack:
         if truth is not None:

@@ -72,6 +72,14 @@ class FitResult(Fitted):
     hidden: Hidden | None = None
     answer: Callable[[], Any] | None = None
 
+    @classmethod
+    def of(cls, likelihood: Likelihood, *, noise_scale: float | None = None) -> FitResult:
+        """The fit of a likelihood, as `fit` makes it: its residuals are not examined, its errors are as stated.
+
+        For fits that are compared: a `noise_scale` that is given multiplies the errors of the data.
+        """
+        return fit(likelihood, noise_scale=noise_scale)
+
     @property
     def model(self) -> Model:
         """The model that was fitted."""

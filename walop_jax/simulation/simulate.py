@@ -49,6 +49,11 @@ class Simulated(NamedTuple):
     calset: CalibrationSet
     truth: Instrument
 
+    @property
+    def values(self) -> dict[str, float]:
+        """The true value of every parameter by name; the names are those of a fit."""
+        return truth_values(self.truth)
+
     def __repr__(self) -> str:
         return f"{self.calset!r}\ntruth: {self.truth!r}"
 
