@@ -149,10 +149,10 @@ def home(call: Call, tmp_path_factory) -> Path:
 
 
 def _stars(run: Path) -> Table:
-    """Stars of two nights with the counts that a calibration expects of them."""
+    """Stars of two nights, with photon noise about the counts that a calibration expects of them."""
     places = [(-0.2, 0.1), (-0.1, -0.2), (0.05, 0.15), (0.2, 0.2), (0.15, -0.1)]
     at = [walop.trace(run, x=x, y=y, q=0.01, u=-0.004)[-1].value.ravel() for x, y in places]
-    counts = 1e6 * np.array(at * 2)
+    counts = np.random.default_rng(6).poisson(1e6 * np.array(at * 2)).astype(float)
     x, y = np.array(places * 2).T
     mjd = np.repeat([61220.8, 61221.0], len(places))
     return Table({"X": x, "Y": y, "N": counts, "N_ERR": np.sqrt(counts), "MJD": mjd})

@@ -21,6 +21,7 @@ import walop_jax as walop
 from walop_jax.calibration import write_calibration
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
+from walop_jax.io.errors import DataError
 
 from .conftest import FittedSet
 
@@ -91,9 +92,12 @@ def test_beyond_the_field_there_is_nothing(calibration):
     assert np.isfinite(m[0]).all()
     assert np.isnan(m[1]).all()
     assert np.isnan(c[1]).all()
-    table = walop.matrix(calibration, 0.5, 0.2)
-    assert np.isnan(table["M21"][0])
-    assert table["FLAG"][0] & 32
+    table = walop.matrix(calibration, [0.1, 0.5], 0.2)
+    assert np.isfinite(table["M21"][0])
+    assert np.isnan(table["M21"][1])
+    assert table["FLAG"][1] & 32
+    with pytest.raises(DataError, match="beyond the field"):
+        walop.matrix(calibration, 0.5, 0.2)
 
 
 def test_matrix_is_the_table_of_the_command(call, fitted, tmp_path):

@@ -227,7 +227,7 @@ ELSEWHERE = {
     "34": "diagnosis/test_trust.py::test_a_mistake_in_the_data_is_not_trusted",
     "35": "diagnosis/test_mixups.py::test_every_mix_up_is_told_with_its_remedy",
     "37": "paper/test_full_moon.py::test_a_patch_that_is_not_rayleigh_is_found_and_does_no_harm",
-    "31": "model/test_compiled.py::test_single_precision_is_refused",
+    "31": "test_float32_sessions.py::test_numbers_that_have_lost_their_digits_are_refused",
     "38": "fit/test_outliers.py::test_cosmic_rays_are_flagged_and_nothing_else",
     "42": "model/effects/test_effects_contract.py::test_neutral_and_derivatives",
     "43": "diagnosis/test_detection_limits.py::test_two_effects_that_do_the_same_are_told_as_a_class",

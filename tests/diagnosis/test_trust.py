@@ -52,9 +52,9 @@ def displaced(calset: CalibrationSet) -> CalibrationSet:
 
 
 def dark(calset: CalibrationSet) -> CalibrationSet:
-    """One camera that was never read."""
+    """One camera behind a closed shutter: nothing but read noise."""
     counts = block(calset).counts.copy()
-    counts[..., 2] = 0.0
+    counts[..., 2] = np.random.default_rng(3).normal(5.0, 2.0, counts.shape[:-1])
     return with_data(calset, counts=counts)
 
 

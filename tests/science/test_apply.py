@@ -21,7 +21,8 @@ from walop_jax.fit.verdict import Quality
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.specification import effect_context, make_model, with_effects
-from walop_jax.science.apply import COOL, HOT, apply, linearised
+from walop_jax.science.apply import COOL, HOT, apply
+from walop_jax.science.detectors import linearised
 from walop_jax.simulation.simulate import simulate
 
 pytestmark = pytest.mark.usefixtures("tabulated_once")

@@ -123,8 +123,8 @@ ERRORS = (
     planted("simulation/simulate.py", "np.maximum(counts, 0.0) + self.read_noise**2",
             "np.maximum(counts, 0.0) + self.read_noise", "simulation/test_noise.py"),
     # fit
-    planted("fit/search.py", "start[likelihood.model.index(name)] += sign * one_wave",
-            "start[likelihood.model.index(name)] += one_wave", "fit/test_search.py"),
+    planted("fit/search.py", "start[place] += sign * one_wave",
+            "start[place] += one_wave", "fit/test_search.py"),
     planted("fit/robust.py", "count / (count - 1) * gradients.T", "(count - 1) / count * gradients.T",
             "fit/test_robust.py"),
     planted("fit/robust.py", "root[:, known] @ axis", "root[:, known] @ axis.T", "fit/test_robust.py"),

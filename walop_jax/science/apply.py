@@ -25,10 +25,9 @@ from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError, rows_text
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
-from walop_jax.model import light
-from walop_jax.model.dependence import reported
 from walop_jax.model.parameters import with_values
 from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, CatalogueSearch
+from walop_jax.science.detectors import detector_slopes, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
 from walop_jax.science.star_residuals import StarResiduals
 
@@ -36,7 +35,6 @@ MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
 COOL, HOT = 3500.0, 10000.0
 """Colour temperatures (K) between which 95 % of the stars without TEFF are taken to lie, normal in 1/T."""
-_ROUNDS = 16
 _EXPANSIONS = 8  # of the counts, about the errors of the calibration that explain the stars best, …
 _STRAIGHT = 0.01  # … until second derivatives make less difference than this share of the noise, squared
 IMPROBABLE = 1e-6
@@ -182,7 +180,7 @@ class _Application:
                 gain @ plain[here], gain @ throughput[here], x[here], y[here]
             )
         lit = np.where(found.flux > 0, found.flux, np.inf)
-        for p, change in _detector_slopes(vectors, counts):
+        for p, change in detector_slopes(vectors, counts):
             change = np.nan_to_num(change) / lit[:, None]
             plain[..., p] -= change
             derivative[..., p] -= np.einsum("rik,rk->ri", found.gain, change)
@@ -540,43 +538,6 @@ def _disagree(
 
 
 # ---------------------------------------------------------------------------------- effects beyond the optics
-
-
-def linearised(calibration: Calibration, counts: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-    """Counts as linear detectors would report them, where the calibration has found out what they do to counts."""
-    instrument = calibration.model.instrument(calibration.values)
-    if light.is_linear(instrument):
-        return counts
-    true = counts
-    for _ in range(_ROUNDS):
-        true = true + (counts - np.asarray(reported(instrument, jnp.asarray(true))))
-    return true
-
-
-def _detector_slopes(
-    vectors: AnalysisVectors, counts: Float[np.ndarray, "r k"]
-) -> Iterator[tuple[int, Float[np.ndarray, "r k"]]]:
-    """Positions in `vectors.parameters` of those of the detectors, and d(linearised counts)/d(parameter).
-
-    `counts` are linearised. From reported(N, θ) = what was measured: dN/dθ = −(∂reported/∂θ) / (∂reported/∂N).
-    """
-    calibration = vectors.calibration
-    template, values = calibration.model.template, jnp.asarray(calibration.values)
-    if light.is_linear(vectors.instrument):
-        return
-    to_instrument = with_values(template)
-
-    def read(values: jax.Array, counts: jax.Array) -> jax.Array:
-        return reported(to_instrument(values), counts)
-
-    probe = jnp.full((1, counts.shape[1]), 1e6)
-    known = np.abs(np.asarray(jax.jacfwd(read)(values, probe))).max(axis=(0, 1)) > 0
-    true = jnp.asarray(np.nan_to_num(counts))
-    _, slope = jax.jvp(lambda c: read(values, c), (true,), (jnp.ones_like(true),))
-    for place in np.flatnonzero(known[vectors.parameters]):
-        along = jnp.zeros_like(values).at[vectors.parameters[place]].set(1.0)
-        _, change = jax.jvp(lambda v: read(v, true), (values,), (along,))
-        yield int(place), -np.asarray(change / slope)
 
 
 def _turned(

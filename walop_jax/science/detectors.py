@@ -1,0 +1,60 @@
+"""Detectors that are not linear: counts of a catalogue freed of what a calibration knows of them.
+
+Equation    reported(N, θ) = what was measured, solved for N by fixed-point steps; dN/dθ = −(∂reported/∂θ)/(∂reported/∂N)
+Symbols     N counts (electrons) that arrive, θ coefficients of the detectors
+Limits      Responses within some per cent of linear: each step gains as many digits as the first one is small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.model import light
+from walop_jax.model.dependence import reported
+from walop_jax.model.parameters import with_values
+
+_ROUNDS = 16
+
+
+def linearised(calibration: Calibration, counts: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """Counts as linear detectors would report them, where the calibration has found out what they do to counts."""
+    instrument = calibration.model.instrument(calibration.values)
+    if light.is_linear(instrument):
+        return counts
+    true = counts
+    for _ in range(_ROUNDS):
+        true = true + (counts - np.asarray(reported(instrument, jnp.asarray(true))))
+    return true
+
+
+def detector_slopes(
+    vectors: AnalysisVectors, counts: Float[np.ndarray, "r k"]
+) -> Iterator[tuple[int, Float[np.ndarray, "r k"]]]:
+    """Positions in `vectors.parameters` of those of the detectors, and d(linearised counts)/d(parameter).
+
+    `counts` are linearised. From reported(N, θ) = what was measured: dN/dθ = −(∂reported/∂θ) / (∂reported/∂N).
+    """
+    calibration = vectors.calibration
+    template, values = calibration.model.template, jnp.asarray(calibration.values)
+    if light.is_linear(vectors.instrument):
+        return
+    to_instrument = with_values(template)
+
+    def read(values: jax.Array, counts: jax.Array) -> jax.Array:
+        return reported(to_instrument(values), counts)
+
+    probe = jnp.full((1, counts.shape[1]), 1e6)
+    known = np.abs(np.asarray(jax.jacfwd(read)(values, probe))).max(axis=(0, 1)) > 0
+    true = jnp.asarray(np.nan_to_num(counts))
+    _, slope = jax.jvp(lambda c: read(values, c), (true,), (jnp.ones_like(true),))
+    for place in np.flatnonzero(known[vectors.parameters]):
+        along = jnp.zeros_like(values).at[vectors.parameters[place]].set(1.0)
+        _, change = jax.jvp(lambda v: read(v, true), (values,), (along,))
+        yield int(place), -np.asarray(change / slope)
