@@ -1,6 +1,7 @@
 """Detectors that are not linear: counts of a catalogue freed of what a calibration knows of them.
 
-Equation    reported(N, θ) = what was measured, solved for N by fixed-point steps; dN/dθ = −(∂reported/∂θ)/(∂reported/∂N)
+Equation    reported(N, θ) = what was measured, solved for N by fixed-point steps;
+            dN/dθ = −(∂reported/∂θ) / (∂reported/∂N)
 Symbols     N counts (electrons) that arrive, θ coefficients of the detectors
 Limits      Responses within some per cent of linear: each step gains as many digits as the first one is small.
 """
