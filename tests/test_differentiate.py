@@ -67,7 +67,9 @@ def test_scripts_are_short_and_use_public_names():
         assert not re.search(r"walop_jax\.|import _|\._", text), title
 
 
-@pytest.mark.parametrize("title", quick(SCRIPTS, ["Many instruments at once"]))
+@pytest.mark.parametrize(
+    "title", quick(SCRIPTS, ["Many instruments at once", "Sensitivity maps", "A forecast from a plan"])
+)
 def test_it_runs(title: str, first, request: pytest.FixtureRequest):
     name = OPTIONAL.get(title)
     if name and importlib.util.find_spec(name) is None:

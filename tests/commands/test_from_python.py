@@ -258,3 +258,30 @@ def test_results_go_through_pickle_into_another_process(fitted: FittedSet, tmp_p
     np.testing.assert_allclose(
         [float(line) for line in told.stdout.split()], [*expected, result.model.start[0]], rtol=1e-11
     )
+
+
+def test_nights_of_a_survey_have_their_standards_in_common():
+    tiny = walop.ObservingPlan(grid=2, standard_grid=1, moon_patches=0, standards=3)
+    first, second, other = (
+        walop.simulate(tiny, seed=seed, catalogue_seed=stars) for seed, stars in ((1, 7), (2, 7), (2, None))
+    )
+    np.testing.assert_array_equal(first.calset.sources.q, second.calset.sources.q)
+    assert not np.array_equal(first.calset.intensities.counts, second.calset.intensities.counts)
+    assert not np.array_equal(first.calset.sources.q[2:], other.calset.sources.q[2:])
+    (_, mgf2) = first.truth.element("half2.plate").layers
+    assert first.values["half2.plate.mgf2"] == float(mgf2.thickness)
+    assert tuple(first.values) == walop.base_model(first.calset).names
+
+
+def test_a_fit_of_a_likelihood_keeps_the_factor_on_its_errors():
+    """Errors of twice the size: twice the standard error where data alone decide, no more of it where priors do."""
+    usual = small_fit()
+    twice = walop.FitResult.of(usual.likelihood, noise_scale=2.0)
+    assert twice.noise_scale == 2.0
+    free = usual.model.free
+    ratio = twice.sigma[free] / usual.sigma[free]
+    assert 0.98 < ratio.min() < 1.1
+    assert 1.9 < ratio.max() < 2.05
+    assert 0.0 < np.abs((twice.values - usual.values)[free] / usual.sigma[free]).max() < 2.0
+    with pytest.raises(RuntimeError, match="nobody has examined"):
+        twice.trusted  # noqa: B018
