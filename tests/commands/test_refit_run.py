@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from frames_file import write_frames
 
@@ -19,13 +18,12 @@ from walop_jax.likelihood import limits, runner
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
-from .conftest import FittedSet, assert_same_files
+from .conftest import FittedSet
 
 SIDE = 40
 PLAN = ObservingPlan(
     grid=SIDE, standard_grid=1, standards=0, unpolarised=0, moon_patches=2, polariser_angles=polariser_turn(6)
 )  # fmt: skip
-MATRIX = "χ², gradient and matrix"
 
 
 class StopError(Exception):
@@ -49,39 +47,27 @@ def large(monkeypatch):
     monkeypatch.setattr(runner, "TOLD_EVERY", -1.0)
 
 
-class Interrupting:
-    """Listens, and stops the fit at the line of that number of the passes with the matrix over all points."""
-
-    def __init__(self, at: int) -> None:
-        self.at, self.told = at, []
-
-    def __call__(self, text: str) -> None:
-        self.told.append(text)
-        if sum(line.startswith(MATRIX) and f"of {SIDE**2:,}" in line for line in self.told) == self.at:
-            raise StopError
-
-
 @pytest.mark.long
 def test_an_interrupted_run_leaves_nothing(frames, large, tmp_path):
-    """The same call then fits it, as if there had been no other."""
-    stop = Interrupting(12)
+    """Stopped in the middle of the first pass over all pixels."""
+    told: list[str] = []
+
+    def stop(text: str) -> None:
+        told.append(text)
+        if text.startswith("summing pixels") and f" of {SIDE**2:,} points" in text:
+            raise StopError
+
     with pytest.raises(StopError):
         refit(frames, output=tmp_path / "RUN", progress=stop)
-    assert stop.told[0] == "reading"
-    assert stop.told[1].startswith("preparing the fit")
+    assert told[0] == "reading"
+    assert told[1].startswith("preparing the fit")
     assert list(tmp_path.iterdir()) == []
-    told: list[str] = []
-    again = refit(frames, output=tmp_path / "RUN", progress=told.append)
-    whole = refit(frames, output=tmp_path / "whole")
-    assert told[-1] == "mapping the field"
-    assert read_calibration(tmp_path / "RUN" / "calibration.fits", rebuild=False).residuals is not None
-    np.testing.assert_array_equal(again.values, whole.values)
-    assert_same_files(tmp_path / "RUN", tmp_path / "whole")
 
 
 @pytest.mark.long
 def test_the_map_of_a_caller_is_that_of_the_run(frames, large, tmp_path):
     run = refit(frames, output=tmp_path / "run")
+    assert run.converged
     product = Calibration.from_fit(run, residual_map(run))
     assert (
         product.content_hash()
