@@ -1,15 +1,12 @@
-"""`refit` of frames that are handled like those of whole detectors: residual map, interruption, two processes."""
+"""`refit` of frames that are handled like those of whole detectors: residual map, memory."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import os
-import signal
-import socket
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -28,7 +25,7 @@ SIDE = 72
 RUN = ObservingPlan(
     grid=SIDE, standard_grid=1, standards=0, unpolarised=0, moon_patches=3, polariser_angles=polariser_turn(6)
 )  # fmt: skip
-# The commands in another process, with sets large from the first point on and slabs of 256 points.
+# A command in another process, with sets large from the first point on and slabs of 256 points.
 LARGE = """
 import sys
 from walop_jax.likelihood import limits
@@ -48,28 +45,14 @@ def frames(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def start(tmp_path_factory):
-    """Start a command in a process of its own; those of this module share a cache of compiled code."""
-    cache = str(tmp_path_factory.mktemp("cache"))
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "WALOP_JAX_CACHE": cache}
-
-    def process(*arguments: object) -> subprocess.Popen:
-        command = [sys.executable, "-c", LARGE, *map(str, arguments)]
-        return subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-        )
-
-    return process
-
-
-@pytest.fixture(scope="module")
-def finished(frames, start, tmp_path_factory):
-    """A run in a process of its own, not interrupted."""
+def finished(frames, tmp_path_factory):
+    """A run in a process of its own."""
     folder = tmp_path_factory.mktemp("runs") / "whole"
-    process = start("refit", frames, "-o", folder, "--json")
-    out, err = process.communicate(timeout=300)
-    assert process.returncode == 0, err
-    return folder, json.loads(out)
+    command = [sys.executable, "-c", LARGE, "refit", str(frames), "-o", str(folder), "--json"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder, json.loads(done.stdout)
 
 
 @pytest.mark.long
@@ -110,62 +93,6 @@ def test_the_map_stays_with_the_calibration(finished, tmp_path):
     np.testing.assert_array_equal(copy.residuals.values, product.residuals.values)
     figure = figures.residual_map_figure(product.residuals, ("O1", "E1", "O2", "E2"))
     assert len(figure.axes) == 16
-
-
-@pytest.mark.long
-def test_a_killed_fit_goes_on_where_it_was(frames, finished, start, tmp_path):
-    run = tmp_path / "run"
-    process = start("refit", frames, "-o", run)
-    deadline = time.monotonic() + 200
-    while sum(file.stat().st_size for file in run.glob("partial/*.sums")) < 400_000:
-        assert process.poll() is None, process.communicate()[1]
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    assert not (run / "calibration.fits").exists()
-    kept = {file.name: file.stat().st_size for file in run.glob("partial/*.sums")}
-    again = start("refit", frames, "-o", run, "--json")
-    while again.poll() is None and len(list(run.glob("partial/*.sums"))) <= len(kept):
-        time.sleep(0.02)
-    out, err = again.communicate(timeout=300)
-    assert again.returncode == 0, err
-    assert not (run / "partial").exists()
-    summary = json.loads(out)
-    assert summary["parameters"] == finished[1]["parameters"]
-    assert summary["chi2"] == finished[1]["chi2"]
-    assert read_calibration(run / "calibration.fits", rebuild=False).content_hash() == (
-        read_calibration(finished[0] / "calibration.fits", rebuild=False).content_hash()
-    )
-
-
-@pytest.mark.long
-def test_two_processes_write_one_calibration(frames, finished, start, tmp_path):
-    with socket.socket() as one:
-        one.bind(("localhost", 0))
-        port = one.getsockname()[1]
-    run = tmp_path / "run"
-    both = [
-        start("refit", frames, "-o", run, "--processes", f"{n}/2@localhost:{port}", "--json") for n in (0, 1)
-    ]
-    (out, err), (silent, other) = (process.communicate(timeout=300) for process in both)
-    assert [process.returncode for process in both] == [0, 0], err + other
-    assert silent == ""
-    summary = json.loads(out)
-    for name, entry in finished[1]["parameters"].items():
-        assert summary["parameters"][name]["value"] == pytest.approx(entry["value"], rel=1e-10, abs=1e-10)
-    assert sorted(entry.name for entry in run.iterdir()) == ["calibration.fits", "summary.json"]
-    one, alone = (
-        read_calibration(folder / "calibration.fits", rebuild=False).residuals
-        for folder in (run, finished[0])
-    )
-    np.testing.assert_allclose(one.values, alone.values, atol=1e-10)
-
-
-def test_a_wrong_place_is_one_line(call, frames, tmp_path):
-    result = call("refit", frames, "-o", tmp_path / "run", "--processes", "2/2@localhost:1")
-    assert result.exit_code == 1
-    assert "INDEX counts from 0 to 1" in result.stderr
 
 
 @pytest.mark.long

@@ -1,12 +1,11 @@
-"""Passes over many points: the same on any number of threads, devices and processes, and when they are resumed."""
+"""Passes over many points: the same on any number of threads and devices, with progress."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import os
-import signal
-import socket
+import pickle
 import subprocess
 import sys
 import time
@@ -19,18 +18,16 @@ from jax import monitoring
 from small_run import SEED, SMALL
 
 from walop_jax.fit.model_file import base_model
-from walop_jax.fit.refit import fit
-from walop_jax.likelihood import limits, runner
+from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.runner import Journal, LostProcessError, Processes, Runner
+from walop_jax.likelihood.runner import Runner
 from walop_jax.simulation.simulate import simulate
 
 RUN = frame_run(40)
 PLAN = """
 import jax
 jax.config.update("jax_enable_x64", True)
-import json, os, sys, time
-import numpy as np
+import json
 """
 
 
@@ -94,199 +91,30 @@ def test_two_devices_give_the_same(likelihood):
     np.testing.assert_array_equal(found["gradient"], here.gradient)
 
 
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("localhost", 0))
-        return one.getsockname()[1]
+def test_an_error_in_one_slab_ends_the_pass():
+    """It comes out as it is, and no slab that has not begun is begun."""
+    begun = []
+
+    def work(number):
+        begun.append(number)
+        if number == 2:
+            raise OSError("the disk is gone")
+        time.sleep(0.01)
+        return number
+
+    with pytest.raises(OSError, match="the disk is gone"):
+        list(Runner(threads=2).each("", work, 1000, 10))
+    assert len(begun) < 50
 
 
-SHARED = """
-from walop_jax.likelihood import limits, runner
-from walop_jax.likelihood.runner import Runner
-limits.LARGE_ABOVE, limits.SAMPLE = 0, 400
-here = runner.join(sys.argv[1])
-from test_runner import made  # makes arrays: not ahead of `join`
-p = made(runner=Runner(processes=here))
-assert p.layout.large
-"""
+def test_results_come_in_the_order_of_the_slabs():
+    """Also where the first ones take longest; the last slab is a part of one."""
 
+    def work(number):
+        time.sleep(0.002 * (7 - number))
+        return number
 
-@pytest.mark.long
-def test_two_processes_fit_as_one_does(likelihood, monkeypatch):
-    """To 1e-10 in every parameter, in units of its scale; each has done half of the work."""
-    code = (
-        PLAN
-        + SHARED
-        + """
-from walop_jax.fit.refit import fit
-found = fit(p)
-seen = []
-block = p.calset.intensities.block
-object.__setattr__(p.calset.intensities, "block", lambda a, b: (seen.append(a), block(a, b))[1])
-p.expand(found.values)
-print(json.dumps({"values": found.values.tolist(), "sigma": found.sigma.tolist(), "chi2": found.chi2,
-                  "dof": found.dof, "field": found.posterior.census.field, "converged": found.converged,
-                  "seen": len(set(seen))}))
-"""
-    )
-    port = free_port()
-    both = [run(code, f"{n}/2@localhost:{port}") for n in range(2)]
-    one, other = (result_of(process) for process in both)
-    monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
-    monkeypatch.setattr(limits, "SAMPLE", 400)
-    alone = fit(made())
-    scale = np.array([p.scale for p in likelihood.model.parameters])
-    assert one["converged"]
-    assert one["values"] == other["values"]
-    assert one["sigma"] == other["sigma"]
-    np.testing.assert_allclose(np.array(one["values"]) / scale, alone.values / scale, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(one["sigma"], alone.sigma, rtol=1e-8)
-    assert one["chi2"] == pytest.approx(alone.chi2, rel=1e-12)
-    assert (one["dof"], tuple(one["field"])) == (alone.dof, alone.posterior.census.field)
-    assert (one["seen"], other["seen"]) == (13, 12)
-
-
-@pytest.mark.long
-def test_a_dead_process_is_an_error_in_the_others():
-    code = (
-        PLAN
-        + SHARED
-        + """
-p.expand(p.model.start)
-print("ready", flush=True)
-if here.index == 1:
-    time.sleep(600)
-try:
-    p.expand(p.model.start)
-except runner.LostProcessError as error:
-    print(error, flush=True)
-    os._exit(3)
-"""
-    )
-    port = free_port()
-    both = [run(code, f"{n}/2@localhost:{port}") for n in range(2)]
-    try:
-        for process in both:
-            while "ready" not in (line := process.stdout.readline()):
-                assert line, process.stderr.read()[-2000:]
-        both[1].send_signal(signal.SIGKILL)
-        began = time.monotonic()
-        out, _ = both[0].communicate(timeout=60)
-    finally:
-        for process in both:
-            process.kill()
-            process.communicate()
-    assert both[0].returncode == 3
-    assert "has lost another one" in out
-    assert time.monotonic() - began < 60
-
-
-def test_processes_at_different_work_are_found_out(monkeypatch):
-    from jax.experimental import multihost_utils
-
-    def answer(row):
-        return np.stack([row, row + 1.0])
-
-    monkeypatch.setattr(multihost_utils, "process_allgather", answer)
-    with pytest.raises(LostProcessError, match="same command"):
-        Processes(0, 2).gather("gradient", np.zeros(3))
-
-
-@pytest.mark.parametrize("place", ["", "1/2", "0/2@host", "2/2@host:1", "a/2@host:1", "0/2@host:port"])
-def test_a_place_that_is_none_is_refused(place):
-    with pytest.raises(ValueError, match="INDEX"):
-        runner.join(place)
-
-
-def test_more_processes_than_slabs_are_refused(likelihood):
-    with pytest.raises(ValueError, match="use fewer"):
-        Runner(processes=Processes(99, 100)).total("", None, lambda _: None, likelihood.layout)
-
-
-# ------------------------------------------------------------------------------------------------- resuming
-
-
-class StopError(Exception):
-    pass
-
-
-def interrupted(likelihood, after):
-    """The likelihood with a disk that fails after so many slabs."""
-    block, count = likelihood.calset.intensities.block, 0
-
-    def failing(start, stop):
-        nonlocal count
-        count += 1
-        if count > after:
-            raise StopError
-        return block(start, stop)
-
-    object.__setattr__(likelihood.calset.intensities, "block", failing)
-    return likelihood
-
-
-def test_a_resumed_pass_is_the_same_to_the_last_bit(tmp_path):
-    whole, kept = made(), Runner(journal=Journal(tmp_path / "partial", "one fit"))
-    expected = whole.expand(whole.model.start)
-    first = interrupted(dataclasses.replace(made(), runner=kept), 9)
-    with pytest.raises(StopError):
-        first.expand(first.model.start)
-    again = dataclasses.replace(made(), runner=kept)
-    asked = []
-    block = again.calset.intensities.block
-    object.__setattr__(again.calset.intensities, "block", lambda a, b: (asked.append(a), block(a, b))[1])
-    found = again.expand(again.model.start)
-    assert 25 - 9 <= len(asked) <= 25 - 7
-    assert found.data == expected.data
-    np.testing.assert_array_equal(found.matrix, expected.matrix)
-    np.testing.assert_array_equal(found.census.rows, whole.census.rows)
-    assert found.census.field == whole.census.field
-    # A third time nothing is read at all; other values, another set or model are other work.
-    asked.clear()
-    again.expand(again.model.start)
-    assert not asked
-    again.expand(again.model.start * 1.001)
-    assert len(asked) == 25
-    asked.clear()
-    other = Runner(journal=Journal(tmp_path / "partial", "another fit"))
-    dataclasses.replace(again, runner=other).expand(again.model.start)
-    assert len(asked) == 25
-
-
-def test_what_is_damaged_is_done_again(tmp_path):
-    journal = Journal(tmp_path, "fit")
-    for number in range(3):
-        journal.append("pass", number, np.arange(4.0) + number)
-    path = journal.path("pass")
-    content = bytearray(path.read_bytes())
-    assert list(journal.read("pass")) == [0, 1, 2]
-    # A crash in the middle of a record.
-    path.write_bytes(content[:-11])
-    assert list(journal.read("pass")) == [0, 1]
-    journal.append("pass", 2, np.arange(4.0) + 2)
-    assert path.read_bytes() == bytes(content)
-    # A flipped bit: that record and what follows.
-    content[8 + 72 + 20] ^= 1
-    path.write_bytes(content)
-    assert list(journal.read("pass")) == [0]
-    np.testing.assert_array_equal(journal.read("pass")[0], np.arange(4.0))
-    # Nothing sound is left at all.
-    path.write_bytes(b"\x04")
-    assert journal.read("pass") == {}
-    journal.append("pass", 0, np.arange(4.0))
-    np.testing.assert_array_equal(journal.read("pass")[0], np.arange(4.0))
-
-
-def test_what_was_made_once_is_remembered(tmp_path):
-    journal, calls = Journal(tmp_path, "fit"), []
-
-    def make():
-        calls.append(1)
-        return np.array([1.5, -2.0])
-
-    for _ in range(2):
-        np.testing.assert_array_equal(journal.remembered("sample", make), [1.5, -2.0])
-    assert len(calls) == 1
+    assert list(Runner(threads=3).each("", work, 61, 10)) == list(range(7))
 
 
 def test_progress_counts_every_point_once(likelihood, monkeypatch):
@@ -307,12 +135,8 @@ def test_short_passes_are_not_told_of(likelihood):
     assert told == []
 
 
-def test_small_sets_are_neither_shared_nor_kept(tmp_path):
-    """Every process would wait for the others longer than it computes."""
-    runner = Runner(processes=Processes(1, 2), journal=Journal(tmp_path, "fit"), progress=print)
-    small = made(runner=runner)
-    assert not small.layout.large
-    assert small.runner == Runner(runner.threads, progress=print)
+def test_a_copy_in_another_process_reports_no_progress():
+    assert pickle.loads(pickle.dumps(Runner(threads=3, progress=print))) == Runner(threads=3)
 
 
 def test_a_pass_leaves_its_programs_to_what_comes_after_it():

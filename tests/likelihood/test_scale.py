@@ -12,9 +12,9 @@ Two cores, nothing else running, one thread for BLAS, warm:
       14 400     0.01 s      0.15  s       0.31  s      0.71 GB   kept in memory
    1 000 000     3.2  s      4.7   s      10.7   s      1.55 GB
 
-Points that are no pixels of frames. One million on one core take 35 s, on two in two threads 26 s, in two processes of
-one core each 21 s (the same to 10⁻¹¹). Frames of 4096 × 4096 pixels take 12 s a pass, gradient and matrix (1.4 µs of a
-core a pixel, reading included), `walop-jax refit` of the file of 14 GB 59 s from start to end.
+Points that are no pixels of frames. One million on one core take 35 s, on two in two threads 26 s.
+Frames of 4096 × 4096 pixels take 12 s a pass, gradient and matrix (1.4 µs of a core a pixel, reading included),
+`walop-jax refit` of the file of 14 GB 59 s from start to end.
 
 The compiled code does 276 kflop and 381 kB a point with the matrix (14.8 µs of one core: 19 Gflop/s, 26 GB/s), 29 kflop
 and 47 kB for a gradient (4.1 µs: 7 Gflop/s, 12 GB/s); bytes are as the compiler counts them, caches or not. Reading

@@ -1,13 +1,15 @@
 """Normal equations of nights against fits of the whole, and the table of bad input."""
 
 import dataclasses
+import hashlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 from small_run import SMALL
 
 from walop_jax.data.merge import merge_calibration_sets
-from walop_jax.data.records import Site
+from walop_jax.data.records import InputFile, Site
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.variance_components import groupings
 from walop_jax.fit.model_file import base_model
@@ -18,6 +20,7 @@ from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights import equations, night_file
 from walop_jax.nights.equations import (
+    data_hash,
     model_hash,
     night_equations,
     night_numbers,
@@ -36,6 +39,26 @@ def two():
     first = simulate(SMALL, seed=1)
     later = dataclasses.replace(SMALL, mjd=SMALL.start + 7.0)
     return first.calset, simulate(later, seed=2, instrument=first.truth, catalogue_seed=1).calset
+
+
+def test_data_are_identified_by_their_files_or_their_content(two):
+    """A set that comes from no file: any change of exposures or measurements, however small, is another set."""
+    calset = two[0]
+    content = data_hash(calset)
+    assert data_hash(simulate(SMALL, seed=1).calset) == content
+    exposures = dataclasses.replace(calset.exposures, clp_angle=calset.exposures.clp_angle + 1e-9)
+    assert data_hash(dataclasses.replace(calset, exposures=exposures)) != content
+    rows = calset.intensities
+    counts = rows.counts.copy()
+    counts[-1, -1] += 1e-6
+    assert (
+        data_hash(dataclasses.replace(calset, intensities=dataclasses.replace(rows, counts=counts)))
+        != content
+    )
+    files = (InputFile(Path("a.fits"), "0" * 64), InputFile(Path("b.fits"), "1" * 64))
+    assert data_hash(dataclasses.replace(calset, inputs=files[:1])) == "0" * 64
+    both = hashlib.sha256(b"0" * 64 + b"1" * 64).hexdigest()
+    assert data_hash(dataclasses.replace(calset, inputs=files)) == both
 
 
 @pytest.fixture(scope="module")

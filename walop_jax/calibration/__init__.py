@@ -3,4 +3,4 @@
 from walop_jax.calibration.calibration import Calibration, ListedModel
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap, matrix_names, residual_names
 from walop_jax.calibration.product import PRODUCT, product_path, read_calibration, write_calibration
-from walop_jax.calibration.summary import FAILED, PARTIAL, SUMMARY, summary
+from walop_jax.calibration.summary import FAILED, SUMMARY, summary

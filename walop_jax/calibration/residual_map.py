@@ -14,6 +14,7 @@ Limit       no structure smaller than the smooth model's: δ scatters about 0 wi
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -32,7 +33,6 @@ from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.flux import project_flux, sharing
 from walop_jax.likelihood.frames import FrameSums, PixelPosterior, in_blocks, information
 from walop_jax.likelihood.likelihood import Census, Likelihood, Posterior
-from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
@@ -145,7 +145,7 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
     grid = cells_for(likelihood.layout.points, likelihood.census if near is None else near.census)
     count = grid.pixels
 
-    def work(number: int) -> SlabSums:
+    def work(number: int) -> Vector:
         chunks = likelihood.points.slab(number)
         cell = np.concatenate([cell_of(grid, np.asarray(chunk.x), np.asarray(chunk.y)) for chunk in chunks])
         # Padded points carry no weight, hence zeros.
@@ -153,9 +153,11 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
             np.asarray(_sums(instrument, likelihood.plan, jnp.asarray(chosen), c, nodes)) for c in chunks
         ]
         sums = [np.bincount(cell, column, count) for column in np.concatenate(columns).T]
-        return SlabSums(np.concatenate(sums), np.zeros(4))
+        return np.concatenate(sums)
 
-    total = likelihood.runner.total("residual map", None, work, likelihood.layout).sums.reshape(-1, count)
+    layout = likelihood.layout
+    slabs = likelihood.runner.each("residual map", work, layout.points, layout.slab)
+    total = functools.reduce(np.add, slabs).reshape(-1, count)
     n = len(residual_names(len(instrument.cameras.pairs)))
     left = np.zeros((count, n, n))
     i, j = np.triu_indices(n)

@@ -11,8 +11,6 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.io.code import software_versions
 
 SUMMARY, FAILED = "summary.json", "summary.failed.json"
-PARTIAL = "partial"
-"""Folder of the finished parts of a fit that was interrupted."""
 
 
 def summary(

@@ -135,8 +135,8 @@ class Outcome(Generic[T]):
     `files` write the files of the output folder,
     each given its path; the document is written as the file `saved_as`. `warnings` are sentences to bear in mind.
     `failure` says what has gone wrong (exit code 1), `trusted` whether the result can be used (exit code 3 if not).
-    `next` are command lines that one might want to type next. `silent`: nothing of it is shown; `markdown`: the text is
-    laid out on a terminal.
+    `next` are command lines that one might want to type next. `markdown`: the text is laid out
+    on a terminal.
     """
 
     value: T
@@ -148,7 +148,6 @@ class Outcome(Generic[T]):
     failure: str = ""
     trusted: bool = True
     next: Sequence[str] = ()
-    silent: bool = False
     markdown: bool = False
 
     @functools.cached_property

@@ -222,8 +222,7 @@ def _run(command: Command[Any], given: dict[str, Any]) -> None:
         switch_on_jax()
     with progress(quiet or json, command.stages) as tell:
         found = command.run(Job(progress=tell, typed=True, **common), given)
-    if not found.silent:
-        _show(dataclasses.replace(found, next=found.next or _next_steps(command, given)), quiet, json)
+    _show(dataclasses.replace(found, next=found.next or _next_steps(command, given)), quiet, json)
 
 
 def _next_steps(command: Command[Any], given: dict[str, Any]) -> tuple[str, ...]:

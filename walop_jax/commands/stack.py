@@ -49,8 +49,7 @@ def stack(
 
     >>> walop.stack(["night1.fits", "night2.fits"]).trusted  # doctest: +SKIP
     """
-    from walop_jax.calibration import PARTIAL
-    from walop_jax.nights.stacking import FILES, writers
+    from walop_jax.nights.stacking import FILES, PARTIAL, writers
     from walop_jax.nights.stacking import stack as stacked
 
     given: list[Any] = list(nights) if isinstance(nights, list | tuple) else [nights]

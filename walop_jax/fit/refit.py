@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import importlib
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,18 +13,17 @@ from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.minimise import Minimum
-from walop_jax.fit.model_file import base_model, render
+from walop_jax.fit.model_file import base_model
 from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum
 from walop_jax.fit.verdict import NO_STRUCTURE, STATED, Doubt, Hidden, Quality, Structure, Verdict
-from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.layout import curves_of
 from walop_jax.likelihood.likelihood import Likelihood, Posterior
-from walop_jax.likelihood.runner import Journal, Processes, Progress, Runner, fingerprint
+from walop_jax.likelihood.runner import Progress, Runner
 from walop_jax.model.planning import extrapolations
 from walop_jax.model.specification import Model
 
@@ -383,27 +379,16 @@ def refit(
     calset: CalibrationSet,
     model: Model | None = None,
     *,
-    folder: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
     memory: float | None = None,
-    processes: Processes | None = None,
 ) -> FitResult:
     """Fit a calibration set with `model` (default: the base model).
 
-    `progress` is told in a line what is being done. Of large sets (more than `limits.LARGE_ABOVE` points): `memory`
-    (bytes, default 2 GB) is what their data may take; `processes` are those that share the work and make the same
-    call (`processes.join`); finished slabs are kept in `folder`, where the same call goes on after an interruption, to
-    the same last bit. The folder may go when the fit is done. Errors
-    are those of `with_honest_errors`. Raises what `fit` raises.
+    `progress` is called with a line about what is being done; `memory` (bytes, default 2 GB) is what the data of the
+    points may take. Errors are those of `with_honest_errors`. Raises what `fit` raises.
     """
-    model, crew = model or base_model(calset), processes or Processes()
-    journal = None
-    if folder is not None:  # named by all that the fit depends on: data, model, software, and who does it
-        texts = [fingerprint(calset), render(model), f"{crew.index}/{crew.count}"]
-        texts += [f"{name} {version}" for name, version in software_versions().items()]
-        journal = Journal(Path(folder), hashlib.sha256("\n".join(texts).encode()).hexdigest())
-    runner = Runner(processes=crew, progress=progress, journal=journal)
-    likelihood = Likelihood.of(calset, model, memory=memory, runner=runner)
+    runner = Runner(progress=progress)
+    likelihood = Likelihood.of(calset, model or base_model(calset), memory=memory, runner=runner)
     size = likelihood.layout.memory / 1e9
     runner.tell(Stage(f"preparing the fit{f' of {size:.2g} GB of data' if size > 0.1 else ''}", "fitting"))
     return with_honest_errors(fit(likelihood))

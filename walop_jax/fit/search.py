@@ -128,25 +128,28 @@ def find_minimum(
     on_pixels = stands_for_pixels(likelihood, first)
     points = limits.PIXEL_SAMPLE if on_pixels else max(limits.SAMPLE, layout.points // limits.FARTHEST)
     values, scale, starts = _of_sample(likelihood, first, noise_scale, worth, points)
-    passes = [("fit of all points", likelihood, None, LARGE_TOLERANCE)]
+    passes = [("fit of all points", None, LARGE_TOLERANCE)]
     if on_pixels:
         every = strips_of(likelihood) // limits.FIRST_STRIPS
-        passes = [("fit of some image rows", _unkept(likelihood), every, 1.0)] if every > 1 else []
-        passes.append(("fit of all pixels", likelihood, 1, LARGE_TOLERANCE))
+        passes = [("fit of some image rows", every, 1.0)] if every > 1 else []
+        passes.append(("fit of all pixels", 1, LARGE_TOLERANCE))
     found: FoundMinimum | None = None
-    for label, whole, every, tolerance in passes:
-        expand = None if every is None else functools.partial(_of_pixels, whole, every)
+    for label, every, tolerance in passes:
+        expand = None if every is None else functools.partial(_of_pixels, likelihood, every)
         found = _search(
-            whole, label, values, scale, None, expand, tolerance=tolerance, damping=0.0, look_at_end=False
+            likelihood,
+            label,
+            values,
+            scale,
+            None,
+            expand,
+            tolerance=tolerance,
+            damping=0.0,
+            look_at_end=False,
         )
         values = found.values
     assert found is not None  # there is a pass over everything
     return dataclasses.replace(found, starts=starts)
-
-
-def _unkept(likelihood: Likelihood) -> Likelihood:
-    """The same for passes that are not worth keeping."""
-    return dataclasses.replace(likelihood, runner=dataclasses.replace(likelihood.runner, journal=None))
 
 
 def _of_pixels(
@@ -162,21 +165,14 @@ def _of_sample(
 
     The sample of a very large set is large itself.
     """
-
-    def make() -> Vector:
-        sample = Likelihood.of(
-            thinned(likelihood.calset, points),
-            likelihood.model,
-            memory=likelihood.layout.allowed,
-            runner=_unkept(likelihood).runner,
-        )
-        found = find_minimum(sample, first, noise_scale, worth)
-        return np.append(found.values, [found.posterior.noise_scale, found.starts])
-
-    journal = likelihood.runner.journal
-    key = f"sample {points} {first.tobytes().hex()} {noise_scale} {worth}"
-    *values, scale, starts = make() if journal is None else journal.remembered(key, make)
-    return np.array(values), float(scale), int(starts)
+    sample = Likelihood.of(
+        thinned(likelihood.calset, points),
+        likelihood.model,
+        memory=likelihood.layout.allowed,
+        runner=likelihood.runner,
+    )
+    found = find_minimum(sample, first, noise_scale, worth)
+    return found.values, found.posterior.noise_scale, found.starts
 
 
 def _from_afar(

@@ -1,1 +1,1 @@
-"""χ² of data with its gradient and matrix: fluxes eliminated, priors, tables, frames, threads and processes."""
+"""χ² of data with its gradient and matrix: fluxes eliminated, priors, tables, frames, threads."""

@@ -28,7 +28,7 @@ side; the map from there to the field is linear (`Grid`). A pixel takes about a 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -45,7 +45,6 @@ from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import TOLERANCE, FieldTable, accurate_table, in_batches
 from walop_jax.likelihood.flux import sharing
 from walop_jax.likelihood.likelihood import Census, DataTerms, Likelihood, Matrix, OpticsUsed, Posterior
-from walop_jax.likelihood.runner import SlabSums
 from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import compiled
@@ -375,11 +374,9 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
     series = np.swapaxes(unit.reshape(smooth.count, smooth.count, *unit.shape[1:]), 0, 1)
     known = jnp.asarray(likelihood.flux_known[exposures])
     together = sharing(instrument, likelihood.plan).cameras
-    of_all = (len(exposures), rows, columns)
-    shapes = [(likelihood.cameras, *of_all)] * 2 + [of_all] * 3
     read = RowReader(frames, height, width)
 
-    def work(number: int) -> SlabSums:
+    def work(number: int) -> tuple[np.ndarray, CellSums]:
         top = strips[number] * height
         bottom = min(top + height, cells.grid.height)
         pixels = read(top, bottom)
@@ -388,17 +385,19 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
         found = strip_sums(pixels, jnp.asarray(series), across, along, jnp.zeros(cells.side), known, together)
         if int(found.impossible):
             frames.block(top * cells.grid.width, bottom * cells.grid.width)  # says which
-        flat = np.concatenate([np.ravel(np.asarray(leaf)[..., :columns]) for leaf in found.cells])
-        return SlabSums(np.ravel(found.moments), np.full(4, -np.inf), {number: flat})
+        return np.asarray(found.moments), jax.tree.map(
+            lambda leaf: np.asarray(leaf)[..., :columns], found.cells
+        )
 
     step = height * cells.grid.width * every
-    layout = dataclasses.replace(likelihood.layout, points=cells.grid.pixels, slab=step, chunk=step)
-    key = f"cells {values.tobytes().hex()} every {every}"
-    total = runner.total("summing pixels", key, work, layout)
+    moments, parts = np.zeros(series.shape), []
+    for pull, part in runner.each("summing pixels", work, cells.grid.pixels, step):
+        moments += pull
+        parts.append(part)
     count = len(likelihood.flux_known)
-    sums = _assembled(total.parts, shapes, cells.shape[0], every)
+    sums = _assembled(parts, cells.shape[0], every)
     sums = CellSums(*(_in_places(array, exposures, count, axis=-3) for array in sums))
-    moments = _in_places(total.sums.reshape(series.shape), exposures, count, axis=-1)
+    moments = _in_places(moments, exposures, count, axis=-1)
     return FrameSums(likelihood, values, cells, sums, moments, every, smooth, OpticsUsed(smooth.count, off))
 
 
@@ -436,17 +435,18 @@ def _series(
     return accurate_table(exact, FRAME, limits.NODES_PER_SIDE, TOLERANCE, error)
 
 
-def _assembled(parts: dict[int, Vector], shapes: list[tuple[int, ...]], height: int, every: int) -> CellSums:
-    """All strips in their places; nothing where one was left out."""
-    rows = shapes[0][-2]
-    sizes = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
-    strips = -(-height // rows)
-    found = [np.zeros((*shape[:-2], strips * rows, shape[-1])) for shape in shapes]
-    for number, flat in parts.items():
-        for array, shape, piece in zip(found, shapes, np.split(flat, sizes), strict=True):
+def _assembled(parts: Sequence[CellSums], height: int, every: int) -> CellSums:
+    """The cells of one strip in `every` in their places, `height` rows of them; zeros in the others."""
+
+    def column(*strips: np.ndarray) -> np.ndarray:
+        rows = strips[0].shape[-2]
+        whole = np.zeros((*strips[0].shape[:-2], -(-height // rows) * rows, strips[0].shape[-1]))
+        for number, strip in enumerate(strips):
             first = number * every * rows
-            array[..., first : first + rows, :] = piece.reshape(shape)
-    return CellSums(*(array[..., :height, :] for array in found))
+            whole[..., first : first + rows, :] = strip
+        return whole[..., :height, :]
+
+    return jax.tree.map(column, *parts)
 
 
 # ------------------------------------------------------------------------------- from sums to the parameters
@@ -470,7 +470,7 @@ def expand_pixels(
 
     Raises what `frame_sums` raises.
     """
-    values = likelihood.runner.processes.agreed("values", np.asarray(values, float))
+    values = np.asarray(values, float)
     found = frame_sums(likelihood, values, every)
     terms = DataTerms(found.chi2, half_gradient(found), gauss_newton(found), found.census)
     beside = without_frames(likelihood.calset)

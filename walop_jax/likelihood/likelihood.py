@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -16,7 +17,7 @@ from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
 from walop_jax.likelihood.layout import Layout, MeasuredPoints, PointReader, curves_of, planned_instrument
 from walop_jax.likelihood.optics import directions
-from walop_jax.likelihood.runner import Runner, SlabSums
+from walop_jax.likelihood.runner import Runner
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
@@ -183,10 +184,9 @@ class Likelihood:
     ) -> Likelihood:
         """Bring a set and a model together; `probes` are effects beyond the model whose columns will be asked for.
 
-        `memory` (bytes) is what the data of the points may take, None for the usual 2 GB. A large set is shared with
-        the processes of `runner`, and finished slabs are kept in its journal; smaller ones are not worth it.
-        `points_per_chunk` and `interpolate` are decided by the size of the set where they are None. Derivatives of a
-        small set are compiled without optimisation, unless many such sets come (`once` False).
+        `memory` (bytes) is what the data of the points may take, None for the usual 2 GB. `points_per_chunk` and
+        `interpolate` are decided by the size of the set where they are None. Derivatives of a small set are compiled
+        without optimisation, unless many such sets come (`once` False).
         """
         runner = runner or Runner()
         layout = Layout.of(
@@ -200,9 +200,7 @@ class Likelihood:
         )
         reader = PointReader(calset, layout.plan, layout.mirrored, model.template.cameras.floor)
         once &= layout.points * len(calset.exposures) <= limits.DERIVATIVES_ONCE
-        return cls(
-            layout, MeasuredPoints(reader, layout), runner if layout.large else runner.alone(), model, once
-        )
+        return cls(layout, MeasuredPoints(reader, layout), runner, model, once)
 
     def following(self, values: Vector) -> Likelihood:
         """The same with wavelength nodes that follow the retarders at a full vector of values; itself if they do."""
@@ -273,7 +271,7 @@ class Likelihood:
         `noise_scale` multiplies the errors of the data (not the priors'): above 1 it stands for what the
         model cannot explain. `near` is an earlier expansion at similar values, which saves the search for nodes.
         """
-        values = self.runner.processes.agreed("values", np.asarray(values, float))
+        values = np.asarray(values, float)
         terms, optics = self.data_terms(values, near)
         return self.posterior(values, terms, noise_scale, optics)
 
@@ -283,7 +281,6 @@ class Likelihood:
         nodes, optics = self.nodes(instrument, near)
         (data, gradient, matrix), census = self._total(
             "χ², gradient and matrix",
-            f"matrix {values.tobytes().hex()}",
             lambda chunk: (
                 engine.dense_equations(instrument, self.plan, chunk, once=self.once)
                 if nodes is None and self.pairs <= limits.FITTED_FROM_ROWS
@@ -326,13 +323,12 @@ class Likelihood:
     def _total(
         self,
         label: str,
-        key: str | None,
         function: Callable[[engine.PointData], Sequence[Array]],
         shapes: Sequence[tuple[int, ...]],
     ) -> tuple[list[np.ndarray], Census]:
         """Sums over all points of the arrays that `function` gives for a chunk, the points counted on the way."""
 
-        def work(number: int) -> SlabSums:
+        def work(number: int) -> tuple[Vector, Float[np.ndarray, " 4"]]:
             chunks = self.points.slab(number)
             sums = np.zeros(sum(math.prod(shape) for shape in shapes))
             for chunk in chunks:
@@ -340,18 +336,19 @@ class Likelihood:
             used = np.concatenate([np.asarray(chunk.weight)[..., 0] > 0 for chunk in chunks])
             x, y = (np.concatenate([np.asarray(getattr(chunk, name)) for chunk in chunks]) for name in "xy")
             extent = np.stack([-x, x, -y, y])[:, used.any(axis=1)].max(axis=1, initial=-np.inf)
-            return SlabSums(np.concatenate([sums, used.sum(axis=0)]), extent)
+            return np.concatenate([sums, used.sum(axis=0)]), extent
 
-        total = self.runner.total(label, key, work, self.layout)
-        *arrays, rows = np.split(total.sums, np.cumsum([math.prod(shape) for shape in shapes]))
-        low_x, high_x, low_y, high_y = (total.extent * np.array([-1.0, 1.0, -1.0, 1.0])).tolist()
+        slabs = self.runner.each(label, work, self.layout.points, self.layout.slab)
+        total, extent = functools.reduce(lambda a, b: (a[0] + b[0], np.maximum(a[1], b[1])), slabs)
+        *arrays, rows = np.split(total, np.cumsum([math.prod(shape) for shape in shapes]))
+        low_x, high_x, low_y, high_y = (extent * np.array([-1.0, 1.0, -1.0, 1.0])).tolist()
         census = Census(rows.astype(int), (low_x, high_x, low_y, high_y), self.cameras)
         return [array.reshape(shape) for array, shape in zip(arrays, shapes, strict=True)], census
 
     @cached_property
     def census(self) -> Census:
         """Count of what is used of the set: a pass of its own; an expansion brings its own census with it."""
-        return self._total("counting", "census", lambda _: (), ())[1]
+        return self._total("counting", lambda _: (), ())[1]
 
     @property
     def dof(self) -> int:

@@ -23,7 +23,7 @@ READING = 5
 LARGEST_SLAB = 1 << 26
 """Bytes of point data that are read together at most: larger slabs are no faster."""
 SLABS = 16
-"""A set is cut into so many slabs at least, if it has as many chunks: work for several threads and processes."""
+"""A set is cut into so many slabs at least, if it has as many chunks: work for several threads."""
 
 # ---------------------------------------------------------------------------------------- within one chunk
 
@@ -74,8 +74,6 @@ NEIGHBOURS = 256
 """Points of a sample that lie side by side: frames are read in rows, and single pixels cost as much as a row."""
 RUNS = (16, 128)
 """Smallest and largest number of runs of neighbours in a sample: spread over the field, yet few to read."""
-FINGERPRINT_POINTS = 4096
-"""Field points whose measurements go into the fingerprint of a set that was read: a change of the set shows in some."""
 LEVEL_POINTS = 256
 """Field points from which the start value of a throughput is taken: a start need not be exact."""
 

@@ -10,8 +10,9 @@ Programs are kept where JAX's cache folder has a folder `programs`, which the co
 they are code: the folder must be the user's own. A file that is damaged is made again.
 
 On CPU the fusion emitters of XLA compute shared sub-expressions over and over when a derivative of the plates is
-compiled (measured with jax 0.10.2: 35 s and 9.6 s a call instead of 3 s and 0.08 s), so they are switched off
-there where XLA has the option (that of jax 0.12 has not: a fit takes twice the CPU to begin with).
+compiled (measured with jax 0.10.2: a first fit takes 18 s of CPU instead of 11 s, later calls as long; plates solved
+one by one took 9.6 s a call instead of 0.08 s), so they are switched off there where XLA has the option (that of jax
+0.12 has not).
 `tests/model/test_compiled.py` keeps an eye on it. What is called once or twice is not worth optimising.
 """
 

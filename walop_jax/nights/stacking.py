@@ -69,6 +69,8 @@ REFERENCE = "reference.fits"
 TRACKS = "tracks.fits"
 FILES = (NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY)
 """The files of a survey."""
+PARTIAL = "partial"
+"""Folder of the nights that are made, until all are."""
 
 
 class _Data(NamedTuple):
