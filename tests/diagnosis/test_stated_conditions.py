@@ -213,8 +213,8 @@ def test_what_could_hide_is_ranked_by_what_it_does_to_stars():
     calibration = Calibration.from_fit(small_fit())
     x, y = small_fit().calset.points.x, small_fit().calset.points.y
     seen = []
-    for number, name in enumerate(hidden.names):
-        one = Hidden((name,), hidden.sizes[number : number + 1], ("",), hidden.changes[number : number + 1])
+    for number in range(len(hidden)):
+        one = Hidden(*(getattr(hidden, f.name)[number : number + 1] for f in dataclasses.fields(Hidden)))
         seen.append(np.nanmedian(dataclasses.replace(calibration, hidden=one).protection(x, y)[0]))
     assert len(seen) > 3
     assert all(after < 1.3 * before for before, after in itertools.pairwise(seen))  # at other points

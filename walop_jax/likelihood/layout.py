@@ -35,6 +35,7 @@ from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import values_of
 from walop_jax.model.plan import Plan, with_median
 from walop_jax.model.planning import outgrown, plan_for
 from walop_jax.model.specification import Model
@@ -132,6 +133,8 @@ def planned_instrument(calset: CalibrationSet, model: Model) -> Instrument:
 
     A fit that has made them thicker than the start has put them there.
     """
+    if np.array_equal(values_of(model.template), model.start):
+        return model.template
     start = model.instrument()
     return model.template if outgrown(start, model.template, curves_of(calset)) else start
 

@@ -129,12 +129,12 @@ def _follow(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
 
 def changed_elements(bare: Instrument, effect: Effect) -> tuple[Element, ...]:
     """The elements behind the polariser that an effect puts into an instrument or changes, with shapes for numbers."""
-    before = {id(element) for element in _behind_polariser(bare)}
 
-    def changed(effect: Effect) -> list[Element]:
+    def changed(bare: Instrument, effect: Effect) -> list[Element]:
+        before = {id(element) for element in _behind_polariser(bare)}
         return [element for element in _behind_polariser(effect.patch(bare)) if id(element) not in before]
 
-    return tuple(jax.eval_shape(changed, effect))
+    return tuple(jax.eval_shape(changed, bare, effect))
 
 
 def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
@@ -145,12 +145,16 @@ def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
 
 def conditions_of_effect(bare: Instrument, effect: Effect) -> frozenset[str]:
     """Conditions that the elements which an effect inserts or changes ask for, by names in `ray.CONDITIONS`."""
+    return _conditions_of_effect(*shapes_of((bare, effect)))
 
+
+@functools.lru_cache(maxsize=1024)
+def _conditions_of_effect(structure: Any, shapes: Shapes) -> frozenset[str]:
     def find() -> frozenset[str]:
-        changed = changed_elements(bare, effect)
+        changed = changed_elements(*of_shapes(structure, shapes))
         return frozenset(name for element in changed for name in _conditions_asked(*shapes_of(element)))
 
-    return answer("conditions_of_effect", *shapes_of((bare, effect)), find)
+    return answer("conditions_of_effect", structure, shapes, find)
 
 
 @functools.lru_cache(maxsize=1024)
