@@ -217,7 +217,7 @@ def test_what_could_hide_is_ranked_by_what_it_does_to_stars():
         one = Hidden(*(getattr(hidden, f.name)[number : number + 1] for f in dataclasses.fields(Hidden)))
         seen.append(np.nanmedian(dataclasses.replace(calibration, hidden=one).protection(x, y)[0]))
     assert len(seen) > 3
-    assert all(after <= 1.3 * before for before, after in itertools.pairwise(seen))  # at other points; 0: out of the beam
+    assert all(after <= 1.3 * before for before, after in itertools.pairwise(seen))  # 0: out of the beam
 
 
 @pytest.mark.parametrize("seed", quick(range(50, 55), [50]))
