@@ -27,6 +27,14 @@ def test_a_set_and_its_truth(call, tmp_path):
     assert known["seed"] == 3
 
 
+def test_what_is_hidden_is_printed_with_its_size(call, tmp_path):
+    effects = ("--effect", "clp_wobble=amplitude:0.06,phase:1.1", "--effect", "chwp_in_beam")
+    result = call("simulate", "-o", tmp_path / "set.fits", *SMALL, *effects)
+    assert (
+        "; clp_wobble=amplitude:0.06 deg, phase:1.1 rad; chwp_in_beam beyond the base model" in result.output
+    )
+
+
 def test_plate_and_narrow_bands(call, tmp_path):
     output = tmp_path / "set.fits"
     result = call(

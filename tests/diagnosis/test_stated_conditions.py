@@ -22,9 +22,11 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.detection_limits import condition_limits
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.limits_found import PROBABILITY
+from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.stated_conditions import (
     Singles,
     condition_scores,
+    instead_of_names,
     rival_conditions,
     stated_conditions,
 )
@@ -168,6 +170,18 @@ def test_a_name_that_explains_no_more_than_a_stated_number_is_told_beside_it():
     (told,) = rival_conditions(Design.of(wrong), named.chi2)
     assert "one number that the set states would, if it were " in told
     assert "the equinox of RA and DEC 20" in told
+
+
+def test_a_name_that_explains_a_fit_far_off_is_kept():
+    """Wollaston prisms turned by 0.3°: χ² in multiplied errors is not compared with χ² in those that are stated."""
+    turn = effect_from_text("wollaston_axis=0.3", SMALL.context())
+    calset = simulate(SMALL, seed=SEED, effects=[turn]).calset
+    wrong = refit(calset)
+    named = refit(calset, with_effects(wrong.model, [turn.neutral(SMALL.context())], SMALL.context()))
+    assert wrong.noise_scale > 2.0
+    assert named.noise_scale == 1.0
+    every = dataclasses.replace(POLICY, alarm=np.inf)
+    assert instead_of_names(wrong, named, every) == ""
 
 
 def test_scale_and_angle_are_sums_of_both_coordinates():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -209,6 +210,10 @@ def test_three_stars_that_lie_off_are_no_spot_and_no_optics():
     watch = study.watched(100, 2, odd)
     assert watch.holds
     assert not watch.changes
+    (sentence,) = watch.warnings
+    assert re.match(
+        r"[123] of 100 stars disagree with the calibration each by itself and were left out", sentence
+    )
 
 
 def test_a_change_that_nothing_within_its_range_describes_has_no_name(monkeypatch):

@@ -19,7 +19,7 @@ from walop_jax.commands.inputs import (
     catalogue_of,
     design_of,
 )
-from walop_jax.io.text import json_text, parse_toml, read_text
+from walop_jax.io.text import json_text, parse_toml, read_text, rounded
 
 if TYPE_CHECKING:
     from walop_jax import Effect, Instrument, ObservingPlan
@@ -154,7 +154,7 @@ def simulate(
         lambda: document,
         lambda: (
             f"{output}: {plan.name}, {document['exposures']} exposures of {document['points']} points; "
-            f"{', '.join(document['effects']) or 'nothing'} beyond the base model"
+            f"{'; '.join(map(_sized, hidden)) or 'nothing'} beyond the base model"
         ),
         next=(f"walop-jax refit {output} --instrument {file} -o RUN",) if plan.design.description else (),
     )
@@ -194,6 +194,19 @@ def _texts(effect: str | Sequence[str | Effect] | Mapping[str, Any] | None) -> S
         else f"{name}={given}"
         for name, given in effect.items()
     ]
+
+
+def _sized(effect: Effect) -> str:
+    """An effect as `--effect` writes it, with its units: wollaston_axis=angle:0.3 deg."""
+    import numpy as np
+
+    from walop_jax.model.parameters import field_declarations
+
+    numbers = [
+        f"{name}:{'/'.join(rounded(float(v)) for v in np.ravel(getattr(effect, name)))} {declared.unit}".rstrip()
+        for name, declared in field_declarations(type(effect)).items()
+    ]
+    return f"{effect.name}={', '.join(numbers)}" if numbers else effect.name
 
 
 def truth_document(plan: ObservingPlan, seed: int, instrument: Instrument) -> dict[str, Any]:

@@ -218,6 +218,8 @@ def instead_of_names(before: FitResult, after: FitResult, policy: Policy = POLIC
     """
     asked = [one for one in condition_scores(Design.of(before)) if one.score.testable]
     asked = [one for one in asked if corrected_p(one.score.log_p, len(asked)) < policy.alarm]
+    if after.noise_scale != before.noise_scale:  # one scale of the errors, or χ² of both are not comparable
+        after = fit(after.likelihood, start=after.values, noise_scale=before.noise_scale)
     best, told = log_evidence_ratio(before, after), ""
     for one in sorted(asked, key=lambda one: one.score.log_p)[:_FITTED]:
         found, size, result, now = one.stated, 0.0, before, one

@@ -167,7 +167,8 @@ def _verify(path: Path, hdus: list[Any], stream: io.BufferedIOBase) -> str:
         data_sum = _sum(stream, end - data, digest)
         declared = hdu.header.get("DATASUM")
         if declared is not None and str(declared).strip() != str(data_sum):
-            raise fail("the data do not agree with DATASUM", file=path, extension=name, advice=BROKEN)
+            advice = f"{BROKEN}, or with checksum=True if the data were edited on purpose"
+            raise fail("the data do not agree with DATASUM", file=path, extension=name, advice=advice)
         if "CHECKSUM" in hdu.header and _fold(header_sum + data_sum) not in (0, 0xFFFFFFFF):
             advice = f"{BROKEN}, or renew the checksum if the header was edited on purpose"
             raise fail("the bytes do not agree with CHECKSUM", file=path, extension=name, advice=advice)

@@ -109,7 +109,8 @@ def watch(
     if not parts:
         raise DataError("N: no star has a camera to spare beside flux, q and u; add rows at other settings")
     stars = StarResiduals.joined(parts)
-    return dataclasses.replace(Watching(stars, vectors).watch(), remarks=remarks)
+    found = Watching(stars, vectors).watch()
+    return dataclasses.replace(found, remarks=(*remarks, *found.remarks))
 
 
 def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[Catalogue], tuple[str, ...]]:
@@ -395,7 +396,23 @@ class Watching:
                 self.spoilt |= profile(self.spots.x, self.spots.y, (x, y, 1.5 * radius, edge)) > 0
             weight, share, whole = self.weights(residual)
             matrix, score = self.scan(residual, weight, share)
-        return self.told(changes, matrix, score, whole)
+        remarks = self.alone(residual, weight, whole)
+        return dataclasses.replace(self.told(changes, matrix, score, whole), remarks=remarks)
+
+    def alone(
+        self, residual: Float[np.ndarray, "r k"], weight: Float[np.ndarray, " s"], whole: Scale
+    ) -> tuple[str, ...]:
+        """A remark on stars that were left out as they disagree by more than noise ever does."""
+        dof = np.maximum(self.stars.dof.astype(float), 1e-12)
+        chi2 = self.stars.chi2(residual) / (self.variance * max(whole.value, 1.0))
+        odd = (weight == 0) & (self.stars.dof > 0) & (chi2 > special.chdtri(dof, ALARM / len(dof)))
+        if not odd.any():
+            return ()
+        worst = self.stars.first[np.argmax(np.where(odd, chi2, 0.0))]
+        return (
+            f"{odd.sum()} of {len(dof)} stars disagree with the calibration each by itself and were left out, the "
+            f"worst at X {self.stars.x[worst]:+.3f}°, Y {self.stars.y[worst]:+.3f}°: blends, cosmic rays, bad pixels?",
+        )
 
     def _likeliest(self, ways: list[Settled]) -> Settled | None:
         """The change behind which χ² is least, stars that are left out at their cut; others as good are alike."""
