@@ -110,8 +110,8 @@ def in_memory(columns: Any, name: str = "the table") -> InputTable:
     """A table given in memory, copied.
 
     It is an astropy table, a data frame, a structured array, a table of an open FITS file, or columns by name (arrays,
-    quantities, …). The index of a data frame is a column where it has a name. `name` is what errors call the table. Raises `DataError`
-    if it has no rows, or columns of different lengths.
+    quantities, …). The index of a data frame is a column where it has a name. `name` is what errors call the table.
+    Raises `DataError` if it has no rows, or columns of different lengths.
     """
     from astropy.io import fits
     from astropy.table import Table
