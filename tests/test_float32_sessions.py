@@ -15,6 +15,7 @@ from small_run import SMALL
 
 import walop_jax as walop
 from walop_jax.model.compiled import array, compiled, float64
+from walop_jax.model.elements import WavePlate
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import values_of
 
@@ -95,12 +96,14 @@ def test_the_switch_is_for_the_block(single):
 
 def test_what_the_session_compiles_is_refused(single):
     """A forward model made, or kept, in a session of float32, and the matrices of an instrument."""
+    mine = jnp.ones(1)  # alive: the session is left as it is
     with pytest.raises(RuntimeError, match="float64, which is switched off"):
         walop.forward(SMALL)
     with float64():
         forward = walop.forward(SMALL)
         values = np.asarray(forward.start)
         instrument = forward.instrument(values)
+        plate = next(e for e in instrument.arms[0].elements if isinstance(e, WavePlate))
         flux = np.ones(forward.shape[:2])
     asked = [
         *(
@@ -114,11 +117,12 @@ def test_what_the_session_compiles_is_refused(single):
         lambda values: forward.chi2(instrument),
         lambda values: forward.full(values[np.asarray(forward.free)]),
         lambda values: instrument.mueller(0.1, 0.05, 0.6, {"CHWP": 45.0}),
-        lambda values: instrument.arms[0].plate.retardance(2.0, 30.0, 0.6),
+        lambda values: plate.retardance(2.0, 30.0, 0.6),
     ]
     for function in asked:
         with pytest.raises(RuntimeError, match="float64, which is switched off"):
             function(values)
+    assert mine.dtype == jnp.ones(1).dtype == jnp.float32
 
 
 def test_values_in_float32_are_numbers_and_no_precision():

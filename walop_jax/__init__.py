@@ -49,9 +49,10 @@ def __getattr__(name: str) -> Any:
 
 
 def _switch_on_float64() -> None:
-    """Let JAX compute in float64 if nothing has been computed in 32 bits yet; otherwise leave the session as it is."""
+    """Let JAX compute in float64 if nothing has been computed yet; otherwise leave the session as it is."""
+    fresh = "jax" not in sys.modules
     jax = importlib.import_module("jax")
-    if not jax.config.jax_enable_x64 and not any("32" in str(array.dtype) for array in jax.live_arrays()):
+    if not jax.config.jax_enable_x64 and (fresh or not jax.live_arrays()):
         jax.config.update("jax_enable_x64", True)
 
 
