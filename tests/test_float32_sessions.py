@@ -11,8 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_run import SMALL
 
+import walop_jax as walop
 from walop_jax.model.compiled import array, compiled, float64
+from walop_jax.model.elements import WavePlate
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import values_of
 
@@ -89,3 +92,46 @@ def test_the_switch_is_for_the_block(single):
     with float64(), float64():
         assert jnp.ones(1).dtype == jnp.float64
     assert jnp.ones(1).dtype == jnp.float32
+
+
+def test_what_the_session_compiles_is_refused(single):
+    """A forward model made, or kept, in a session of float32, and the matrices of an instrument."""
+    mine = jnp.ones(1)  # alive: the session is left as it is
+    with pytest.raises(RuntimeError, match="float64, which is switched off"):
+        walop.forward(SMALL)
+    with float64():
+        forward = walop.forward(SMALL)
+        values = np.asarray(forward.start)
+        instrument = forward.instrument(values)
+        plate = next(e for e in instrument.arms[0].elements if isinstance(e, WavePlate))
+        flux = np.ones(forward.shape[:2])
+    asked = [
+        *(
+            getattr(forward, name)
+            for name in ("counts", "flux", "residuals", "chi2", "log_density", "log_prior")
+        ),
+        forward.instrument,
+        jax.jit(forward.chi2),
+        jax.grad(forward.chi2),
+        lambda values: forward.counts(values, flux),
+        lambda values: forward.chi2(instrument),
+        lambda values: forward.full(values[np.asarray(forward.free)]),
+        lambda values: instrument.mueller(0.1, 0.05, 0.6, {"CHWP": 45.0}),
+        lambda values: plate.retardance(2.0, 30.0, 0.6),
+    ]
+    for function in asked:
+        with pytest.raises(RuntimeError, match="float64, which is switched off"):
+            function(values)
+    assert mine.dtype == jnp.ones(1).dtype == jnp.float32
+
+
+def test_values_in_float32_are_numbers_and_no_precision():
+    """Rounded values make the instrument that the same numbers in float64 make, in float64."""
+    forward = walop.forward(SMALL)
+    rounded = np.asarray(forward.start, np.float32)
+    wanted = jax.tree.leaves(forward.instrument(rounded.astype(np.float64)))
+    for values in (rounded, jnp.asarray(rounded)):
+        for leaf, same in zip(jax.tree.leaves(forward.instrument(values)), wanted, strict=True):
+            assert leaf.dtype == same.dtype
+            np.testing.assert_array_equal(leaf, same)
+    assert forward.full(rounded[np.asarray(forward.free)]).dtype == np.float64

@@ -160,3 +160,17 @@ def test_columns_that_are_not_used_or_replaced_are_named(call, fitted: FittedSet
     made = walop.matrix(fitted.calibration, given)
     made["x"] *= 60.0
     assert given["x"][0] == 0.1
+
+
+def test_columns_of_the_call_add_to_a_table_of_any_form(fitted: FittedSet, tmp_path: Path):
+    """A setting for all rows beside a table: its remarks and header stay, and its form does not matter."""
+    table = Table({"X": [0.1, 0.2], "Y": [0.0, 0.1], "NOTE": [1, 2]}, meta={"OBSERVER": "me"})
+    wanted = walop.matrix(fitted.calibration, points=table, teff=4000.0)
+    assert wanted.meta["OBSERVER"] == "me"
+    for given in (table.as_array(), table.to_pandas(), {name: table[name] for name in table.colnames}):
+        found = walop.matrix(fitted.calibration, points=given, teff=4000.0)
+        np.testing.assert_array_equal(found["M21"], wanted["M21"])
+    (tmp_path / "t.csv").write_text("X;Y\n0,1;0,0\n0,2;0,1\n")
+    found = walop.matrix(fitted.calibration, points=tmp_path / "t.csv", teff=4000.0)
+    np.testing.assert_array_equal(found["M21"], wanted["M21"])
+    assert "columns are separated by semicolons, decimals by commas" in found.meta["REMARK"]

@@ -80,8 +80,9 @@ def test_bad_tables_are_refused(tmp_path, text, message):
 def test_files_that_are_no_tables(tmp_path):
     with pytest.raises(DataError, match="no such file"):
         read(tmp_path / "none.csv")
+    (tmp_path / "points.h5").write_bytes(b"\x89HDF")
     with pytest.raises(DataError, match=r"\.ecsv"):
-        read(tmp_path / "points.txt")
+        read(tmp_path / "points.h5")
     (tmp_path / "p.fits").write_bytes(b"not FITS")
     with pytest.raises(DataError, match="FITS"):
         read(tmp_path / "p.fits")

@@ -528,3 +528,85 @@ def test_the_table_that_fits_is_taken_or_can_be_named(tmp_path):
     fits.HDUList([fits.PrimaryHDU(), log, log.copy()]).writeto(path, overwrite=True)
     with pytest.raises(DataError, match="none of the tables LOG, LOG has X and Y"):
         read_input_table(path)
+
+
+# ---------------------------------------------------------------------------------------------- other forms of tables
+
+
+def test_the_index_of_a_data_frame_is_a_column():
+    """Identifiers that are an index, as `set_index` makes it, hold rows together as a column does."""
+    columns = {f"N{k}": np.full(ROWS, 1e6) + np.arange(ROWS) + k for k in range(4)}
+    columns |= {f"N{k}_ERR": np.full(ROWS, 1e3) for k in range(4)} | {"X": 0.1, "Y": 0.1}
+    frame = pd.DataFrame(columns | {"ID": ["a", "a", "b", "b", "c"]})
+    assert read(frame.set_index("ID")).star.tolist() == [0, 0, 1, 1, 2]
+    assert read(frame.set_index("ID", drop=False)).star.tolist() == [0, 0, 1, 1, 2]
+    assert read(frame.assign(FRAME=1).set_index(["FRAME", "ID"])).star.tolist() == [0, 0, 1, 1, 2]
+    assert "index" not in in_memory(frame).table.colnames
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda t: t.as_array(),
+        lambda t: t.as_array().view(np.recarray),
+        fits.BinTableHDU,
+        lambda t: fits.BinTableHDU(t).data,
+    ],
+    ids=["structured", "recarray", "hdu", "fits data"],
+)
+def test_structured_arrays_and_tables_of_open_files_are_tables(form):
+    given = table(
+        ID=[7, 7, 8, 8, 9], CHWP_ANGLE=[0.0, 22.5, 0.0, 22.5, 0.0], CHWP_IN=[True, False] * 2 + [True]
+    )
+    found = read(form(given))
+    assert found.star.tolist() == [0, 0, 1, 1, 2]
+    np.testing.assert_array_equal(found.counts, given["N"])
+    np.testing.assert_array_equal(found.points.settings.positions["CHWP"], [0.0, np.nan, 0.0, np.nan, 0.0])
+
+
+def test_undefined_numbers_of_an_open_file_are_missing():
+    """TNULL holds for data that a user has opened as well."""
+    column = fits.Column("ID", "J", null=-7, array=np.array([5, -7, -7, 5, 6]))
+    parts = [column, *fits.BinTableHDU(table()).columns]
+    assert read(fits.BinTableHDU.from_columns(parts).data).star.tolist() == [0, 2, 3, 0, 1]
+
+
+def test_a_plate_whose_place_is_not_given_is_where_its_angle_says():
+    """An undefined CHWP_IN is as if the column were absent, also where the calibration forbids that."""
+    stated = MaskedColumn([True, True, False, False, True], mask=[0, 1, 0, 1, 0])
+    angles = [10.0, 20.0, 30.0, 40.0, 50.0]
+    for place in (stated, ["T", "", "F", "n/a", "T"]):
+        positions = read(table(CHWP_ANGLE=angles, CHWP_IN=place)).points.settings.positions["CHWP"]
+        np.testing.assert_array_equal(positions, [10.0, 20.0, np.nan, 40.0, 50.0])
+        with pytest.raises(DataError, match=r"no exposure .* in rows 1, 3"):
+            read(table(CHWP_ANGLE=angles, CHWP_IN=place), never_in=["CHWP"])
+
+
+def test_flags_of_field_points_are_no_flags_of_cameras():
+    """FLAG of an earlier `matrix` is about a place of the field."""
+    results = {name: np.zeros(ROWS) for name in ("M21", "M21_ERR", "M22_ERR", "P_ERR")}
+    assert not read(table(**results, FLAG=[16, 32, 0, 0, 64])).spoilt.any()
+
+
+def test_a_column_is_renamed_whatever_names_there_are():
+    given = in_memory(table(FLAG=np.zeros(ROWS, int), N_FLAG=0, OLD_FLAG=1, OLDER_FLAG=2))
+    read_catalogue(given, SOUTH)
+    names = extended(given, {"FLAG": np.ones(ROWS, int)}).colnames
+    assert len(set(names)) == len(names) == 9
+    assert "OLD_OLD_FLAG" in names
+
+
+@pytest.mark.parametrize("name", ["t.fts", "t.cat", "t", "t.fits.gz", "t.fts.gz"])
+def test_fits_is_known_by_its_content(tmp_path, name):
+    table().write(tmp_path / "t.fits")
+    content = (tmp_path / "t.fits").read_bytes()
+    (tmp_path / name).write_bytes(gzip.compress(content) if name.endswith(".gz") else content)
+    assert len(read_catalogue(read_input_table(tmp_path / name), SOUTH)) == ROWS
+
+
+@pytest.mark.parametrize("name", ["t.txt", "t.dat", "t.dat.gz"])
+def test_texts_of_other_names_are_read(tmp_path, name):
+    content = b"X Y TEFF\n0.1 0.2 5000\n0.2 0.1 6000\n"
+    (tmp_path / name).write_bytes(gzip.compress(content) if name.endswith(".gz") else content)
+    points = field_points(read_input_table(tmp_path / name), SOUTH)
+    assert points.settings.teff.tolist() == [5000.0, 6000.0]

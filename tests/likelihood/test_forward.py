@@ -171,6 +171,8 @@ def test_a_flux_that_is_given(scene: Forward):
     counts = scene.counts(scene.start, flux)
     np.testing.assert_allclose(scene.counts(scene.start, 3.0 * flux), 3.0 * counts, rtol=1e-12)
     assert counts.shape == scene.shape
+    best = scene.flux(scene.start)  # with an axis of groups of cameras
+    np.testing.assert_allclose(scene.counts(scene.start, best), scene.counts(scene.start), rtol=1e-13)
 
 
 def test_memory_of_a_gradient_is_flat_in_the_points():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import builtins
 import collections.abc
+import contextlib
 import functools
 import inspect
 import numbers
@@ -42,6 +43,8 @@ WORDS = {
 }
 """Kinds of arguments, as messages name them."""
 
+
+IN_THE_SESSION = ("forward",)
 
 OF_MODELS = ("free", "fixed", "fix", "frozen", "start", "prior", "priors", "tie", "ties", "bounds")
 IN_THE_MODEL = (
@@ -127,7 +130,10 @@ def bound(
 
 
 def checked(function: Callable[..., Any], name: str) -> Callable[..., Any]:
-    """The function with its arguments looked at before the call, which computes in float64."""
+    """The function with its arguments looked at before the call, which computes in float64.
+
+    What the session itself compiles later (`IN_THE_SESSION`) is made in the session as it is.
+    """
     from walop_jax.model.compiled import float64
 
     signature = inspect.signature(function)
@@ -135,7 +141,7 @@ def checked(function: Callable[..., Any], name: str) -> Callable[..., Any]:
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
         bound(name, signature, function, args, kwargs)
-        with float64():
+        with contextlib.nullcontext() if name in IN_THE_SESSION else float64():
             return function(*args, **kwargs)
 
     run.__module__, run.__qualname__ = "walop_jax", name  # where it is found again, by pickle as well

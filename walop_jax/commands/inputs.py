@@ -275,15 +275,17 @@ def table_of(given: Any, columns: Mapping[str, Any]) -> InputTable:
     """A table: a file of one, an astropy table, or columns by name; `columns` are added, or stand in place of its."""
     from walop_jax.data.user_tables import in_memory, read_input_table
 
-    read = read_input_table(given) if isinstance(given, str | os.PathLike) else None
-    if read is not None and not columns:
+    named = {name.upper(): values for name, values in columns.items()}
+    if isinstance(given, Mapping):
+        return in_memory({key: given[key] for key in given if str(key).upper() not in named} | named)
+    read = read_input_table(given) if isinstance(given, str | os.PathLike) else in_memory(given)
+    if not named:
         return read
-    table: Any = given if read is None else read.table
-    if columns:
-        named = {name.upper(): values for name, values in columns.items()}
-        kept = [key for key in getattr(table, "colnames", table) if str(key).upper() not in named]
-        table = {key: table[key] for key in kept} | named
-    return in_memory(table) if read is None else in_memory(table, str(read.path))
+    kept = {key: read.table[key] for key in read.table.colnames if str(key).upper() not in named}
+    made = in_memory(kept | named, str(read.path))
+    made.table.meta.update(read.table.meta)
+    made.remarks.extend(read.remarks)
+    return made
 
 
 def in_bytes(memory: float | None) -> float | None:

@@ -19,6 +19,7 @@ from walop_jax.data.settings import TEMPERATURE, Settings
 from walop_jax.data.user_tables import (
     MISSING,
     InputTable,
+    empty_cells,
     numeric_column,
     plain_column,
     read_input_table,
@@ -134,12 +135,15 @@ def field_points(
             raise place.fail(what, name, advice)
         angle = numeric_column(source, name, EXPOSURES["CLP_ANGLE"])
         _doubt_radians(source, name, angle, place)
-        inside = np.isfinite(angle)
+        inside, unstated = np.isfinite(angle), np.ones(source.rows, bool)
         if f"{prefix}_IN" in source.names:
-            inside = numeric_column(source, f"{prefix}_IN", EXPOSURES["CHWP_IN"])
-        elif prefix in never_in:
+            rule = EXPOSURES["CHWP_IN"]
+            unstated = empty_cells(source, f"{prefix}_IN", rule)
+            inside = np.where(unstated, inside, numeric_column(source, f"{prefix}_IN", rule))
+        if prefix in never_in:
             what = f"has values, but no exposure of the calibration had {prefix} in the beam: was it, in"
-            place.refuse(inside, what, name, f"add {prefix}_IN: F where it was out, T where it was in")
+            advice = f"add {prefix}_IN: F where it was out, T where it was in"
+            place.refuse(inside & unstated, what, name, advice)
         advice = f"{prefix}_IN is true: give the angle"
         place.refuse(inside & ~np.isfinite(angle), "is not finite", name, advice)
         check({name: angle}, {name: EXPOSURES["CLP_ANGLE"]}, place)
@@ -292,15 +296,15 @@ def read_catalogue(
     )
 
 
+_OF_RESULTS = ({"QU_COV", "P_DEBIASED"}, {"M21_ERR", "M22_ERR", "P_ERR"})
+"""Columns of `apply` and of `matrix`: where they are, FLAG is that of a star or of a point, not of cameras."""
+
+
 def _flagged(source: InputTable, cameras: Sequence[str], place: Place) -> Bool[np.ndarray, "n k"]:
     """Cameras that the catalogue itself says are not to be used: N_FLAG, FLAG, or a column for each camera."""
     flagged = np.zeros((source.rows, len(cameras)), bool)
-    names = ["N_FLAG"]
-    if not {"QU_COV", "P_DEBIASED"} <= set(
-        source.names
-    ):  # else FLAG is that of a star, of an earlier `apply`
-        names.append("FLAG")
-    for name in names:
+    earlier = any(names <= set(source.names) for names in _OF_RESULTS)
+    for name in ("N_FLAG",) if earlier else ("N_FLAG", "FLAG"):
         if source.column(name) is not None:
             flagged |= _bits(source, name, len(cameras), place)
     for k, camera in enumerate(cameras):

@@ -18,6 +18,7 @@ from walop_jax.io.plain_tables import table_format
 from walop_jax.io.text import check_input, some, unpacking
 
 _PACKED = (".gz", ".bz2", ".xz")
+_ALSO = {".tsv": "ascii.csv", ".txt": "ascii.csv", ".dat": "ascii.csv", ".xml": "votable"}
 _SEPARATORS = (",", ";", "\t", "|")
 _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
 _LOOKED_AT = 200  # lines, for their separators of decimals
@@ -34,12 +35,14 @@ def read_table_file(path: Path, needed: Collection[str]) -> tuple[Path, Any, tup
     table.
     """
     path, extension = _extension_of(path)
-    kind = "" if path.suffix.lower() == ".zip" else _format(path)
     path = check_input(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            if kind == "fits" or _begins(path, b"SIMPLE  ="):
+            if _begins(path, b"SIMPLE  ="):  # whatever its name is
+                return path, *_from_fits(path, extension, needed)
+            kind = "" if path.suffix.lower() == ".zip" else _format(path)
+            if kind == "fits":
                 return path, *_from_fits(path, extension, needed)
             content, inside = _content(path)
             kind = kind or _format(Path(inside))
@@ -61,7 +64,7 @@ def _extension_of(path: Path) -> tuple[Path, str]:
 
 def _format(path: Path) -> str:
     plain = path.with_suffix("") if path.suffix.lower() in _PACKED else path
-    return "ascii.csv" if plain.suffix.lower() == ".tsv" else table_format(plain)
+    return _ALSO.get(plain.suffix.lower()) or table_format(plain)
 
 
 def _content(path: Path) -> tuple[bytes, str]:
@@ -92,8 +95,6 @@ def _astropy_table(content: bytes | str, kind: str, **options: Any) -> Any:
 
 def _from_fits(path: Path, extension: str, needed: Collection[str]) -> tuple[Any, tuple[str, ...]]:
     """The table of a FITS file that is named, or the only one that has the columns that are needed."""
-    from astropy.table import Table
-
     with open_fits(path) as opened:
         tables = {n: hdu for n, hdu in enumerate(opened.hdus) if type(hdu).__name__ == "BinTableHDU"}
         labels = {n: hdu.name or str(n) for n, hdu in tables.items()}
@@ -115,12 +116,20 @@ def _from_fits(path: Path, extension: str, needed: Collection[str]) -> tuple[Any
             what = f"has several tables that could be meant ({several})"
             raise fail(what, file=path, advice=f"name one: {path.name}[{labels[chosen[0]]}]")
         hdu = tables[chosen[0]]
-        table = Table.read(hdu, character_as_bytes=False)
-        _hide_undefined(table, hdu)
-        _times(table, hdu)
+        table = table_of_hdu(hdu)
     others = [label for n, label in labels.items() if n != chosen[0]]
     remark = f"the table {labels[chosen[0]]} is read, not {some(others, 5)}"
     return table, (remark,) if others and not extension else ()
+
+
+def table_of_hdu(hdu: Any) -> Any:
+    """The astropy table of an extension: what is undefined is masked, and times are such."""
+    from astropy.table import Table
+
+    table = Table.read(hdu, character_as_bytes=False)
+    _hide_undefined(table, hdu)
+    _times(table, hdu)
+    return table
 
 
 def _hide_undefined(table: Any, hdu: Any) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.data.schema import Column, Place, converted, distinct, without_mask
-from walop_jax.data.table_files import read_table_file
+from walop_jax.data.table_files import read_table_file, table_of_hdu
 from walop_jax.io.errors import fail, rows_text
 from walop_jax.io.fits_reading import one_line
 from walop_jax.io.text import in_ascii, some
@@ -76,7 +76,10 @@ class InputTable:
 
     def new_name(self, name: str) -> str:
         """The name of a column of the user's that is used and has the name of one that is added."""
-        return next(new for new in (f"N_{name}", f"OLD_{name}", f"OLDER_{name}") if new not in self.names)
+        new = f"N_{name}"
+        while new in self.names:
+            new = f"OLD_{new.removeprefix('N_')}"
+        return new
 
 
 def _columns(names: Sequence[str]) -> str:
@@ -104,17 +107,27 @@ def read_input_table(path: str | os.PathLike[str], needed: Collection[str] = ("X
 
 
 def in_memory(columns: Any, name: str = "the table") -> InputTable:
-    """A table given in memory, copied: an astropy table or data frame, or columns by name (arrays, quantities, …).
+    """A table given in memory, copied.
 
-    `name` is what errors call it. Raises `DataError` if it has no rows, or columns of different lengths.
+    It is an astropy table, a data frame, a structured array, a table of an open FITS file, or columns by name (arrays,
+    quantities, …). The index of a data frame is a column where it has a name. `name` is what errors call the table.
+    Raises `DataError` if it has no rows, or columns of different lengths.
     """
+    from astropy.io import fits
     from astropy.table import Table
 
     try:
         if isinstance(columns, Table):
             table = Table(columns)  # quantities become columns with a unit
+        elif isinstance(columns, fits.FITS_rec | fits.BinTableHDU):
+            hdu = fits.BinTableHDU(columns) if isinstance(columns, fits.FITS_rec) else columns
+            table = Table(table_of_hdu(hdu))
+        elif getattr(getattr(columns, "dtype", None), "names", None):
+            table = Table(columns)
         elif hasattr(columns, "to_numpy") and hasattr(columns, "columns"):  # a data frame
-            table = Table.from_pandas(columns)
+            levels = getattr(getattr(columns, "index", None), "names", ())
+            named = [level for level in levels if level is not None and level not in columns.columns]
+            table = Table.from_pandas(columns.reset_index(named) if named else columns)
         else:
             arrays = {
                 str(key): values if np.ndim(values) and hasattr(values, "jd1") else np.atleast_1d(values)
@@ -211,6 +224,14 @@ def plain_column(
         raise place.fail("is no plain column", name, "give a column of numbers or texts")
     values, masked = without_mask(column)
     return values, masked, str(getattr(column, "unit", None) or "")
+
+
+def empty_cells(source: InputTable, name: str, rule: Column) -> Bool[np.ndarray, " n"]:
+    """True where a column has no value: masked, or a text that says so."""
+    values, empty, _ = plain_column(source.column(name), name, rule, Place(source.path, ""))
+    if values.dtype.kind in "OSU":
+        empty = empty | np.isin(np.char.lower(np.char.strip(values.astype(str))), MISSING)
+    return np.any(empty.reshape(source.rows, -1), axis=1)
 
 
 def _cells(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_file import base_model
-from walop_jax.likelihood.forward import Forward
+from walop_jax.likelihood.forward import WHAT, Forward
+from walop_jax.model.compiled import need_float64
 from walop_jax.model.specification import Model
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import as_planned
@@ -21,6 +22,7 @@ def forward(calset: CalibrationSet | ObservingPlan, model: Model | None = None) 
     >>> bool(forward.log_density(forward.start) < forward.log_density(result.values))
     True
     """
+    need_float64(WHAT)
     if isinstance(calset, ObservingPlan):
         calset = as_planned(calset)
     return Forward.of(calset, base_model(calset) if model is None else model)

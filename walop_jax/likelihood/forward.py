@@ -28,13 +28,15 @@ from walop_jax.likelihood import engine, limits, optics
 from walop_jax.likelihood.engine import PointData
 from walop_jax.likelihood.layout import Layout, PointReader
 from walop_jax.likelihood.likelihood import PriorRows, prior_rows
-from walop_jax.model.compiled import array
+from walop_jax.model.compiled import array, need_float64
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import check_names, values_of, with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import Model
 
 Values = Float[Any, " n"]
+
+WHAT = "the forward model"  # in messages
 
 
 class Forward(eqx.Module):
@@ -63,13 +65,9 @@ class Forward(eqx.Module):
     def of(cls, calset: CalibrationSet, model: Model, chunk: int | None = None) -> Forward:
         """The forward model of a set that fits into memory, `chunk` points at a time (None: by the kind of machine).
 
-        Raises RuntimeError when float64 is switched off: what a session compiles has its precision.
+        Raises RuntimeError when float64 is switched off, as the methods do: what a session compiles has its precision.
         """
-        if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-            raise RuntimeError(
-                "the forward model is computed in float64, which is switched off: call "
-                'jax.config.update("jax_enable_x64", True) before anything else, or set JAX_ENABLE_X64=1'
-            )
+        need_float64(WHAT)
         if chunk is None:
             on_cpu = jax.default_backend() == "cpu"
             chunk = limits.FORWARD_CHUNK if on_cpu else limits.FORWARD_CHUNK_OF_ACCELERATORS
@@ -114,37 +112,43 @@ class Forward(eqx.Module):
         Raises ValueError, with the nearest names, for one that does not exist.
         """
         check_names("parameter", named, self.names)
+        need_float64(WHAT)
         index = [self.names.index(name) for name in named]
         return self._tied(self.start.at[np.array(index, int)].set(jnp.array(list(named.values()), float)))
 
     def full(self, free: Float[Any, " f"]) -> Values:
         """All values from those of the free parameters."""
-        return self._tied(self.start.at[self.free].set(free))
+        need_float64(WHAT)
+        return self._tied(self.start.at[self.free].set(jnp.asarray(free, float)))
 
     def _tied(self, values: Values) -> Values:
-        return values[self.master]
+        need_float64(WHAT)
+        return jnp.asarray(values, float)[self.master]
 
     def instrument(self, values: Values) -> Instrument:
         """The instrument with these values in the place of its parameters."""
-        return with_values(self.template)(self._tied(jnp.asarray(values)))
+        return with_values(self.template)(self._tied(values))
 
     # ------------------------------------------------------------------------------------ what is measured
 
     def counts(
-        self, values: Values | Instrument, flux: Float[Any, "p e"] | None = None
+        self, values: Values | Instrument, flux: Float[Any, "p e *f"] | None = None
     ) -> Float[Array, "p e k"]:
         """Counts (electrons) of every camera, for a flux (electrons per unit of unpolarised light) or the best one.
 
-        With the best flux they are 0 where no intensity is used.
+        A flux is that of all cameras, or has an axis of their groups as in `flux`. With the best flux they are 0 where
+        no intensity is used.
         """
-        given = None if flux is None else self._chunked(jnp.asarray(flux)[..., None])
+        if flux is not None:
+            flux = jnp.asarray(flux, float)
+            flux = self._chunked(flux if flux.ndim > 2 else flux[..., None])
 
         def of(point: PointData, flux: Array | None) -> Array:
             instrument, unit = self._unit(values, point)
             flux = engine.best_flux(instrument, self.plan, unit, point) if flux is None else flux
             return engine.real_counts(instrument, self.plan, unit, flux)
 
-        return self._whole(jax.lax.map(lambda part: jax.vmap(of)(*part), (self.data, given)))
+        return self._whole(jax.lax.map(lambda part: jax.vmap(of)(*part), (self.data, flux)))
 
     def flux(self, values: Values | Instrument) -> Float[Array, "p e f"]:
         """Best flux of every (point, exposure), one for each group of cameras that has one in common."""
@@ -174,7 +178,7 @@ class Forward(eqx.Module):
     def log_prior(self, values: Values) -> Float[Array, ""]:
         """Logarithm of the prior of the free parameters, weak pulls included, without its constant."""
         index, mean, width = self.prior
-        return -0.5 * jnp.sum(((self._tied(jnp.asarray(values))[index] - mean) / width) ** 2)
+        return -0.5 * jnp.sum(((self._tied(values)[index] - mean) / width) ** 2)
 
     def log_density(self, values: Values) -> Float[Array, ""]:
         """Logarithm of the posterior density, without its constant."""
@@ -184,10 +188,11 @@ class Forward(eqx.Module):
 
     def _unit(self, values: Values | Instrument, point: PointData) -> tuple[Instrument, Float[Array, "e k"]]:
         """The instrument, and the counts of a point for light of unit flux."""
+        need_float64(WHAT)
         if isinstance(values, Instrument):
             instrument, vector = values, values_of(values)
         else:
-            vector = self._tied(jnp.asarray(values))
+            vector = self._tied(values)
             instrument = with_values(self.template)(vector)
         x, y = engine.field_sites(instrument, point)
         base = values if isinstance(values, Instrument) else self.template

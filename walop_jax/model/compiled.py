@@ -257,6 +257,15 @@ def float64() -> contextlib.AbstractContextManager[Any]:
     return here.enable_x64(True)
 
 
+def need_float64(what: str) -> None:
+    """Raise RuntimeError, with the remedy, where float64 is switched off for what the session itself compiles."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise RuntimeError(
+            f"{what} is computed in float64, which is switched off: call "
+            'jax.config.update("jax_enable_x64", True) before anything else, or set JAX_ENABLE_X64=1'
+        )
+
+
 def _refuse_float32(args: tuple[Any, ...]) -> None:
     """Raise RuntimeError, with the remedy, for numbers that were made in float32: they have lost their digits."""
     if jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]

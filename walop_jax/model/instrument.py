@@ -34,7 +34,7 @@ from walop_jax.io.errors import nearest
 from walop_jax.model import fold, legendre
 from walop_jax.model.build import parts, with_origins
 from walop_jax.model.cameras import Cameras, Throughput
-from walop_jax.model.compiled import array
+from walop_jax.model.compiled import array, need_float64
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH, Units
 from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate
 from walop_jax.model.elements.wave_plate import MODELS
@@ -222,8 +222,9 @@ class Instrument(Component):
         those of moving elements in the beam, by the prefix of their columns ({"CHWP": 45.0}); the others are out.
         `conditions` are those of `ray.CONDITIONS` that the optics depend on (temperature in Celsius, hour_angle in h).
         Raises ValueError for a moving element that the instrument does not have, and `NotPlannedError` for a condition
-        that is missing.
+        that is missing, RuntimeError when float64 is switched off.
         """
+        need_float64("the Mueller matrix")
         instrument, angles = self.patched(), dict(angles or {})
         moving = instrument.moving()
         check_names("moving element", angles, moving)

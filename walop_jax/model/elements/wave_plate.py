@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.io.errors import nearest
 from walop_jax.model import materials, mueller, plates
+from walop_jax.model.compiled import need_float64
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
@@ -181,8 +182,9 @@ class WavePlate(Element):
 
         `azimuth` (deg) of the plane of incidence counts from +X toward +Y, `wavelength` is in µm, the temperature in
         Celsius. Arrays broadcast. Positive is a lead of the wave along the fast axis of the last layer.
-        Raises ValueError for a plate without layers.
+        Raises ValueError for a plate without layers, RuntimeError when float64 is switched off.
         """
+        need_float64("the retardance")
         if not self.layers:
             raise ValueError(f"element {self.name!r} has no layers, hence no retardance")
         incidence, azimuth, wavelength = jnp.broadcast_arrays(
