@@ -79,7 +79,7 @@ LINES = {
     "stack": [Line("stack RUN -o SURVEY", "survey", "seconds")],
     "model": [Line("model set.fits --effect clp_zero -o model.toml", takes="seconds")],
     "instrument": [Line("instrument WALOP-SOUTH")],
-    "import-zemax": [Line("import-zemax exports -o design.fits", takes="seconds")],
+    "import-zemax": [Line("import-zemax exports -o design.fits", takes="minutes")],
     "trace": [Line("trace RUN --x 0.1 --y 0.2 --q 0.01")],
     "cite": [Line("cite RUN"), Line("cite RUN --bibtex")],
     "conformance": [Line("conformance --make PACK")],
@@ -249,4 +249,7 @@ def _typed(line: str, call: Call) -> None:
     if words[0] == "plan":
         words += ["--draws", "1"]  # as good a plan takes twenty times as long
     done = call(*words)
+    if "design.fits" in words:  # transmissions of no instrument: no model explains them
+        assert "the fit did not converge" in done.output
+        return
     assert done.exit_code in (0, UNTRUSTED), f"{line}: {done.output}"

@@ -73,5 +73,5 @@ def test_what_limits_it_is_what_alone_is_uncertain():
     # A diattenuation of the light ahead of everything is an offset of q: 0.002, but for what p does to second order.
     np.testing.assert_allclose(found.hidden, 0.002, rtol=0.1)
     told = dict(found.facts())
-    assert told["could hide"].endswith("from the scale of X and Y (if wrong by 2 %)")
+    assert told["from"] == "the scale of X and Y (if wrong by 2 %)"
     assert told["to see that"] == check

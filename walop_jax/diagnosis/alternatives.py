@@ -232,7 +232,7 @@ def _of_some_exposures(likelihood: Likelihood, worst: Sequence[int]) -> Iterator
 
 
 def refuse_dead_cameras(result: FitResult) -> None:
-    """Raise `DataError` for a camera with the same number at all field points of all exposures.
+    """Raise `DataError` for a camera with one and the same number at all field points in all exposures.
 
     A fit takes that for a camera that sees little light.
     """
@@ -242,11 +242,11 @@ def refuse_dead_cameras(result: FitResult) -> None:
     counts = np.where(block.used[..., None], block.counts, np.nan)[:, seen]
     if not seen.any():
         return
-    still = np.all(np.nanmax(counts, axis=0) == np.nanmin(counts, axis=0), axis=0)
+    still = np.nanmax(counts, axis=(0, 1)) == np.nanmin(counts, axis=(0, 1))
     if still.any():
         names = ", ".join(np.array(result.model.template.cameras.names)[still])
         raise DataError(
-            f"INTENSITIES, N: camera {names} has the same number at all field points: it was dead, or its column was "
+            f"INTENSITIES, N: camera {names} has the same number everywhere: it was dead, or its column was "
             "not filled; check it, or describe an instrument without it"
         )
 

@@ -120,7 +120,7 @@ class FieldAccuracy:
             each = unmeasured(self.not_measured).items()
             lines.append(("not measured", "; ".join(f"{name}: {off_by(*one.error)}" for name, one in each)))
         if self.hidden > 0:
-            lines.append(("could hide", f"{off_by(self.hidden, self.hidden_worst)} from {self.hidden_by}"))
+            lines += [("could hide", off_by(self.hidden, self.hidden_worst)), ("from", self.hidden_by)]
         if self.hidden > 0 and self.remedy:
             lines.append(("to see that", self.remedy))
         return tuple(lines)
