@@ -96,7 +96,7 @@ PLACEHOLDERS = {
 }
 """What users put in the place of words in README and suggestions."""
 
-PLAN = "grid = 3\nstandard_grid = 1\npolariser_angles = 4\nmoon_patches = 2\nstandards = 3\n"
+PLAN = "grid = 5\nstandard_grid = 1\npolariser_angles = 4\nmoon_patches = 2\nstandards = 3\n"
 BENCH = (
     'instrument = "own.toml"\ngrid = 3\npolariser_angles = 4\nmoon_patches = 0\nstandards = 0\n'
     "moving = { WIN = [0, 45] }\n"
