@@ -28,8 +28,7 @@ from .conftest import FittedSet, assert_same_files, without_times
 FUNCTIONS = {name: getattr(walop, name.replace("-", "_")) for name in COMMANDS}
 # What only Python can say: columns and elements by name, fits in memory, what is no text.
 PYTHON_ONLY = {
-    "refit": {"folder"},
-    "simulate": {"noiseless"},
+    "simulate": {"noiseless", "catalogue_seed"},
     "matrix": {"columns"},
     "compare": {"calibration"},
     "trace": {"positions"},

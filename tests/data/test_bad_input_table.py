@@ -238,7 +238,7 @@ ELSEWHERE = {
     "48": "io/test_folder.py::test_the_second_of_two_writers_is_told_who_the_first_is",
     "49": "io/test_folder.py::test_a_read_only_folder_is_refused",
     "50": "likelihood/test_large.py::test_memory_is_bounded_by_what_is_allowed",
-    "51": "likelihood/test_runner.py::test_a_dead_process_is_an_error_in_the_others",
+    "51": "likelihood/test_runner.py::test_an_error_in_one_slab_ends_the_pass",
     "52": "calibration/test_product.py::test_what_is_not_as_written_is_refused",
     "53": "commands/test_tables.py::test_a_filter_that_the_calibration_does_not_cover_is_refused_unless_forced",
     "54": "commands/test_program.py::test_a_path_that_is_not_utf_8",
