@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.likelihood import engine, limits, optics
+from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.engine import PointData
 from walop_jax.likelihood.layout import Layout, PointReader
 from walop_jax.likelihood.likelihood import PriorRows, prior_rows
@@ -190,14 +190,12 @@ class Forward(eqx.Module):
         """The instrument, and the counts of a point for light of unit flux."""
         need_float64(WHAT)
         if isinstance(values, Instrument):
-            instrument, vector = values, values_of(values)
-        else:
-            vector = self._tied(values)
-            instrument = with_values(self.template)(vector)
-        x, y = engine.field_sites(instrument, point)
-        base = values if isinstance(values, Instrument) else self.template
-        rows = jax.vmap(optics.band_rows, (None, None, None, 0, 0))(vector, base, self.plan, x, y)
-        throughput = jax.vmap(instrument.throughput.at)(x, y)
+            instrument, base, vector = values, values, values_of(values)
+        else:  # the template has no slopes of its own: those of the parameters are in the vector alone
+            base, vector = self.template, self._tied(values)
+            instrument = with_values(base)(vector)
+        rows = engine.rows_at(vector, base, self.plan, point)
+        throughput = engine.throughput_at(instrument, point)
         return instrument, engine.unit_counts(instrument, self.plan, rows, throughput, point)
 
     def _residuals(self, values: Values | Instrument, data: PointData) -> Float[Array, "m e k"]:
