@@ -41,10 +41,9 @@ from handmade_run import parameters  # noqa: E402
 from handmade_set import Handmade  # noqa: E402
 
 from walop_jax.calibration import (  # noqa: E402
-    Calibration,
-    ListedModel,
     MatrixMaps,
-    read_calibration,
+    Product,
+    read_product,
     write_calibration,
 )  # fmt: skip
 from walop_jax.data import DataError, read_calibration_set  # noqa: E402
@@ -120,7 +119,7 @@ def _read_set(path: Path) -> Answer:
 
 
 def _read_product(path: Path) -> Answer:
-    product = read_calibration(path, rebuild=False)
+    product = read_product(path)
     return Answer(digest(dataclasses.replace(product, inputs=(), path=None)))
 
 
@@ -139,8 +138,11 @@ def _product(folder: Path) -> bytes:
         ("throughput.n0.p00", "", 0.5, None, False),
     )
     maps = MatrixMaps(grid, "SDSS-r", rng.random((6, 3, 4)), rng.random((6, 3, 4)))
-    product = Calibration(
-        fitted=ListedModel(calset.instrument, three, maps, ("[model]", 'instrument = "WALOP-SOUTH"')),
+    product = Product(
+        instrument=calset.instrument,
+        parameters=three,
+        maps=maps,
+        model_lines=("[model]", 'instrument = "WALOP-SOUTH"'),
         values=np.array([15.63, 1.0 / 3.0, 0.5]), site=calset.site, origin="by hand", date="2026-11-21T10:00:00",
         verdict=Verdict(3e4, 33000, 44000, 1.0, True),
         covariance=root @ root.T,

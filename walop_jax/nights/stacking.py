@@ -202,7 +202,7 @@ def stack(
     opened = [_opened(one, catalogue) for one in nights]
     fits = [one for one in (like, *(some.fit for some in opened)) if one is not None]
     held = [Calibration.from_fit(one) if isinstance(one, FitResult) else one for one in fits[:1]]
-    maker = _Maker(held[0].rebuilt() if held else None, partial, len(opened) < MANY)
+    maker = _Maker(held[0] if held else None, partial, len(opened) < MANY)
     made: list[Night] = []
     at_hand: dict[tuple[str, int], _Data] = {}
     for k, one in enumerate(opened):

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from walop_jax.calibration import PRODUCT, SUMMARY, Calibration, MatrixMaps
+from walop_jax.calibration import PRODUCT, SUMMARY, Calibration, MatrixMaps, Product
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.figure_data import (
     FIGURE_DATA,
@@ -107,7 +107,8 @@ class FigureSource(Run):
     @functools.cached_property
     def prior_width(self) -> Mapping[str, float]:
         """Widths of the priors by name, as far as they are known."""
-        return {} if self.product is None else self.product.prior_width
+        parameters = () if self.product is None else self.product.parameters
+        return {p.name: np.nan if p.prior is None else p.prior[1] for p in parameters}
 
     @property
     def examined(self) -> int:
@@ -131,8 +132,8 @@ class FigureSource(Run):
         return self.stored.maps
 
     @property
-    def stored(self) -> Calibration:
-        """The calibration as its file holds it."""
+    def stored(self) -> Calibration | Product:
+        """Contents of the file, or the calibration in memory."""
         self.wanted(PRODUCT, "give the RUN of walop-jax refit or diagnose")
         assert self.product is not None
         return self.product
@@ -154,7 +155,7 @@ class RunContents:
 
     source: FigureSource
     summary: dict[str, Any]
-    product: Calibration | None
+    product: Calibration | Product | None
     diagnosis: dict[str, Any] | None
     figure_data: DiagnosisFigureData | None
     sample: dict[str, Any] | None
