@@ -10,7 +10,7 @@ from handmade_run import parameters
 from test_other_products import product_of
 
 from walop_jax.calibration.certify import certify
-from walop_jax.data import read_calibration_set
+from walop_jax.data.calset import read_calibration_set
 
 NAN = float("nan")
 

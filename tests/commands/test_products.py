@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 import walop_jax as walop
-from walop_jax.calibration import read_product, write_calibration
-from walop_jax.data import builtin_filter
-from walop_jax.data.settings import Settings
+from walop_jax.calibration.product import read_product, write_calibration
+from walop_jax.data.settings import Settings, builtin_filter
 from walop_jax.io.errors import DataError
 from walop_jax.model.trace import Sightline, trace
 
