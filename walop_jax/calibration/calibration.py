@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from walop_jax.calibration.accuracy import p_errors
 from walop_jax.calibration.could_hide import hidden_errors
 from walop_jax.calibration.matrix import (
     MatrixMaps,
@@ -24,9 +25,7 @@ from walop_jax.calibration.matrix import (
     matrix_draws,
     matrix_names,
     of_structure,
-    p_errors,
     planned_matrices,
-    sample_stars,
     slopes_over_field,
 )
 from walop_jax.data.frames import Grid
@@ -545,7 +544,7 @@ class Calibration(Contents, Fitted):
             columns[f"{name}_ERR"] = column, f"standard error of {name}"
         if len(names) == 6:
             known = np.full(len(x), np.nan)
-            known[inside] = p_errors(there, covariance, sample_stars())
+            known[inside] = p_errors(there, covariance)
             columns["P_ERR"] = known, "error of p of a star with p <= 5 %, of the calibration alone"
         columns["FLAG"] = flag, "16 high cross-talk, 32 beyond the calibrated field, 64 filter or temperature"
         return columns

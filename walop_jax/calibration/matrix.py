@@ -3,9 +3,6 @@
 Elements     three for each arm, m21, m22, m23, m31, … of `light.instrument_matrix`: band integrated, with throughput.
 Covariance   C_m = J C_θ Jᵀ with the exact J; the throughput series enters through its local values.
 Derivatives  to all parameters, and to the amplitudes of effects that are not there yet.
-
-Impact       m = m₀ + A s with s = (q, u), so a star that is calibrated with (m₀, A) while (m₀ + δm₀, A + δA) is true
-comes out wrong by A⁻¹ (δm₀ + δA s), at most |A⁻¹ δm₀| + p ‖A⁻¹ δA‖.
 """
 
 from __future__ import annotations
@@ -22,7 +19,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
@@ -42,7 +38,6 @@ from walop_jax.model.plan import Plan, with_numbers
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model, series_indices
 
-STARS, LARGEST_P = 100, 0.05
 _MARK = 2.0**40
 """A value that no parameter has: it finds the amplitudes of effects among all parameters."""
 
@@ -329,7 +324,8 @@ def matrix_slopes(
     plan = plan_for_settings(instrument, setting, filters)
     numbers = (np.broadcast_to(number, len(x)) for number in _numbers(setting))
     exact = _matrix_and_slopes(instrument, plan, once=len(x) <= limits.MATRICES_ONCE)
-    return in_chunks(exact, x, y, *numbers)
+    matrix, slopes = in_chunks(exact, x, y, *numbers)
+    return matrix, slopes
 
 
 def slopes_over_field(
@@ -382,60 +378,6 @@ def of_structure(structure: Structure, values: Float[np.ndarray, "p m"]) -> Floa
     return added
 
 
-def errors_of_changes(
-    matrix: Float[np.ndarray, "p a 3"],
-    slopes: Float[np.ndarray, "p a 3 n"],
-    changes: Float[np.ndarray, "c n"],
-) -> Float[np.ndarray, "c p"]:
-    """`change_of_qu` of every change of all parameters, to first order."""
-    return np.array([change_of_qu(matrix, matrix + slopes @ change) for change in changes])
-
-
-def change_of_qu(
-    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
-) -> Float[np.ndarray, " p"]:
-    """Largest error of q and u at each field point for stars polarised by up to `p`; NaN where not measured."""
-    found = np.full(len(assumed), np.nan)
-    if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
-        return found
-    good = np.abs(np.linalg.det(assumed[:, :, 1:])) > SMALLEST_DETERMINANT
-    inverse = np.linalg.inv(assumed[good, :, 1:])
-    change = (true - assumed)[good]
-    offset = np.linalg.norm(inverse @ change[:, :, :1], axis=(1, 2))
-    found[good] = offset + p * np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
-    return found
-
-
-def sample_stars(count: int = STARS, seed: int = 0) -> Float[np.ndarray, "n 2"]:
-    """(q, u) of sources with p evenly up to `LARGEST_P` and any angle."""
-    rng = np.random.default_rng(seed)
-    p, angle = rng.uniform(0.0, LARGEST_P, count), rng.uniform(0.0, np.pi, count)
-    return np.stack([p * np.cos(2 * angle), p * np.sin(2 * angle)], axis=1)
-
-
-def p_errors(
-    matrix: Float[np.ndarray, "p 6"], covariance: Float[np.ndarray, "p 6 6"], stars: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, " p"]:
-    """Error of p for stars (q, u), rms over them, from the six elements of the matrix and their covariance."""
-    form = p_forms(matrix, stars)
-    variance = np.einsum("pni,pij,pnj->pn", form, covariance, form, optimize=True)
-    return np.sqrt(np.mean(variance, axis=1))
-
-
-def p_forms(
-    matrix: Float[np.ndarray, "p 6"], stars: Float[np.ndarray, "*b n 2"]
-) -> Float[np.ndarray, "p n 6"]:
-    """δp = −e · M⁻¹ · (δm s) of every star as a linear form of the six elements; the same stars (q, u), or of each."""
-    stars = np.broadcast_to(stars, (len(matrix), *stars.shape[-2:]))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        (a, b), (c, d) = matrix[:, 1:3].T, matrix[:, 4:].T
-        inverse = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], 1) / (a * d - b * c)[:, None, None]
-        along = stars / np.hypot(stars[..., :1], stars[..., 1:])
-        s = np.concatenate([np.ones((*stars.shape[:2], 1)), stars], axis=2)
-        left = np.einsum("pnc,pcr->pnr", along, inverse)
-        return np.einsum("pnr,pns->pnrs", left, s).reshape(*stars.shape[:2], 6)
-
-
 def effect_slopes(
     instrument: Instrument,
     setting: Settings,
@@ -472,11 +414,3 @@ def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
     instrument, calset = result.model.instrument(result.values), result.calset
     plan = plan_for_settings(instrument, first_setting(calset, instrument), calset.filters)
     return planned_matrices(instrument, plan, calset.points.x, calset.points.y)
-
-
-def largest_change(
-    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
-) -> float:
-    """Largest of `change_of_qu` over the field; NaN when no point holds both q and u."""
-    found = change_of_qu(assumed, true, p)
-    return float(np.nanmax(found)) if np.isfinite(found).any() else float("nan")
