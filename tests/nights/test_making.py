@@ -105,6 +105,8 @@ def test_a_worker_that_is_killed_is_replaced(given, here, tmp_path):
 def test_no_scheduler_and_both(tmp_path, given):
     """A usage error or advice, before anything is read."""
     pytest.importorskip("distributed")
-    result = run_program("stack", *given, "-o", tmp_path / "S", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1")
+    result = run_program(
+        "stack", *given, "-o", tmp_path / "S", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"
+    )
     assert result.exit_code == 2 and "exclude each other" in result.stderr
     assert not (tmp_path / "S").exists()

@@ -10,6 +10,8 @@ from walop_jax.commands.command import Argument, Job, Option, Outcome, command
 from walop_jax.commands.inputs import Effects, PathLike, calibration_of, catalogue_of
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.nights.survey import Survey
 
@@ -33,7 +35,7 @@ def stack(
     events: Annotated[Any, EVENTS] = None,
     no_breaks: Annotated[bool, KNOWN] = False,
     workers: Annotated[int | None, WORKERS] = None,
-    scheduler: Annotated[str | None, SCHEDULER] = None,
+    scheduler: Annotated[str | Executor | None, SCHEDULER] = None,
     output: Annotated[Any, SURVEY] = None,
     effects: Effects = None,
 ) -> Outcome[Survey]:
@@ -53,7 +55,8 @@ def stack(
     Nights are made by Dask on a cluster, or in processes of this machine, with --scheduler or --workers: the survey is
     the same to the last digit, and a worker that is lost is replaced (walop-jax docs nights).
 
-    In Python: a `Survey`; nights may be fits and sets in memory, `laws` a mapping of names to [law] tables.
+    In Python: a `Survey`; nights may be fits and sets in memory, `laws` a mapping of names to [law] tables,
+    `scheduler` any `concurrent.futures.Executor`.
 
     >>> walop.stack(["night1.fits", "night2.fits"]).trusted  # doctest: +SKIP
     """

@@ -52,8 +52,12 @@ def run_file(path: str | os.PathLike[str], advice: str) -> ModuleType:
 
 def files_of_users() -> tuple[str, ...]:
     """Absolute paths of the Python files of users that were run: another process must run them before it unpickles."""
-    modules = [module for name, module in sys.modules.items() if name.startswith(_OF_USERS)]
-    return tuple(sorted(str(Path(str(module.__file__)).resolve()) for module in modules))
+    modules = [
+        getattr(module, "__file__", None)
+        for name, module in sys.modules.items()
+        if name.startswith(_OF_USERS)
+    ]
+    return tuple(sorted(str(Path(file).resolve()) for file in modules if file is not None))
 
 
 def blank(kind: type[T]) -> T:

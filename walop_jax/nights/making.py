@@ -189,15 +189,15 @@ def _maker(code: tuple[str, ...], recipe: bytes) -> Maker:
 
 @contextlib.contextmanager
 def executor_of(
-    workers: int | None = None, scheduler: str | None = None
+    workers: int | None = None, scheduler: str | Executor | None = None
 ) -> Generator[Executor | None, None, None]:
-    """Executor of the workers of a Dask scheduler, or of new processes of this machine; None without either.
+    """Executor of the workers of a Dask scheduler (or as given), or of new processes of this machine; None without.
 
     A worker makes one night at a time. Tasks of a worker that is lost go to another one. Raises `DataError` where
     `distributed` is not installed, and where no scheduler answers.
     """
-    if workers is None and scheduler is None:
-        yield None
+    if workers is None and (scheduler is None or isinstance(scheduler, Executor)):
+        yield scheduler
         return
     if workers is not None and scheduler is not None:
         raise fail("workers and scheduler exclude each other", advice="start the workers on the cluster")
