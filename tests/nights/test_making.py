@@ -1,4 +1,4 @@
-"""Nights made in other processes, by threads and on a Dask cluster that loses a worker, against those of one process."""
+"""Nights made in other processes, and on a Dask cluster that loses a worker, against those of one process."""
 
 import contextlib
 import dataclasses
@@ -18,6 +18,7 @@ from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.nights.equations import SIDEREAL
 from walop_jax.nights.making import executor_of
 from walop_jax.nights.stacking import stack
 from walop_jax.simulation.simulate import simulate
@@ -68,9 +69,9 @@ def test_threads_make_the_same_survey(given, here, tmp_path):
 
 @pytest.mark.long
 def test_copies_are_refused_whoever_makes_them(folder, given, tmp_path):
-    """The second night once more, an hour later: its measurements are the same."""
+    """The second night once more, a sidereal day later: its measurements are the same."""
     calset = walop.read(folder / "night1.fits")
-    later = dataclasses.replace(calset.exposures, mjd=calset.exposures.mjd + 1 / 24)
+    later = dataclasses.replace(calset.exposures, mjd=calset.exposures.mjd + 1 / SIDEREAL)
     copy = tmp_path / "copy.fits"
     walop.write_calibration_set(copy, dataclasses.replace(calset, exposures=later))
     with ThreadPoolExecutor(1) as executor, pytest.raises(DataError, match=r"100 % .*night1\.fits"):
@@ -102,11 +103,12 @@ def test_a_worker_that_is_killed_is_replaced(given, here, tmp_path):
     assert_identical(survey, here)
 
 
-def test_no_scheduler_and_both(tmp_path, given):
+def test_workers_and_scheduler_exclude_each_other(tmp_path, given):
     """A usage error or advice, before anything is read."""
     pytest.importorskip("distributed")
     result = run_program(
         "stack", *given, "-o", tmp_path / "S", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"
     )
-    assert result.exit_code == 2 and "exclude each other" in result.stderr
+    assert result.exit_code == 2
+    assert "exclude each other" in result.stderr
     assert not (tmp_path / "S").exists()

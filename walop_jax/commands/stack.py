@@ -6,7 +6,7 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
 from walop_jax.commands.inputs import Effects, PathLike, calibration_of, catalogue_of
 
 if TYPE_CHECKING:
@@ -64,6 +64,10 @@ def stack(
     from walop_jax.nights.stacking import FILES, PARTIAL, writers
     from walop_jax.nights.stacking import stack as stacked
 
+    if workers is not None and scheduler is not None:
+        raise UsageError(
+            "workers and scheduler exclude each other: a cluster has its own workers", "scheduler"
+        )
     given: list[Any] = list(nights) if isinstance(nights, list | tuple) else [nights]
     with contextlib.ExitStack() as hold:
         job = hold.enter_context(job.reserved(output, FILES))

@@ -199,8 +199,6 @@ def executor_of(
     if workers is None and (scheduler is None or isinstance(scheduler, Executor)):
         yield scheduler
         return
-    if workers is not None and scheduler is not None:
-        raise fail("workers and scheduler exclude each other", advice="start the workers on the cluster")
     try:
         from distributed import Client, LocalCluster  # pyright: ignore[reportMissingImports]
     except ImportError:
