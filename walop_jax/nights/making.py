@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data import read_calibration_set
+from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.model_file import model_like
