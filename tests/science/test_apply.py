@@ -404,7 +404,7 @@ def test_simulated_observation_of_standards(calset, calibration, tmp_path):
     point, star = np.array(point), np.array(star)
     table = Table({"X": block.x[point], "Y": block.y[point], "N": block.counts[point, star]})
     table["N_ERR"] = block.sigma[point, star]
-    table["CHWP_ANGLE"] = np.where(exposures.chwp_in[star], exposures.chwp_angle[star], np.nan)
+    table["CHWP_ANGLE"] = exposures.position("CHWP").angle[star]
     table["ROTATOR"] = exposures.rotator[star]
     source = block.source[point, star]
     table["TEFF"] = run.calset.sources.teff[source]

@@ -24,7 +24,7 @@ from walop_jax.data import schema
 from walop_jax.data.calset import empty_sources
 from walop_jax.data.checks import instrument_name, make_exposures, make_filters, make_sources, oldest_version
 from walop_jax.data.frames import Grid, read_grid
-from walop_jax.data.records import PREFIX, InputFile, Site
+from walop_jax.data.records import CALIBRATION_PLATE, PREFIX, InputFile, Site
 from walop_jax.data.schema import Column, Place, column_names, read_table, table_rules
 from walop_jax.data.write import filter_columns, grid_cards, set_table_hdu, sign_and_write, table_hdu
 from walop_jax.fit.verdict import DATA, STATED, Hidden, Structure, Verdict
@@ -244,8 +244,8 @@ def _map_hdu(name: str, image: np.ndarray, maps: MatrixMaps | ResidualMap) -> fi
     """An image of the field, with cards for the moving elements that are in the beam."""
     hdu = fits.ImageHDU(image, name=name)
     hdu.header.update(grid_cards(maps.grid))
-    inside = [entry for entry in maps.positions.items() if np.isfinite(entry[1])]
-    for number, (prefix, angle) in enumerate(inside, start=1):
+    further = {prefix: angle for prefix, angle in maps.positions.items() if prefix != CALIBRATION_PLATE}
+    for number, (prefix, angle) in enumerate(further.items(), start=1):
         hdu.header[f"ELEM{number}"], hdu.header[f"ANGLE{number}"] = prefix, angle
     return hdu
 
@@ -256,8 +256,8 @@ def _residual_hdus(residuals: ResidualMap) -> list[fits.ImageHDU]:
     ]
     for hdu in hdus:
         hdu.header["FILTER"] = residuals.filter
-        if np.isfinite(residuals.chwp_angle):
-            hdu.header["CHWPANG"] = (residuals.chwp_angle, "[deg] calibration plate; absent: out")
+        if (angle := residuals.positions.get(CALIBRATION_PLATE)) is not None:
+            hdu.header["CHWPANG"] = (angle, "[deg] calibration plate; absent: out")
         if hdu.header["NAXIS"] == 3:
             for number, quantity in enumerate(residuals.names, start=1):
                 hdu.header[f"PLANE{number}"] = quantity
@@ -513,11 +513,11 @@ class _Reader:
                 self.fail(name, "is not an image on the grid of RESIDUAL")
             images[attribute] = np.ascontiguousarray(data, dtype=np.float64)
         header = self.hdus["RESIDUAL"].header
+        plate = {CALIBRATION_PLATE: float(header["CHWPANG"])} if "CHWPANG" in header else {}
         return ResidualMap(
             grid=self.grid("RESIDUAL"),
             filter=str(header.get("FILTER", "")).strip(),
-            chwp_angle=float(header.get("CHWPANG", np.nan)),
-            positions=self.positions("RESIDUAL"),
+            positions=plate | self.positions("RESIDUAL"),
             **images,
         )
 

@@ -48,7 +48,7 @@ def instrument_name(value: object, version: int, place: Place) -> str:
 
 def oldest_version(instrument: str, exposures: Exposures, cameras: int) -> int:
     """The oldest version of the calibration set format (CALVERS) that can hold a set."""
-    newer = instrument not in shipped() or cameras != 4 or exposures.moving
+    newer = instrument not in shipped() or cameras != 4 or exposures.further
     return 1 if not newer and np.isin(exposures.kind, _FIRST_KINDS).all() else 2
 
 

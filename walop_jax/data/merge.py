@@ -167,7 +167,7 @@ def _holds_noise(rows: _Rows, exposures: Exposures, copies: set[int]) -> bool | 
     labels = [
         (str(kind), str(name), bool(polariser), bool(plate))
         for kind, name, polariser, plate in zip(
-            exposures.kind, exposures.filter, exposures.clp_in, exposures.chwp_in, strict=True
+            exposures.kind, exposures.filter, exposures.clp_in, exposures.position("CHWP").inside, strict=True
         )
     ]
     numbers = Counter(labels[n] for n in np.unique(rows.exposure).tolist() if n not in copies)
@@ -413,15 +413,15 @@ def _join_exposures(sets: tuple[CalibrationSet, ...]) -> tuple[Exposures, list[s
             remarks.append(f"{_name(entry)} [EXPOSURES] EXPOSURE: taken in another file, raised by {shift}")
             new = new + shift
         ids = np.concatenate([ids, new])
-    prefixes = list(dict.fromkeys(prefix for entry in sets for prefix in entry.exposures.moving))
+    prefixes = list(dict.fromkeys(prefix for entry in sets for prefix in entry.exposures.positions))
     parts = []
     for entry in sets:
         e = entry.exposures
-        absent = {prefix: Position.out(len(e)) for prefix in prefixes if prefix not in e.moving}
+        absent = {prefix: Position.out(len(e)) for prefix in prefixes if prefix not in e.positions}
         if absent:
             names = ", ".join(f"{prefix}_ANGLE" for prefix in absent)
             remarks.append(f"{_name(entry)} [EXPOSURES] {names}: column missing; taken as out of the beam")
-        parts.append(dataclasses.replace(e, moving={**e.moving, **absent}).columns())
+        parts.append(e.placed(**absent).columns())
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return Exposures.from_columns(columns | {"EXPOSURE": ids}), remarks
 

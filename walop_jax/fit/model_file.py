@@ -17,7 +17,7 @@ from typing import Any
 import tomlkit
 
 from walop_jax.data.merge import parts_of
-from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet, Sources
+from walop_jax.data.records import POLARISER, CalibrationSet, Sources
 from walop_jax.data.settings import Settings
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
@@ -222,7 +222,7 @@ def base_model(
         raise ValueError(
             f"{instrument.name} has {len(instrument.cameras)} cameras, the data have {calset.cameras}"
         )
-    present = Settings.of(calset.exposures, (CALIBRATION_PLATE, *calset.exposures.moving))
+    present = Settings.of(calset.exposures, [p for p in calset.exposures.positions if p != POLARISER])
     present.check_moving(instrument.patched().moving())
     instrument = adapted(
         instrument,

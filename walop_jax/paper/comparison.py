@@ -23,7 +23,7 @@ from jaxtyping import Float
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import LARGEST_P, SMALLEST_DETERMINANT, STARS, sample_stars
-from walop_jax.data.records import CalibrationSet
+from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet
 from walop_jax.data.settings import DEFAULT_FILTER, Settings
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError
@@ -320,7 +320,7 @@ def _moon(
         return None
     patches = judge_patches(calset, calibration)
     document = patches.document(e.exposure)
-    weight = patches.weight[~e.chwp_in[patches.exposure]]
+    weight = patches.weight[~e.position(CALIBRATION_PLATE).inside[patches.exposure]]
     try:
         schemes = {
             "equal_weights": full_moon_scheme(calset, paper),
