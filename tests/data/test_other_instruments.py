@@ -1,4 +1,4 @@
-"""Sets of other instruments (CALVERS 2): any number of cameras, further moving elements, lamps."""
+"""Sets of other instruments: any number of cameras, further moving elements, lamps."""
 
 from __future__ import annotations
 
@@ -179,21 +179,20 @@ def fifth_camera(calset):
     block = calset.intensities.block(0, 3)
     counts, sigma = (np.concatenate([a, a[..., :1]], axis=2) for a in (block.counts, block.sigma))
     more = Block(block.x, block.y, counts, sigma, block.used, block.source)
-    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, more))
+    return dataclasses.replace(
+        calset, instrument="Bench of five", intensities=TableIntensities.dense(calset.points, more)
+    )
 
 
 def named(calset):
     return dataclasses.replace(calset, instrument="WALOP-EAST")
 
 
-@pytest.mark.parametrize(
-    ("change", "version"), [(lambda c: c, 1), (lamp, 2), (element, 2), (fifth_camera, 2), (named, 2)]
-)
-def test_the_oldest_version_that_holds_a_set_is_written(handmade, change, version):
+@pytest.mark.parametrize("change", [lambda c: c, lamp, element, fifth_camera, named])
+def test_whatever_a_set_holds_is_written(handmade, change):
     calset = change(read_calibration_set(handmade.write()))
     path = handmade.folder / "again.fits"
     write_calibration_set(path, calset)
-    assert fits.getheader(path)["CALVERS"] == version
     again = read_calibration_set(path)
     assert (again.instrument, again.cameras) == (calset.instrument, calset.cameras)
     one, other = all_columns(calset), all_columns(again)

@@ -156,7 +156,7 @@ def _sample(calset: CalibrationSet) -> _Sample:
         starts = np.unique(np.linspace(0, total - _RUN, _LOOKED_AT // _RUN).astype(int))
         blocks = [calset.intensities.block(int(start), int(start) + _RUN) for start in starts]
     used = np.concatenate([block.used for block in blocks])
-    counted = calset.exposures.kind != "flux"
+    counted = ~calset.exposures.flux_known
     rows = used & counted
     counts = np.concatenate([block.counts for block in blocks])[rows]
     sigma = np.concatenate([block.sigma for block in blocks])[rows]
@@ -274,7 +274,7 @@ def about_exposures(exposures: Exposures) -> Iterator[Finding]:
             "the polariser turns through half a turn only",
             "a full turn tells a wobble of its rotation from the instrument",
         )
-    if not np.any(((e.kind == "moon") | (e.kind == "standard")) & ~e.clp_in):
+    if not np.any(e.direct("moon", "standard")):
         yield Finding(
             "note",
             "no light of known polarisation but through the polariser (neither Moon sky nor standards)",

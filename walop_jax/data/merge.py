@@ -74,7 +74,7 @@ def check_repeats(
     pixels were summed (`compression`). Raises `DataError` with identifiers and rows of what is there twice; returns
     remarks.
     """
-    counted = exposures.kind != "flux"
+    counted = ~exposures.flux_known
     if compression is not None:
         counted &= ~compression.covers(exposures)
     if not counted.any():

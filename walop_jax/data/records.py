@@ -8,7 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -17,8 +17,29 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import nearest
 from walop_jax.io.plain_tables import astropy_table
 
-KINDS = ("clp", "moon", "standard", "flux", "lamp", "steady")
-"""Kinds of exposures: through the polariser, full-Moon sky, standard star, known throughput, lamp, lamp of one flux."""
+
+class Kind(NamedTuple):
+    """Facts about a KIND of exposures.
+
+    `flux_known`: its flux is one, `flux_shared`: an unknown one is the same in all exposures of a filter, `from_sky`:
+    the light comes through the telescope. `seconds` is the usual exposure time, None where no plan observes it.
+    """
+
+    flux_known: bool = False
+    flux_shared: bool = False
+    from_sky: bool = True
+    seconds: float | None = None
+
+
+KINDS: Mapping[str, Kind] = {
+    "clp": Kind(seconds=30.0),
+    "lamp": Kind(from_sky=False, seconds=30.0),
+    "moon": Kind(seconds=60.0),
+    "standard": Kind(seconds=60.0),
+    "flux": Kind(flux_known=True, from_sky=False),
+    "steady": Kind(flux_shared=True, from_sky=False),
+}
+"""Kinds of exposures: through the polariser, lamp, full-Moon sky, standard star, known throughput, lamp of one flux."""
 
 POLARISER, CALIBRATION_PLATE = "CLP", "CHWP"
 """Column prefixes of the moving elements that every calibration set knows."""
@@ -170,6 +191,15 @@ class Exposures:
     def further(self) -> dict[str, Position]:
         """The moving elements beyond polariser and calibration plate."""
         return {p: at for p, at in self.positions.items() if p not in (POLARISER, CALIBRATION_PLATE)}
+
+    @property
+    def flux_known(self) -> Bool[np.ndarray, " e"]:
+        """True in exposures of a KIND of known flux."""
+        return np.isin(self.kind, [name for name, kind in KINDS.items() if kind.flux_known])
+
+    def direct(self, *kinds: str) -> Bool[np.ndarray, " e"]:
+        """True in exposures of some KINDs that are not taken through the polariser."""
+        return np.isin(self.kind, kinds) & ~self.clp_in
 
     def position(self, prefix: str) -> Position:
         """The moving element of a column prefix.

@@ -22,7 +22,7 @@ from walop_jax.io.errors import fail, nearest, rows_text
 Kind = Literal["int", "float", "bool", "str"]
 
 CALVERS = 2
-"""Newest version of the calibration set format; a set is written in the oldest version that can hold it."""
+"""Version of the calibration set format that is written. Sets of version 1 are sets of version 2 as well."""
 
 
 class Rule(NamedTuple):
@@ -116,7 +116,9 @@ EXPOSURES: Mapping[str, Column] = {
 }
 _COORDINATE = Column("float", "deg", rules=(finite("remove these points"),))
 POINTS: Mapping[str, Column] = {"POINT": _IDENTIFIER, "X": _COORDINATE, "Y": _COORDINATE}
-_COUNTS = Column("float", "electron", width=4, shape_advice="one row holds the four cameras O1, E1, O2, E2")
+_COUNTS = Column(
+    "float", "electron", width=None, shape_advice="one row holds all cameras, the same number in every row"
+)
 INTENSITIES: Mapping[str, Column] = {
     "EXPOSURE": Column("int"),
     "POINT": Column("int"),
@@ -150,7 +152,7 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
     "SOURCES": SOURCES,
     "FILTERS": FILTERS,
 }
-"""The tables of a calibration set of version 1, in the order in which they are written."""
+"""The tables of a calibration set, in the order in which they are written; see `table_rules`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,19 +184,13 @@ def check(table: Mapping[str, np.ndarray], columns: Mapping[str, Column], place:
             place.refuse(rule.broken(table[name]), rule.what, name, rule.advice)
 
 
-def table_rules(name: str, version: int, columns: Collection[str], place: Place) -> Mapping[str, Column]:
-    """The columns of a table of a calibration set of a version, where a file has `columns` (in capitals).
+def table_rules(name: str, columns: Collection[str], place: Place) -> Mapping[str, Column]:
+    """The columns of a table of a calibration set, where a file has `columns` (in capitals).
 
-    From version 2 on EXPOSURES has a pair `<P>_IN`, `<P>_ANGLE` for every further moving element, need not have
-    those of CLP and CHWP, and INTENSITIES has any number of cameras. Raises `DataError` for half a pair and for a
+    EXPOSURES has a pair `<P>_IN`, `<P>_ANGLE` for every moving element. Raises `DataError` for half a pair and for a
     prefix that is none.
     """
-    rules = TABLES[name]
-    if version > 1 and name == "INTENSITIES":
-        advice = "one row holds all cameras, the same number in every row"
-        counts = dataclasses.replace(_COUNTS, width=None, shape_advice=advice)
-        return {**rules, "N": counts, "N_ERR": counts}
-    return {**rules, **_moving_columns(columns, place)} if version > 1 and name == "EXPOSURES" else rules
+    return TABLES[name] if name != "EXPOSURES" else {**EXPOSURES, **_moving_columns(columns, place)}
 
 
 def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]:

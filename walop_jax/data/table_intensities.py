@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.records import Block, DataFlag, Exposures, Intensities, Points, Sources
+from walop_jax.data.records import KINDS, Block, DataFlag, Exposures, Intensities, Points, Sources
 from walop_jax.data.schema import Place
 from walop_jax.io.errors import rows_text
 
-ONE_CAMERA = ("flux", "steady")  # KINDs of which a single camera says something
+ONE_CAMERA = [name for name, kind in KINDS.items() if kind.flux_known or kind.flux_shared]
+"""KINDs of exposures for which one camera is sufficient."""
 NEGATIVE = 5.0
 """Counts below minus this many sigma are no bias-subtracted counts but a fault."""
 
@@ -236,12 +237,13 @@ def _source_rows(
         order = np.argsort(sources.source, kind="stable")
         at = order[np.minimum(np.searchsorted(sources.source[order], ids), len(order) - 1)]
         rows = np.where((sources.source[at] == ids) & (ids >= 0), at, -1)
-    standard = ((exposures.kind == "standard") & ~exposures.clp_in)[exposure] & used
+    standard = exposures.direct("standard")[exposure] & used
     if np.any(bad := standard & (rows < 0)):
         known = ", ".join(str(entry) for entry in sources.source[:10]) or "none"
         what = f"a standard star needs a row of SOURCES; {ids[np.argmax(bad)]} is not one,"
         place.refuse(bad, what, "SOURCE", f"SOURCES has {known}")
-    lamp = (exposures.kind == "lamp")[exposure] & used & (ids >= 0)
+    indoors = [name for name, kind in KINDS.items() if not kind.from_sky and not kind.flux_known]
+    lamp = np.isin(exposures.kind, indoors)[exposure] & used & (ids >= 0)
     place.refuse(lamp, "a lamp is no source of the sky,", "SOURCE", "write −1, or another KIND")
     lost = np.flatnonzero(used & (ids >= 0) & (rows < 0))
     remark = f"{place.file} [{place.extension}] SOURCE: not in SOURCES, taken as unknown in {rows_text(lost)}"

@@ -153,7 +153,7 @@ class _Maker:
         Held against each other are the smallest of the numbers that hashes of (X, Y, counts) are: the same ones of the
         same measurements (MinHash, Broder 1997).
         """
-        rows = table.used & (calset.exposures.kind != "flux")[table.exposure]
+        rows = table.used & ~calset.exposures.flux_known[table.exposure]
         point = table.point[rows]
         places = np.column_stack([calset.points.x[point], calset.points.y[point], table.counts[rows]])
         hashes = np.zeros(len(places), np.uint64)

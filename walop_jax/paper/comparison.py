@@ -316,7 +316,7 @@ def _moon(
 ) -> dict[str, Any] | None:
     """Verdicts on the Moon patches, and the errors that the full-Moon scheme leaves at the grid points."""
     e = calset.exposures
-    if not np.any((e.kind == "moon") & ~e.clp_in):
+    if not np.any(e.direct("moon")):
         return None
     patches = judge_patches(calset, calibration)
     document = patches.document(e.exposure)

@@ -241,7 +241,7 @@ def judge_patches(calset: CalibrationSet, calibration: Calibration) -> Patches:
     Raises `DataError` if there is none.
     """
     e = calset.exposures
-    moon = np.flatnonzero((e.kind == "moon") & ~e.clp_in)
+    moon = np.flatnonzero(e.direct("moon"))
     if moon.size == 0:
         raise DataError("EXPOSURES: there is no full-Moon exposure (KIND moon, polariser out)")
     block = calset.intensities.block(0, len(calset.points))
@@ -320,8 +320,8 @@ def full_moon_scheme(
     """
     e = calset.exposures
     block = calset.intensities.block(0, len(calset.points))
-    moon = np.flatnonzero((e.kind == "moon") & ~e.clp_in & ~e.position(CALIBRATION_PLATE).inside)
-    standard = np.flatnonzero((e.kind == "standard") & ~e.clp_in & ~e.position(CALIBRATION_PLATE).inside)
+    moon = np.flatnonzero(e.direct("moon") & ~e.position(CALIBRATION_PLATE).inside)
+    standard = np.flatnonzero(e.direct("standard") & ~e.position(CALIBRATION_PLATE).inside)
     centre_x, centre_y = box_centres()
     grid = _positions(block, paper.x, paper.y)
     middle = _positions(block, centre_x, centre_y)

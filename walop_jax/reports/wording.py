@@ -153,7 +153,7 @@ def data_in_words(product: Calibration) -> list[tuple[str, str]]:
         for prefix, p in e.positions.items()
         if prefix != POLARISER
     ]
-    moon = (e.kind == "moon") & ~e.clp_in
+    moon = e.direct("moon")
     places = {(round(float(a), 3), round(float(d), 3)) for a, d in zip(e.ra[moon], e.dec[moon], strict=True)}
     listed = some([str(name) for name in product.sources.name], _MANY)
     rows += [

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from walop_jax.data.checks import checked_curve
 from walop_jax.data.records import (
     CALIBRATION_PLATE,
+    KINDS,
     POLARISER,
     Exposures,
     FilterCurve,
@@ -44,7 +45,9 @@ NARROW_BANDS: Mapping[str, float] = {"NB-580": 0.580, "NB-660": 0.660}  # centre
 _SPACING = 0.004  # d between exposures
 _GOLDEN = 0.5 * (3.0 - np.sqrt(5.0))  # of a turn: spreads any number of angles evenly
 _STANDARD_EDGE = 0.8  # of the field: 5 × 5 centres of boxes that fill it
-EXPOSED: Mapping[str, float] = {"clp": 30.0, "lamp": 30.0, "moon": 60.0, "standard": 60.0}
+EXPOSED: Mapping[str, float] = {
+    name: kind.seconds for name, kind in KINDS.items() if kind.seconds is not None
+}
 """The usual exposure time (s) of each kind, in which a camera sees `ObservingPlan.electrons`."""
 _MOON_ROTATOR, _STAR_ROTATOR = (0.0, 40.0, 90.0, 135.0), (0.0, 30.0, 75.0, 120.0)
 
