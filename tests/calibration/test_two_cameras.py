@@ -19,7 +19,6 @@ from walop_jax.calibration.certify import _physics
 from walop_jax.calibration.matrix import analysis_vectors, matrices
 from walop_jax.data import DataError
 from walop_jax.data.calset import empty_sources
-from walop_jax.data.catalogue import field_points, read_catalogue
 from walop_jax.data.records import Exposures, FilterCurve, Position, Site
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
@@ -30,6 +29,7 @@ from walop_jax.model.planning import plan_for, plan_for_settings
 from walop_jax.model.specification import Model, make_model
 from walop_jax.model.trace import Sightline, trace
 from walop_jax.science.apply import apply
+from walop_jax.science.catalogue import field_points, read_catalogue
 from walop_jax.science.star_errors import determinant
 
 TEXT = """

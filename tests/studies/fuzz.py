@@ -48,7 +48,6 @@ from walop_jax.calibration import (  # noqa: E402
     write_calibration,
 )  # fmt: skip
 from walop_jax.data import DataError, read_calibration_set  # noqa: E402
-from walop_jax.data.catalogue import read_catalogue  # noqa: E402
 from walop_jax.data.frames import Grid  # noqa: E402
 from walop_jax.data.user_tables import read_input_table  # noqa: E402
 from walop_jax.fit.model_file import (  # noqa: E402
@@ -58,6 +57,7 @@ from walop_jax.fit.model_file import (  # noqa: E402
 )
 from walop_jax.fit.verdict import Verdict  # noqa: E402
 from walop_jax.model.instrument import nominal_instrument  # noqa: E402
+from walop_jax.science.catalogue import read_catalogue  # noqa: E402
 
 SLOWEST = 10  # seconds
 OUTCOMES = ("error", "same", "word", "silent", "traceback", "slow")

@@ -22,7 +22,7 @@ from walop_jax.data.checks import (
     make_sources,
 )
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
-from walop_jax.data.merge import check_repeats, merge_calibration_sets
+from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import (
     KINDS,
     CalibrationSet,
@@ -46,7 +46,13 @@ from walop_jax.data.schema import (
     without_mask,
 )
 from walop_jax.data.settings import builtin_filter
-from walop_jax.data.table_intensities import TableIntensities, mask_repeats, table_intensities, usable
+from walop_jax.data.table_intensities import (
+    TableIntensities,
+    mask_repeats,
+    repeated_counts,
+    table_intensities,
+    usable,
+)
 from walop_jax.data.write import EXTENSION, filter_columns, read_compression, remark, set_tables
 from walop_jax.io.errors import fail, nearest
 from walop_jax.io.fits_reading import OpenFile, open_fits
@@ -161,7 +167,7 @@ def assembled(
         intensities, repeated = mask_repeats(intensities, exposures, path)
         remarks += more + repeated + _idle(intensities, exposures, path)
     if compression is None:
-        remarks += check_repeats(intensities, exposures, points, path)
+        remarks += repeated_counts(intensities, exposures, points, path)
     else:
         remarks.append(remark(compression, len(points)))
     return CalibrationSet(
