@@ -133,8 +133,8 @@ def test_any_field_of_another_instrument(two_cameras):
         read_calibration_set(two_cameras.write())
 
 
-def test_version_1_knows_none_of_it(handmade):
-    """A column or an image that version 2 would read is unknown there, as it always was."""
+def test_a_set_of_version_1_has_no_further_elements(handmade):
+    """A column that would be that of an element is unknown there, and so is a picture beside a table."""
     handmade[E]["HWP_ANGLE"] = ["D", "deg", np.zeros(8)]
     path = handmade.folder / "set.fits"
     fits.HDUList([*handmade.hdus(), fits.ImageHDU(np.zeros((2, 2)), name="N4")]).writeto(path, checksum=True)

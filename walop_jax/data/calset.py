@@ -112,7 +112,10 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
     for name in ("EXPOSURES", *(() if images else ("POINTS", "INTENSITIES")), "FILTERS", "SOURCES"):
         place = Place(path, name)
         if name in hdus:
-            rules = table_rules(name, column_names(hdus[name], place), place)
+            columns = column_names(hdus[name], place)
+            if primary["CALVERS"] == 1:  # CLP and CHWP alone move there, whatever other columns are called
+                columns = [column for column in columns if column in schema.TABLES[name]]
+            rules = table_rules(name, columns, place)
             tables[name], more = read_table(hdus[name], rules, place)
             remarks += more
         elif name not in ("FILTERS", "SOURCES"):
@@ -226,6 +229,9 @@ def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], d
             raise fail("is there twice", file=opened.path, extension=name, advice="remove one")
         else:
             kind[name] = hdu
+    if "INTENSITIES" in tables and "N0" not in images:  # pictures of something else
+        remarks += [f"{opened.path} [{name}]: unknown extension, not used" for name in images]
+        images.clear()
     return tables, images
 
 

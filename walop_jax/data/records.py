@@ -18,7 +18,7 @@ from walop_jax.io.errors import nearest
 from walop_jax.io.plain_tables import astropy_table
 
 
-class Kind(NamedTuple):
+class ExposureKind(NamedTuple):
     """Facts about a KIND of exposures.
 
     `flux_known`: its flux is one, `flux_shared`: an unknown one is the same in all exposures of a filter, `from_sky`:
@@ -31,13 +31,13 @@ class Kind(NamedTuple):
     seconds: float | None = None
 
 
-KINDS: Mapping[str, Kind] = {
-    "clp": Kind(seconds=30.0),
-    "lamp": Kind(from_sky=False, seconds=30.0),
-    "moon": Kind(seconds=60.0),
-    "standard": Kind(seconds=60.0),
-    "flux": Kind(flux_known=True, from_sky=False),
-    "steady": Kind(flux_shared=True, from_sky=False),
+KINDS: Mapping[str, ExposureKind] = {
+    "clp": ExposureKind(seconds=30.0),
+    "lamp": ExposureKind(from_sky=False, seconds=30.0),
+    "moon": ExposureKind(seconds=60.0),
+    "standard": ExposureKind(seconds=60.0),
+    "flux": ExposureKind(flux_known=True, from_sky=False),
+    "steady": ExposureKind(flux_shared=True, from_sky=False),
 }
 """Kinds of exposures: through the polariser, lamp, full-Moon sky, standard star, known throughput, lamp of one flux."""
 

@@ -103,7 +103,7 @@ EXPOSURES: Mapping[str, Column] = {
     "MJD": _number("d", _IS_JULIAN),
     "EXPTIME": _number("s", _TIME),
     "FILTER": Column("str", missing="SDSS-r"),
-    "CLP_IN": Column("bool"),
+    "CLP_IN": Column("bool", missing=False),
     "CLP_ANGLE": _ANGLE,
     "CHWP_IN": Column("bool", missing=False),
     "CHWP_ANGLE": _ANGLE,
@@ -198,12 +198,12 @@ def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]
     rules: dict[str, Column] = {}
     for prefix in (POLARISER, CALIBRATION_PLATE):
         inside, angle = f"{prefix}_IN", f"{prefix}_ANGLE"
-        absent = inside not in columns and angle not in columns
-        rules[inside] = Column("bool", missing=False if absent else None, remarked=not absent)
-        rules[angle] = dataclasses.replace(_ANGLE, remarked=not absent)
+        there = inside in columns or angle in columns
+        rules[inside] = Column("bool", missing=None if there else False, remarked=there)
+        rules[angle] = dataclasses.replace(_ANGLE, remarked=there)
     for name in columns:
-        prefix, mark, last = name.rpartition("_")
-        if not mark or last not in ("IN", "ANGLE") or name in rules:
+        prefix, _, last = name.rpartition("_")
+        if last not in ("IN", "ANGLE") or name == last or name in rules:
             continue
         if not PREFIX.fullmatch(prefix):
             raise place.fail(
@@ -215,11 +215,8 @@ def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]
         if angle not in columns:
             pairs = [entry for entry in columns if entry.endswith("_ANGLE")]
             advice = f"add it, or rename {inside} if there is no such element"
-            raise place.fail(
-                f"the column is missing, {inside} is there",
-                angle,
-                f"{advice} ({nearest(angle, pairs)})" if pairs else advice,
-            )
+            like = f" ({nearest(angle, pairs)})" if pairs else ""
+            raise place.fail(f"the column is missing, {inside} is there", angle, advice + like)
         rules[inside] = Column("bool", missing=True, remarked=False)
         rules[angle] = dataclasses.replace(_ANGLE, missing=None)
     return rules

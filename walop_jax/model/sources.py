@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from walop_jax.data.records import KINDS, Kind
+from walop_jax.data.records import KINDS, ExposureKind
 from walop_jax.model.parameters import Component, number, param
 from walop_jax.model.ray import NotPlannedError
 
@@ -84,7 +84,7 @@ class Source(Component):
 
     name: ClassVar[str] = ""
     kind: ClassVar[str] = ""
-    facts: ClassVar[Kind] = Kind()
+    facts: ClassVar[ExposureKind] = ExposureKind()
     reference: ClassVar[str] = ""
 
     def shines(self, sight: Sight) -> Bool[Array, " e"]:
@@ -188,7 +188,7 @@ class Lamp(Source):
 
     name: ClassVar[str] = "lamp"
     kind: ClassVar[str] = "lamp"
-    facts: ClassVar[Kind] = KINDS[kind]
+    facts: ClassVar[ExposureKind] = KINDS[kind]
 
 
 class KnownFlux(Source):
@@ -196,7 +196,7 @@ class KnownFlux(Source):
 
     name: ClassVar[str] = "flux"
     kind: ClassVar[str] = "flux"
-    facts: ClassVar[Kind] = KINDS[kind]
+    facts: ClassVar[ExposureKind] = KINDS[kind]
 
 
 class Steady(Source):
@@ -204,7 +204,7 @@ class Steady(Source):
 
     name: ClassVar[str] = "steady"
     kind: ClassVar[str] = "steady"
-    facts: ClassVar[Kind] = KINDS[kind]
+    facts: ClassVar[ExposureKind] = KINDS[kind]
 
 
 SOURCES: tuple[type[Source], ...] = (MoonSky, Standards, ThroughPolariser, Lamp, KnownFlux, Steady)
