@@ -169,9 +169,8 @@ def assembled(
         intensities, more = table_intensities(tables["INTENSITIES"], exposures, points, sources, place)
         intensities, repeated = mask_repeats(intensities, exposures, path)
         remarks += more + repeated + _idle(intensities, exposures, path)
-    if compression is None:
-        remarks += repeated_counts(intensities, exposures, points, path)
-    else:
+    remarks += repeated_counts(intensities, exposures, points, path, compression)
+    if compression is not None:
         remarks.append(remark(compression, len(points)))
     return CalibrationSet(
         instrument=instrument,

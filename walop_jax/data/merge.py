@@ -117,8 +117,7 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
     else:
         intensities = JoinedIntensities(tuple(parts), len(exposures))
         points = _stack_points(parts)
-    if compression is None:
-        remarks += repeated_counts(intensities, exposures, points, names)
+    remarks += repeated_counts(intensities, exposures, points, names, compression)
     return CalibrationSet(
         instrument=first.instrument,
         site=first.site,

@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.records import KINDS, Block, DataFlag, Exposures, Intensities, Points, Sources
+from walop_jax.data.records import (
+    KINDS,
+    Block,
+    Compression,
+    DataFlag,
+    Exposures,
+    Intensities,
+    Points,
+    Sources,
+)
 from walop_jax.data.schema import Place
 from walop_jax.io.errors import rows_text
 from walop_jax.io.text import some
@@ -307,21 +316,27 @@ def _same_data(intensities: TableIntensities, first: int, second: int) -> bool:
 
 
 def repeated_counts(
-    intensities: Intensities, exposures: Exposures, points: Points, file: object
+    intensities: Intensities,
+    exposures: Exposures,
+    points: Points,
+    file: object,
+    compression: Compression | None = None,
 ) -> Iterator[str]:
     """Remark on exposures, or field points, most of whose rows have the counts of another row at the same place.
 
     Counts agree where they do in single precision, whatever times and identifiers they have. Noise does not repeat in
-    all cameras; expected counts without noise may. Exposures of known flux, which may be exact, are left out. Of large
-    sets, and of frames, a sample of the points is looked at.
+    all cameras; expected counts without noise may. Exposures of known flux, which may be exact, are left out, and
+    those whose pixels were summed. Of large sets, and of frames, a sample of the points is looked at.
     """
     total = len(points)
     starts = (
         range(0, total, _RUN) if total <= _LOOKED_AT else np.linspace(0, total - _RUN, _LOOKED_AT // _RUN)
     )
+    if not len(starts):
+        return
     places = np.concatenate([np.arange(start, min(start + _RUN, total)) for start in map(int, starts)])
     block = Block.joined([intensities.block(int(start), int(start) + _RUN) for start in starts])
-    at, exposure = np.nonzero(block.used & ~exposures.flux_known)
+    at, exposure = np.nonzero(block.used & counted)
     same = equal_rows([block.x[at], block.y[at], *block.counts[at, exposure].T])
     order = np.lexsort((at, exposure, same))  # copies behind what they repeat
     again = np.zeros(len(at), bool)
