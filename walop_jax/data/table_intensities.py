@@ -328,7 +328,10 @@ def repeated_counts(
     all cameras; expected counts without noise may. Exposures of known flux, which may be exact, are left out, and
     those whose pixels were summed. Of large sets, and of frames, a sample of the points is looked at.
     """
-    total = len(points)
+    counted = ~exposures.flux_known
+    if compression is not None:
+        counted &= ~compression.covers(exposures)
+    total = len(points) if counted.any() else 0
     starts = (
         range(0, total, _RUN) if total <= _LOOKED_AT else np.linspace(0, total - _RUN, _LOOKED_AT // _RUN)
     )
