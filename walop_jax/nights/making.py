@@ -11,6 +11,8 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import importlib
+import importlib.util
 import pickle
 from collections import Counter
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
@@ -26,7 +28,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.model_file import model_like
 from walop_jax.io.code import files_of_users, run_file
-from walop_jax.io.errors import fail
+from walop_jax.io.errors import DataError, fail
 from walop_jax.model.specification import Model
 from walop_jax.nights.equations import (
     Candidates,
@@ -69,10 +71,13 @@ class Task(NamedTuple):
 
 
 class Made(NamedTuple):
-    """The nights of a task, and a sketch of the measurements that they were made of (empty: not computed)."""
+    """The nights of a task, with the source and a sketch of their measurements (empty: not computed)."""
 
     nights: list[Night]
+    source: str = ""
     sketch: frozenset[int] = frozenset()
+    error: DataError | None = None
+    """Why there are no nights of data that have been read: copies of other data are told first."""
 
 
 @dataclasses.dataclass
@@ -105,12 +110,16 @@ class Maker:
         calset, model = self._set_and_model(data)
         values = dict(zip(self.like.model.names, self.like.values.tolist(), strict=True))
         candidates = self._candidates_of(model, calset)
-        nights = night_equations(calset, model, values, candidates, own=True, once=self.few)
+        table = calset.intensities
+        measured = sketch(calset, table) if isinstance(table, TableIntensities) else frozenset[int]()
+        try:
+            nights = night_equations(calset, model, values, candidates, own=True, once=self.few)
+        except DataError as error:
+            return Made([], source_of(calset), measured, error)
         if place is not None:
             place.parent.mkdir(parents=True, exist_ok=True)
             write_nights(place, nights, overwrite=True)
-        table = calset.intensities
-        return Made(nights, sketch(calset, table) if isinstance(table, TableIntensities) else frozenset())
+        return Made(nights, source_of(calset), measured)
 
     def _again(self, night: Night, task: Task) -> Made:
         """The night linearised at other values; its candidates as well, or they follow (`with_candidates_of`)."""
@@ -156,7 +165,9 @@ class Makers:
         """
         for made in self._made(tasks):
             if made.sketch:
-                self._refuse_copies(made.nights[0].source, made.sketch)
+                self._refuse_copies(made.source, made.sketch)
+            if made.error is not None:
+                raise made.error
             yield made.nights
 
     def _made(self, tasks: Sequence[Task]) -> Iterable[Made]:
@@ -199,18 +210,17 @@ def executor_of(
     if workers is None and (scheduler is None or isinstance(scheduler, Executor)):
         yield scheduler
         return
-    try:
-        from distributed import Client, LocalCluster  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise fail("Dask is not installed", advice="pip install 'walop-jax[cluster]'") from None
+    if importlib.util.find_spec("distributed") is None:
+        raise fail("Dask is not installed", advice="pip install 'walop-jax[cluster]'")
+    dask = importlib.import_module("distributed")
     with contextlib.ExitStack() as hold:
         if scheduler is None:
             own = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None}
-            address = hold.enter_context(LocalCluster(**own))
+            address = hold.enter_context(dask.LocalCluster(**own))
         else:
             address = scheduler
         try:
-            client = hold.enter_context(Client(address, timeout="20s"))
+            client = hold.enter_context(dask.Client(address, timeout="20s"))
         except OSError as error:
             raise fail(
                 f"no Dask scheduler answers at {scheduler}: {error}", advice="start dask scheduler"
@@ -224,7 +234,7 @@ def sketch(calset: CalibrationSet, table: TableIntensities) -> frozenset[int]:
     The smallest of the hashes of (X, Y, counts); the share that two sketches have in common is that of the sets
     (Broder 1997).
     """
-    rows = table.used & (calset.exposures.kind != "flux")[table.exposure]
+    rows = table.used & ~calset.exposures.flux_known[table.exposure]
     point = table.point[rows]
     places = np.column_stack([calset.points.x[point], calset.points.y[point], table.counts[rows]])
     hashes = np.zeros(len(places), np.uint64)
