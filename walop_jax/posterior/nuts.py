@@ -51,16 +51,16 @@ class Nuts(Sampler):
         key = np.random.SeedSequence(seed).generate_state(1)
         adaptation = importlib.import_module("blackjax.adaptation.step_size")
         begin, learn, settled = adaptation.dual_averaging_adaptation(TARGET_ACCEPTANCE)
-        tuning = begin(FIRST_STEP)
+        tuning = [begin(FIRST_STEP)]
         for chain, info in _chain(
-            density, first, key, range(self.warm_up), lambda: np.exp(tuning.log_step_size)
+            density, first, key, range(self.warm_up), lambda: np.exp(tuning[0].log_step_size)
         ):
-            tuning = learn(tuning, info.acceptance_rate)
+            tuning[0] = learn(tuning[0], info.acceptance_rate)
             first = np.asarray(chain.position)
         return {
             "position": first,
             "key": key,
-            "step_size": np.array(settled(tuning) if self.warm_up else FIRST_STEP),
+            "step_size": np.array(settled(tuning[0]) if self.warm_up else FIRST_STEP),
             "steps": np.array(self.warm_up),
         }
 
