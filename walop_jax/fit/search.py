@@ -145,7 +145,6 @@ def find_minimum(
             expand,
             tolerance=tolerance,
             damping=0.0,
-            look_at_end=False,
         )
         values = found.values
     assert found is not None  # there is a pass over everything
