@@ -181,9 +181,17 @@ def _slopes_at(
     return m[:, 0].reshape(len(m), size), slopes[:, 0].reshape(len(m), size, slopes.shape[-1])
 
 
-_slopes = compiled(_slopes_at, kept_as="slopes")
-_vectors = compiled(jax.vmap(point_vectors, in_axes=(None, None, 0, 0)), kept_as="vectors")
-_sky_vectors = compiled(jax.vmap(point_sky_vectors, in_axes=(None, None, 0, 0)), kept_as="sky_vectors")
+_slopes = compiled(_slopes_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="slopes")
+_vectors = compiled(
+    jax.vmap(point_vectors, in_axes=(None, None, 0, 0)),
+    optimised_above=limits.OPTIMISED_ABOVE,
+    kept_as="vectors",
+)
+_sky_vectors = compiled(
+    jax.vmap(point_sky_vectors, in_axes=(None, None, 0, 0)),
+    optimised_above=limits.OPTIMISED_ABOVE,
+    kept_as="sky_vectors",
+)
 
 
 def analysis_vectors(
@@ -198,8 +206,8 @@ def analysis_vectors(
 
     For light behind the telescope, or `from_sky`, which passes the telescope first.
     """
-    program, once = _sky_vectors if from_sky else _vectors, len(x) <= limits.MATRICES_ONCE
-    return in_chunks(lambda a, b: (program(instrument, plan, a, b, once=once),), x, y)[0]
+    program, plan = _sky_vectors if from_sky else _vectors, dataclasses.replace(plan, work=len(x))
+    return in_chunks(lambda a, b: (program(instrument, plan, a, b),), x, y)[0]
 
 
 sky_vectors = functools.partial(analysis_vectors, from_sky=True)
@@ -226,12 +234,11 @@ def matrices(
     """
     size = 3 * len(instrument.cameras.pairs)
     values, errors = np.empty((len(x), size)), np.empty((len(x), size, size))
-    once = len(x) <= limits.MATRICES_ONCE
     for layout, rows in settings.layouts():
-        plan = plan_for_settings(instrument, layout, filters)
+        plan = dataclasses.replace(plan_for_settings(instrument, layout, filters), work=len(x))
 
         def part(*columns: Array, plan: Plan = plan) -> tuple[np.ndarray, np.ndarray]:
-            found, slopes = map(np.asarray, _slopes(instrument, plan, *columns, once=once))
+            found, slopes = map(np.asarray, _slopes(instrument, plan, *columns))
             return found, slopes @ covariance @ np.swapaxes(slopes, 1, 2)
 
         values[rows], errors[rows] = in_chunks(part, x[rows], y[rows], *_numbers(settings[rows]))
@@ -293,10 +300,9 @@ def matrix_slopes(
     """
     if not instrument.cameras.pairs:  # no row, and nothing to compile
         return np.zeros((len(x), 0, 3)), np.zeros((len(x), 0, 3, values_of(instrument).size))
-    plan = plan_for_settings(instrument, setting, filters)
+    plan = dataclasses.replace(plan_for_settings(instrument, setting, filters), work=len(x))
     numbers = (np.broadcast_to(number, len(x)) for number in _numbers(setting))
-    once = len(x) <= limits.MATRICES_ONCE
-    values, slopes = in_chunks(lambda *at: _slopes(instrument, plan, *at, once=once), x, y, *numbers)
+    values, slopes = in_chunks(lambda *at: _slopes(instrument, plan, *at), x, y, *numbers)
     arms = (len(x), values.shape[1] // 3, 3)
     return values.reshape(arms), slopes.reshape(*arms, slopes.shape[-1])
 

@@ -23,6 +23,12 @@ from walop_jax.likelihood.likelihood import Likelihood, Posterior
 from walop_jax.model import materials
 from walop_jax.model.specification import Model, Vector
 
+FIRST_STRIPS = 8
+"""Strips of image rows that are fitted before all of them: twice what a throughput of fourth order asks for."""
+
+PIXEL_SAMPLE = 1024
+"""Pixels of whole frames on which their fit begins: the optics of so few are soon solved one by one."""
+
 Expand = Callable[[Vector, float, Posterior | None], Posterior]
 
 FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
@@ -126,11 +132,11 @@ def find_minimum(
     if not layout.large:
         return _from_afar(likelihood, first, noise_scale, worth)
     on_pixels = stands_for_pixels(likelihood, first)
-    points = limits.PIXEL_SAMPLE if on_pixels else max(limits.SAMPLE, layout.points // limits.FARTHEST)
+    points = PIXEL_SAMPLE if on_pixels else max(limits.SAMPLE, layout.points // limits.FARTHEST)
     values, scale, starts = _of_sample(likelihood, first, noise_scale, worth, points)
     passes = [("fit of all points", None, LARGE_TOLERANCE)]
     if on_pixels:
-        every = strips_of(likelihood) // limits.FIRST_STRIPS
+        every = strips_of(likelihood) // FIRST_STRIPS
         passes = [("fit of some image rows", every, 1.0)] if every > 1 else []
         passes.append(("fit of all pixels", 1, LARGE_TOLERANCE))
     found: FoundMinimum | None = None

@@ -195,13 +195,13 @@ def knows(option: str) -> bool:
 
 
 def compiled(
-    function: Callable[..., Result], *, fuse: bool = False, kept_as: str = ""
+    function: Callable[..., Result], *, optimised_above: float = -1, fuse: bool = False, kept_as: str = ""
 ) -> Callable[..., Result]:
     """`jax.jit` with this package's options; the back end is looked up at the first call, not at import.
 
-    A call with `once=True` compiles without optimisation: sooner ready, slower to run. `fuse` leaves the fusion
-    emitters on, for a function without derivatives of the plates. `kept_as` is the name under which the traced program
-    is kept between processes (`program`), for a function that depends on nothing but its arguments.
+    Code for a `Plan` whose `work` is not above `optimised_above` is not optimised: sooner ready, slower to run. `fuse`
+    leaves the fusion emitters on, for a function without derivatives of the plates. `kept_as` is the name under which
+    the traced program is kept between processes (`program`), for a function that depends on nothing but its arguments.
     """
 
     def options(once: bool) -> dict[str, Any] | None:
@@ -229,8 +229,9 @@ def compiled(
         return programs[at]
 
     @functools.wraps(function)
-    def call(*args: Any, once: bool = False) -> Result:
+    def call(*args: Any) -> Result:
         _refuse_float32(args)
+        once = any(getattr(arg, "work", np.inf) <= optimised_above for arg in args)
         with float64():
             run = (kept(args, once) if kept_as else None) or jitted(once)
             return run(*args)

@@ -64,7 +64,6 @@ SKETCH, COPIED = (
     512,
     0.02,
 )  # measurements by which sets are compared, and their share that no two have by chance
-MANY = 20  # sets from which on programs are better compiled for longer
 REFERENCE = "reference.fits"
 TRACKS = "tracks.fits"
 FILES = (NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY)
@@ -97,7 +96,7 @@ class _Maker:
 
     like: Calibration | None
     folder: Path | None
-    few: bool = True
+    count: int = 1
     candidates: dict[tuple[str, ...], Candidates] = dataclasses.field(default_factory=dict)
     sets: dict[str, tuple[CalibrationSet, Model]] = dataclasses.field(default_factory=dict)
     noise: dict[int, str] = dataclasses.field(default_factory=dict)
@@ -118,7 +117,7 @@ class _Maker:
         calset, model = self._set_and_model(data)
         values = dict(zip(self.like.model.names, self.like.values.tolist(), strict=True))
         known = self._candidates(model, calset)
-        found = night_equations(calset, model, values, known, own=True, once=self.few)
+        found = night_equations(calset, model, values, known, own=True, sets=self.count)
         if place is not None:
             place.parent.mkdir(parents=True, exist_ok=True)
             write_nights(place, found, overwrite=True)
@@ -133,7 +132,7 @@ class _Maker:
         if not candidates:  # a gauge stays where its column was made
             cut = len(night.names) - night.candidates
             values = {**values, **dict(zip(night.names[cut:], night.reference[cut:].tolist(), strict=True))}
-        (made,) = night_equations(calset, model, values, known, number=night.number, once=self.few)
+        (made,) = night_equations(calset, model, values, known, number=night.number, sets=self.count)
         return with_candidates_of(made, night)
 
     def _set_and_model(self, data: _Data) -> tuple[CalibrationSet, Model]:
@@ -202,7 +201,7 @@ def stack(
     opened = [_opened(one, catalogue) for one in nights]
     fits = [one for one in (like, *(some.fit for some in opened)) if one is not None]
     held = [Calibration.from_fit(one) if isinstance(one, FitResult) else one for one in fits[:1]]
-    maker = _Maker(held[0].rebuilt() if held else None, partial, len(opened) < MANY)
+    maker = _Maker(held[0].rebuilt() if held else None, partial, len(opened))
     made: list[Night] = []
     at_hand: dict[tuple[str, int], _Data] = {}
     for k, one in enumerate(opened):
