@@ -43,6 +43,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.polynomial.legendre import legvander
 
 from walop_jax.data.records import POLARISER, CalibrationSet, Exposures
+from walop_jax.diagnosis.policy import RINGS
 from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import cut, states
@@ -58,7 +59,6 @@ MANY_POINTS = 4
 """Field points of an exposure, on average, above which its cameras may have gains of their own: with fewer there are
 nearly as many gains as data."""
 
-RINGS = (3, 4, 5, 6, 7, 8)  # degrees; the throughput takes up what is smoother
 SINGLE_EXPOSURES = "single exposures"
 STATES = "states"
 
