@@ -86,6 +86,7 @@ _WORDS = re.compile(
 )
 """Words of headers that CONTHASH covers: all that are read, but for structure (FITS), date and software."""
 _AGAIN = "make the product again"
+_NEWER = "use a newer walop-jax, or make the product again with this one"
 
 Cards = dict[str, tuple[Any, str]]
 
@@ -333,7 +334,7 @@ class _Reader:
     def __init__(self, opened: OpenFile) -> None:
         self.path, self.header, self.opened = opened.path, opened.hdus[0].header, opened.hdus
         self.primary = Place(self.path, "PRIMARY")
-        self.version = self._version()
+        self._check_version()
         self.hdus: dict[str, Any] = {}
         for hdu in opened.hdus[1:]:
             name = hdu.name.strip().upper()
@@ -406,11 +407,10 @@ class _Reader:
             advice = "a product is not edited by hand: fit again, with a model file for what should differ"
             raise self.primary.fail("the content is not what was written", "CONTHASH", advice)
         if rule not in (None, HASHRULE):
-            advice = "use a newer walop-jax, or make the product again with this one"
-            raise self.primary.fail(f"is {rule!r}, this program knows {HASHRULE}", "HASHRULE", advice)
+            raise self.primary.fail(f"is {rule!r}, this program knows {HASHRULE}", "HASHRULE", _NEWER)
         return held
 
-    def _version(self) -> int:
+    def _check_version(self) -> None:
         version = self.header.get("PRODVERS")
         if version is None and "CALVERS" in self.header:
             what, advice = "this is a calibration set, not a calibration product", "run walop-jax refit on it"
@@ -419,10 +419,9 @@ class _Reader:
         elif isinstance(version, bool) or not isinstance(version, int) or version < 1:
             what, advice = f"is {version!r}, not a version", _AGAIN
         elif version > PRODVERS:
-            what = f"is {version}, this program reads up to {PRODVERS}"
-            advice = "use a newer walop-jax, or make the product again with this one"
+            what, advice = f"is {version}, this program reads up to {PRODVERS}", _NEWER
         else:
-            return version
+            return
         raise self.primary.fail(what, "PRODVERS", advice)
 
     def number(self, name: str, missing: float | None = None) -> float:
@@ -495,9 +494,9 @@ class _Reader:
         return found
 
     def maps(self) -> MatrixMaps:
-        """The maps of the matrix: of two arms in version 1, of as many as there are images later on."""
+        """The maps of the matrix, of as many arms as there are images."""
         rows = [int(match[1]) for name in self.hdus if (match := _MATRIX_IMAGE.fullmatch(name))]
-        names = matrix_names(2 if self.version == 1 else max([1, *(row - 1 for row in rows)]))
+        names = matrix_names(max([1, *(row - 1 for row in rows)]))
         errors = tuple(f"{name}_ERR" for name in names)
         images = {name: self.image(name) for name in (*names, *errors)}
         grid = self.grid(names[0])
