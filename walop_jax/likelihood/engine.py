@@ -17,6 +17,7 @@ Exposures      are not compressed beforehand, although light is linear in them: 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
