@@ -294,7 +294,6 @@ NAME = "arrays"
 """Name in errors of the file that is none."""
 
 _SHOWN = 3
-_UNITS = {name: rule.unit for name, rule in schema.EXPOSURES.items()}
 
 
 def from_arrays(
@@ -356,11 +355,11 @@ def from_arrays(
     tables: dict[str, Mapping[str, Any]] = {
         "EXPOSURES": {
             "EXPOSURE": np.arange(number),
-            "KIND": _column("KIND", kinds, number),
+            "KIND": _spread("KIND", kinds, number),
             "CLP_IN": inside,
             "CLP_ANGLE": np.where(inside, angles, np.nan),
         }
-        | {name.upper(): _column(name.upper(), values, number) for name, values in exposures.items()},
+        | {name.upper(): _spread(name, values, number) for name, values in exposures.items()},
         "POINTS": {"POINT": np.arange(len(x)), "X": x, "Y": y},
         "INTENSITIES": {
             "EXPOSURE": exposure,
@@ -427,22 +426,16 @@ def _spoilt(counts: np.ndarray) -> Iterator[str]:
         yield f"{NAME}: not finite in {shown}{more}: not used in any camera"
 
 
-def _column(name: str, values: Any, number: int) -> np.ndarray:
-    unit = _UNITS.get(name, "deg" if name.endswith("_ANGLE") else "")
-    raw, masked = without_mask(getattr(values, "value", values))
-    if raw.dtype.kind in "bSU":
-        Place(NAME, "EXPOSURES").refuse(
-            np.atleast_1d(masked), "is masked", name.lower(), "fill or remove these"
-        )
-    plain = raw if raw.dtype.kind in "bSU" else in_unit(values, unit, name.lower())
-    try:
-        return np.broadcast_to(plain, number).copy()
-    except ValueError:
-        raise fail(
-            f"has shape {plain.shape} for {number} exposures",
-            column=name.lower(),
-            advice="one value for each",
-        ) from None
+def _spread(name: str, values: Any, number: int) -> Any:
+    """A column of EXPOSURES from one value for each, or one for all."""
+    spread = np.repeat(np.atleast_1d(values), number) if np.size(values) == 1 else values
+    if np.shape(spread) != (number,):
+        what = f"has shape {np.shape(values)} for {number} exposures"
+        raise fail(what, column=name.lower(), advice="one value for each")
+    plain, masked = without_mask(spread)
+    if plain.dtype.kind in "bSU":
+        Place(NAME, "EXPOSURES").refuse(masked, "is masked", name.lower(), "fill or remove these")
+    return spread
 
 
 def _none_where_masked(source: Any) -> np.ndarray:
@@ -450,15 +443,8 @@ def _none_where_masked(source: Any) -> np.ndarray:
     return np.where(masked, -1, values)
 
 
-def _sources(given: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _sources(given: Mapping[str, Any]) -> dict[str, Any]:
     """The columns of SOURCES, numbered where they have no number."""
-    columns = {}
-    for name, values in given.items():
-        rule = schema.SOURCES.get(str(name).upper())
-        if rule is not None and rule.kind == "float":
-            plain = in_unit(values, rule.unit, str(name))
-        else:
-            plain = np.asarray(values)
-        columns[str(name).upper()] = np.atleast_1d(plain)
+    columns = {str(name).upper(): np.atleast_1d(values) for name, values in given.items()}
     columns.setdefault("SOURCE", np.arange(max(map(len, columns.values()), default=0)))
     return columns

@@ -13,15 +13,13 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.schema import EXPOSURES, Column, Place, check, finite
+from walop_jax.data.schema import EXPOSURES, MISSING, Column, Place, check, finite, plain_column
 from walop_jax.data.settings import TEMPERATURE, Settings
 from walop_jax.data.table_intensities import equal_rows
 from walop_jax.data.user_tables import (
-    MISSING,
     InputTable,
     empty_cells,
     numeric_column,
-    plain_column,
     read_input_table,
     vector_column,
 )
