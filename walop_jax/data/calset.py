@@ -331,7 +331,9 @@ def from_arrays(
     >>> made.exposures.clp_angle
     array([ 0., 30., 60., 90.])
     """
+    units = {"counts": schema.unit_of(counts), "errors": schema.unit_of(errors)}
     counts, errors = in_unit(counts, "electron", "counts"), in_unit(errors, "electron", "errors")
+    schema.check_units(units, "electron", Place(NAME, ""))
     x, y, angles = (np.atleast_1d(in_unit(v, "deg", n)) for v, n in ((x, "x"), (y, "y"), (angles, "angles")))
     if counts.ndim != 3 or counts.shape[:2] != (len(x), len(angles)) or len(x) != len(y):
         raise fail(

@@ -277,7 +277,7 @@ def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[d
             table[name] = np.full(rows, column.missing)
             if column.remarked:
                 absent.setdefault(str(column.missing), []).append(name)
-    check_units(units_of, columns, place)
+    check_units({name: units_of[name] for name in ("N", "N_ERR") if name in units_of}, "electron", place)
     for missing, left_out in absent.items():
         what = f"column{'s' if len(left_out) > 1 else ''} missing; using {missing}"
         remarks.append(place.remark(what, ", ".join(left_out)))
@@ -408,7 +408,7 @@ def plain_column(
             raise place.fail("holds differences of times", name, "give dates")
         values = np.asarray(getattr(given.utc.mjd, "unmasked", given.utc.mjd), dtype=float)
         return values, np.broadcast_to(masked, values.shape), ""
-    unit = str(getattr(given, "unit", None) or "")
+    unit = unit_of(given)
     values, masked = without_mask(getattr(given, "value", given) if unit else given)
     if values.dtype.names:
         raise place.fail("is no plain column", name, "give a column of numbers or texts")
@@ -467,7 +467,7 @@ def in_unit(values: Any, unit: str, name: str) -> Float[np.ndarray, "*s"]:
     `DataError` for a unit that cannot be converted and for what is not a number.
     """
     place = Place("", "")
-    given = str(getattr(values, "unit", None) or "")
+    given = unit_of(values)
     plain = getattr(values, "value", values) if given and not hasattr(values, "colnames") else values
     try:
         raw, masked = without_mask(plain)
@@ -478,16 +478,18 @@ def in_unit(values: Any, unit: str, name: str) -> Float[np.ndarray, "*s"]:
     return (convert_unit(flat, given, unit, name, place) if given else flat).reshape(np.shape(numbers))
 
 
-def check_units(units_of: Mapping[str, str], columns: Mapping[str, Column], place: Place) -> None:
-    """Raise `DataError` where of a quantity and its error (N and N_ERR) one alone has a unit, which is converted."""
-    for error in (name for name in units_of if name.endswith("_ERR")):
-        name, wanted = error.removesuffix("_ERR"), columns[error].unit
-        pair = units_of.get(name, ""), units_of[error]
-        if wanted and name in units_of and (not pair[0]) != (not pair[1]):
-            given, (with_unit, without) = max(pair), (name, error) if pair[0] else (error, name)
-            if units.Unit(given) != units.Unit(wanted):
-                what = f"has no unit, {with_unit} is in {given}"
-                raise place.fail(what, without, f"give both in one unit, or both in {wanted}")
+def unit_of(column: Any) -> str:
+    """The unit that a column, an array or a quantity brings along, "" for none."""
+    return str(getattr(column, "unit", None) or "")
+
+
+def check_units(given: Mapping[str, str], wanted: str, place: Place) -> None:
+    """Raise `DataError` where some of columns that belong together have a unit to be converted and others have none."""
+    converted = [name for name, unit in given.items() if unit and units.Unit(unit) != units.Unit(wanted)]
+    without = [name for name, unit in given.items() if not unit]
+    if converted and without:
+        what = f"has no unit, {converted[0]} is in {given[converted[0]]}"
+        raise place.fail(what, without[0], f"give all in one unit, or all in {wanted}")
 
 
 def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: Place) -> np.ndarray:

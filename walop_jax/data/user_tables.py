@@ -20,8 +20,10 @@ from walop_jax.data.schema import (
     MISSING,
     Column,
     Place,
+    check_units,
     distinct,
     plain_column,
+    unit_of,
     values_of,
 )
 from walop_jax.data.table_files import read_table_file, table_of_hdu
@@ -168,15 +170,33 @@ def _what_is_there(source: InputTable) -> str:
     return f"the table has {some([str(name) for name in source.table.colnames], _LISTED)}"
 
 
-def vector_column(source: InputTable, name: str, rule: Column, cameras: Sequence[str]) -> np.ndarray:
-    """A column with `rule.width` numbers in a row, or that many columns side by side, which text formats need.
+def vector_columns(
+    source: InputTable, names: Sequence[str], rule: Column, cameras: Sequence[str]
+) -> list[np.ndarray]:
+    """Columns with `rule.width` numbers in a row, or that many columns side by side, which text formats need.
 
-    These are N0, N1, … and N0_ERR, N1_ERR, … (or N_ERR0, …), or go by the names of the `cameras`: O1, E1, … and
-    O1_ERR, E1_ERR, … Raises `DataError` as `numeric_column` does, and for a row of another width.
+    Those of N and N_ERR are N0, N1, … and N0_ERR, N1_ERR, … (or N_ERR0, …), or go by the names of the `cameras`: O1,
+    E1, … and O1_ERR, E1_ERR, … Raises `DataError` as `numeric_column` does, for a row of another width, and where only
+    some of them have a unit that is converted.
     """
+    single = dataclasses.replace(rule, width=1)
+    parts = {name: _side_by_side(source, name, rule.width or 1, cameras) for name in names}
+    found = {part: source.column(part) for name in names for part in parts[name]}
+    units = {part: unit_of(column) for part, column in found.items() if column is not None}
+    values = [
+        numeric_column(source, name, rule)
+        if parts[name] == [name]
+        else np.stack([numeric_column(source, part, single) for part in parts[name]], axis=1)
+        for name in names
+    ]
+    check_units(units, rule.unit, Place(source.path, ""))
+    return values
+
+
+def _side_by_side(source: InputTable, name: str, width: int, cameras: Sequence[str]) -> list[str]:
+    """The columns that hold `width` numbers in a row: one of that name, or one for each number."""
     if name in source.names:
-        return numeric_column(source, name, rule)
-    width = rule.width or 1
+        return [name]
     head, _, tail = name.partition("_")
     end = f"_{tail}" if tail else ""
     spelled = [f"{head}{k}{end}" for k in range(width)], [f"{camera.upper()}{end}" for camera in cameras]
@@ -184,13 +204,10 @@ def vector_column(source: InputTable, name: str, rule: Column, cameras: Sequence
     parts = next((form for form in forms if any(part in source.names for part in form)), None)
     if parts is None:
         source.lacking.update((name, *spelled[0], *spelled[1]))
-        if rule.missing is not None:
-            return np.full((source.rows, width), rule.missing)
         listed = ", or ".join(f"{form[0]} … {form[-1]}" for form in spelled)
         advice = f"add it, or {listed}; {_what_is_there(source)}"
         raise Place(source.path, "").fail("the column is missing", name, advice)
-    single = dataclasses.replace(rule, width=1)
-    return np.stack([numeric_column(source, part, single) for part in parts], axis=1)
+    return parts
 
 
 def empty_cells(source: InputTable, name: str, rule: Column) -> Bool[np.ndarray, " n"]:
