@@ -153,6 +153,7 @@ def assembled(
     Raises `DataError` for whatever numbers cannot be meant.
     """
     remarks = list(remarks)
+    instrument = instrument_name(instrument, Place(path, "PRIMARY"))
     filters = make_filters(tables["FILTERS"], Place(path, "FILTERS")) if "FILTERS" in tables else {}
     place = Place(path, "EXPOSURES")
     exposures = make_exposures(tables["EXPOSURES"], filters, site, place, kinds)
@@ -341,8 +342,6 @@ def from_arrays(
             column="counts",
             advice="its axes are (point, exposure, camera)",
         )
-    instrument = instrument_name(instrument, Place(NAME, "PRIMARY"))
-    check_cameras(instrument, counts.shape[2], Place(NAME, ""), "counts")
     for name, curve in (filters or {}).items():
         if not isinstance(curve, FilterCurve):
             raise fail(
@@ -393,7 +392,7 @@ def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationS
     """
     found = _in_memory(
         set_tables(calset),
-        instrument=instrument_name(calset.instrument, Place(NAME, "PRIMARY")),
+        instrument=calset.instrument,
         site=calset.site,
         origin=calset.origin,
         kinds=(*KINDS, *kinds),
