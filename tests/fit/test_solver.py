@@ -122,6 +122,21 @@ def test_work_is_bounded_and_the_best_place_so_far_comes_back():
     assert found.expansion.objective == min(found.history) == squares(found.x).objective
 
 
+def test_steps_to_and_fro_across_a_valley_are_damped():
+    """r = (x, 5 + k x²) is bent by 1 + 10 k = 1.91 where Gauss and Newton have 1: each step leaves −0.91 of the way.
+
+    Undamped, 0.9 takes a hundred of them to 10⁻⁴.
+    """
+    k = 0.091
+    bent = Squares(
+        lambda x: np.array([x[0], 5.0 + k * x[0] ** 2]), lambda x: np.array([[1.0], [2.0 * k * x[0]]])
+    )
+    found = minimise(bent, np.array([0.9]), np.ones(1), damping=0.0)
+    assert found.converged
+    assert found.steps < 15
+    assert abs(found.x[0]) < 1e-3
+
+
 # -------------------------------------------------------------------------------------- what holds always
 
 

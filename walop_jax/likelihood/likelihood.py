@@ -317,7 +317,7 @@ class Likelihood:
     # ----------------------------------------------------------------------------------- a pass over the points
 
     def _joined(self, label: str, function: Callable[[engine.PointData], Joined]) -> Joined:
-        """What a function finds out about each batch of points, joined."""
+        """Results of a function for each batch of points, joined."""
 
         def work(number: int) -> Joined:
             return functools.reduce(lambda a, b: a.joined(b), map(function, self.points.slab(number)))

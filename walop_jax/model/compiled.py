@@ -147,7 +147,7 @@ def _plain(value: Any) -> Any:
 
 
 def _name(value: Any) -> str:
-    """Where a class or function is found. Raises `_NotKept` unless it is found there."""
+    """Module and name of a class or function. Raises `_NotKept` unless it is found there."""
     module, name = value.__module__ or "", value.__qualname__
     if module.partition(".")[0] not in _KNOWN or _found(f"{module}:{name}") is not value:
         raise _NotKept(name)
@@ -277,7 +277,7 @@ def compiled(
     @functools.wraps(function)
     def call(*args: Any) -> Result:
         _refuse_float32(args)
-        once = any(getattr(arg, "work", np.inf) <= optimised_above for arg in args)
+        once = optimised_above >= 0 and any(getattr(arg, "work", np.inf) <= optimised_above for arg in args)
         with float64():
             run = (kept(args, once) if kept_as else None) or jitted(once)
             return run(*args)

@@ -62,9 +62,7 @@ from walop_jax.science.watch_found import UNNAMED, History, Suspect, Watch, Watc
 from walop_jax.science.watch_readings import Answers, Readings
 from walop_jax.science.watch_spots import SpotFound, Spots, of_stars, profile
 
-WATCHED_ROWS = 200_000
-"""Rows of catalogues by which a calibration is watched: a kilobyte each, and a camera is seen to 10⁻⁵."""
-
+WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen to 10⁻⁵
 SEEN = 2.33
 """Standard deviations above the alarm from which 99 % are found."""
 MOST_GROUPS = 150
