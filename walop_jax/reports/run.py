@@ -50,7 +50,7 @@ Drawable = FitResult | Calibration | Diagnosis | PosteriorSample | Run
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class FigureSource:
-    """What a figure is drawn from: a run, or a result in memory; what is needed and not there is a `DataError`.
+    """The run, or the result in memory, that a figure is drawn from; a lack of what it needs is a `DataError`.
 
     `held` are the contents of a result in memory under the names of the files of a run that would hold them, its data
     as `DATA`; it has no `run`. `sample` is a posterior in memory, which has the walkers as well. `parameters` are
