@@ -18,7 +18,8 @@ from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import astropy_table, write_table
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.posterior import sampling
-from walop_jax.posterior.files import read_draws, with_draws, with_moments, write_posterior
+from walop_jax.posterior.draws import read_draws, with_draws, with_moments
+from walop_jax.posterior.files import write_posterior
 from walop_jax.posterior.result import Options, PosteriorSample
 from walop_jax.posterior.sampling import sample
 

@@ -17,7 +17,6 @@ import functools
 import itertools
 import json
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -31,9 +30,10 @@ from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import value_and_error
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.posterior.draws import INFLATION, arviz
 from walop_jax.posterior.samplers import Sampler, make_sampler
 from walop_jax.posterior.surrogate import Accuracy
-from walop_jax.posterior.target import INFLATION, LARGEST_SAMPLED
+from walop_jax.posterior.target import LARGEST_SAMPLED
 
 Chains = Float[np.ndarray, "e t w k"]  # ensembles, stored steps, walkers, quantities
 
@@ -113,15 +113,6 @@ def effective_samples(chains: Chains) -> Float[np.ndarray, " k"]:
     walkers = np.moveaxis(chains, 2, 1).reshape(e * w, n, k)
     az = arviz()
     return np.array([float(az.ess(walkers[..., i], method="mean")) for i in range(k)])
-
-
-def arviz() -> Any:
-    """ArviZ, without the announcement that it makes when it is imported."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import arviz
-
-    return arviz
 
 
 def _of_rows(likelihood: Likelihood) -> dict[str, Any]:
