@@ -38,7 +38,8 @@ def as_arviz(groups: DataTree) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the announcement that it makes when it is imported
         import arviz
-    return arviz.InferenceData(**{name: node.to_dataset() for name, node in groups.children.items()})
+    data: dict[str, Any] = {name: node.to_dataset() for name, node in groups.children.items()}
+    return arviz.InferenceData(**data)
 
 
 def group_of_draws(draws: Mapping[str, Float[np.ndarray, "c d"]]) -> Dataset:
@@ -91,7 +92,7 @@ def read_draws(
         posterior = groups["posterior"]
         fixed = json.loads(posterior.attrs["fixed"])
         trusted = bool(posterior.attrs["trusted"])
-        held = {str(name): np.asarray(posterior[name].values).ravel() for name in posterior.data_vars}
+        held = {name: np.asarray(posterior[name].values).ravel() for name in map(str, posterior.data_vars)}
     except Exception as error:
         raise fail(f"cannot be read: {error}", file=path, advice=_AGAIN) from error
     held.pop(INFLATION, None)
