@@ -224,7 +224,8 @@ class AnalysisVectors:
         return Rectangle(-corner, corner)
 
     def _vector_table(self, setting: Settings) -> FieldTable:
-        teff = [np.nan, *colour_nodes(COLOURS).tolist()]
+        nodes = colour_nodes(COLOURS).tolist()
+        teff = [np.nan, *nodes]
         weights = colour_weights(np.array(BETWEEN), COLOURS)
 
         def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
@@ -235,7 +236,9 @@ class AnalysisVectors:
             between = np.einsum("tc,pcks->ptks", weights, there)
             return float(np.abs(between - truth).max() / truth.max())
 
-        truth = self.exact(setting, *held_out(self._rectangle), BETWEEN)
+        # As many colours as on the nodes, for whose number the program is there.
+        colours = (*BETWEEN, *nodes[len(BETWEEN) - 1 :])
+        truth = self.exact(setting, *held_out(self._rectangle), colours)[:, : len(BETWEEN)]
         return self._accurate(exact, NODES, TOLERANCE, error, truth)
 
     def _derivative_table(self, setting: Settings) -> FieldTable:
