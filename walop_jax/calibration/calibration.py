@@ -49,7 +49,7 @@ from walop_jax.io.display import Display
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.text import in_ascii
 from walop_jax.model.dependence import left_behind, needs
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.elements import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
@@ -87,7 +87,7 @@ class ListedModel(NamedTuple):
     maps: MatrixMaps
     lines: tuple[str, ...]
     description: tuple[str, ...] = ()
-    catalogue: tuple[type[Effect], ...] = EFFECTS
+    catalogue: tuple[EffectKind, ...] = EFFECTS
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.fits_reading import OpenFile, open_fits
 from walop_jax.io.text import in_ascii
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.parameters import NAME, Parameter
 
 PRODUCT = "calibration.fits"
@@ -283,7 +283,7 @@ def _hidden_hdu(hidden: Hidden) -> fits.ImageHDU:
 
 
 def read_calibration(
-    run: str | os.PathLike[str], catalogue: Sequence[type[Effect]] = EFFECTS, *, rebuild: bool = True
+    run: str | os.PathLike[str], catalogue: Sequence[EffectKind] = EFFECTS, *, rebuild: bool = True
 ) -> Calibration:
     """Read and check a calibration, given by its file or by the folder of a run.
 
@@ -318,7 +318,7 @@ class _Reader:
                 raise fail("is there twice", file=self.path, extension=name, advice="remove one")
             self.hdus[name] = hdu
 
-    def calibration(self, catalogue: tuple[type[Effect], ...]) -> Calibration:
+    def calibration(self, catalogue: tuple[EffectKind, ...]) -> Calibration:
         """The calibration as the file lists it, its content hash checked."""
         covariance = self.image("COVARIANCE")
         maps = self.maps()

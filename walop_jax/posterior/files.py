@@ -39,7 +39,7 @@ from walop_jax.io.errors import fail
 from walop_jax.io.text import read_json, two_digits
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.posterior.emcee import emcee_state, random_attributes
 from walop_jax.posterior.result import PosteriorSample, arviz
 from walop_jax.posterior.samplers import State, Stretch
@@ -278,7 +278,7 @@ class Run(Result):
     """
 
     folder: Path
-    catalogue: Sequence[type[Effect]] = EFFECTS
+    catalogue: Sequence[EffectKind] = EFFECTS
     data: Sequence[str | os.PathLike[str]] = ()
 
     def __post_init__(self) -> None:
