@@ -30,7 +30,7 @@ from walop_jax.simulation.simulate import simulate
 @pytest.fixture(scope="module")
 def leaking():
     """A set with some leakage, its fit without and with that effect, and the context."""
-    effect = dataclasses.replace(effect_by_name("camera_leakage")(), share=4e-4)
+    effect = effect_by_name("camera_leakage").of(PLAN.context(), share=4e-4)
     calset, _ = simulate(PLAN, seed=8, effects=[effect])
     model = base_model(calset)
     context = effect_context(model.template, calset.exposures)
@@ -130,7 +130,7 @@ def test_patterns_do_not_know_the_noise(leaking):
     other, _ = simulate(
         PLAN,
         seed=8,
-        effects=[dataclasses.replace(effect_by_name("camera_leakage")(), share=4e-4)],
+        effects=[effect_by_name("camera_leakage").of(PLAN.context(), share=4e-4)],
         noiseless=True,
     )
     ours, exact = (Measured(Likelihood.of(s, base.model), base.values).level for s in (calset, other))

@@ -87,7 +87,7 @@ def test_effects_are_followed(name: str):
     effect = kind.neutral(CONTEXT)
     names = kind.amplitudes()
     changed = {name: jnp.full(np.shape(getattr(effect, name)), 0.01) for name in names}
-    instrument = built(dataclasses.replace(effect, **changed))
+    instrument = built(effect.replaced(**changed))
     sightline = SIGHTLINES["polariser, plate in" if name == "clp_ellipticity" else "star"]
     last = trace(instrument, builders.broad_band(), sightline)[-1]
     np.testing.assert_allclose(last.value[0], counts_of(instrument, sightline), rtol=0, atol=1e-14)
