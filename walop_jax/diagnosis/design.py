@@ -43,6 +43,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.polynomial.legendre import legvander
 
 from walop_jax.data.records import POLARISER, CalibrationSet, Exposures
+from walop_jax.diagnosis.policy import RINGS
 from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import cut, states
@@ -54,7 +55,6 @@ from walop_jax.model import legendre
 from walop_jax.model.effects.free_form import FINE, HARMONICS, SMOOTH, WIDTH
 from walop_jax.model.instrument import Instrument
 
-RINGS = (3, 4, 5, 6, 7, 8)  # degrees; the throughput takes up what is smoother
 SINGLE_EXPOSURES = "single exposures"
 STATES = "states"
 
