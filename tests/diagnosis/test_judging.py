@@ -51,7 +51,7 @@ def test_evidence_of_many_numbers_is_the_mean_over_fits_with_priors_of_four_widt
     context, rng = leaking[1], np.random.default_rng(1)
     neutral = effect_by_name("moon_patch").neutral(context)
     q, u = 5e-4 * rng.standard_normal((2, len(neutral.q)))
-    calset, _ = simulate(PLAN, seed=8, effects=[dataclasses.replace(neutral, q=q, u=u)])
+    calset, _ = simulate(PLAN, seed=8, effects=[neutral.replaced(q=q, u=u)])
     model = base_model(calset)
     base = fit(Likelihood.of(calset, model))
     with_patches, evidence = with_effects(model, ["moon_patch"], context), []

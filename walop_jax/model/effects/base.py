@@ -129,7 +129,7 @@ class Effect(Component):
 
     @property
     def kind(self) -> Any:
-        """What makes effects like it, and says what they have in common: its class, or its entry in the catalogue."""
+        """Its class, or its entry in the catalogue: what effects of one name have in common."""
         return type(self)
 
     def declarations(self) -> Mapping[str, Parameter]:

@@ -60,7 +60,7 @@ EACH = ("camera", "moon exposure")
 RADIANS = {"rad": 1.0, "deg": np.pi / 180.0}
 
 EffectKind = type[Effect] | Entry
-"""What makes effects of one name: an entry, or a class."""
+"""An entry, or a class: makes effects of one name."""
 
 
 def entries(content: Mapping[str, Any]) -> tuple[EffectKind, ...]:
