@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from walop_jax.io.code import blank
 from walop_jax.model import light
 from walop_jax.model.cameras import DetectorPart
 from walop_jax.model.effects.base import Effect
@@ -30,7 +31,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Shapes, of_shapes, parameter_places, shapes_of
 from walop_jax.model.plan import Plan, blank_plan
 from walop_jax.model.ray import Conditions, NotPlannedError, Ray
-from walop_jax.model.sources import Sight
+from walop_jax.model.sources import ExposureArrays, Sight
 
 AT = 0.11, 0.07
 """A field point off the axis and at an odd place: a dependence must not vanish by symmetry in what is written."""
@@ -151,20 +152,17 @@ KNOWN = frozenset({"temperature", "hour_angle"})
 """Conditions of the optics that a table of points or a catalogue can say."""
 
 
-class _Unknown:
+class _Unknown(ExposureArrays):
     """Exposures of which nothing is known: whatever is asked of them is an error."""
 
     def __getattr__(self, name: str) -> Any:
         raise NotPlannedError(name)
 
 
-UNKNOWN: Any = _Unknown()
-
-
 def is_undone(part: DetectorPart, cameras: int) -> bool:
     """True if a detector asks for nothing but its own counts, so that a catalogue can be freed of it."""
     try:
-        jax.eval_shape(lambda p: p.reported(jnp.ones((1, cameras)), UNKNOWN), part)
+        jax.eval_shape(lambda p: p.reported(jnp.ones((1, cameras)), blank(_Unknown)), part)
     except NotPlannedError:
         return False
     return True
@@ -187,5 +185,5 @@ def reported(instrument: Instrument, counts: Float[Array, "n k"]) -> Float[Array
     """Counts that are reported for counts (electrons) by the detectors that can be undone."""
     for part in instrument.patched().cameras.detectors:
         if is_undone(part, len(instrument.cameras)):
-            counts = part.reported(counts, UNKNOWN)
+            counts = part.reported(counts, blank(_Unknown))
     return counts
