@@ -1,4 +1,4 @@
-"""Elements that change where a ray goes: the mapping from field to pupil, wedges, flexure.
+"""Elements that change where a ray goes: the mapping from field to pupil, wedges.
 
 Pupil       (X, Y) leaves the collimator along (tan M X′, tan M (1 + a) Y′, 1), X′ = X (1 + κ r²): M magnification,
             κ distortion [deg⁻²], r² = X² + Y² [deg²], a aspect.
