@@ -358,15 +358,15 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
     `elements` are further kinds of elements that the description may name. Raises `DataError`, naming table and key,
     for what does not exist or would do nothing where it stands.
     """
-    made = parts(description, elements)
-    every = (*made.elements, *(element for _, inside, _ in made.arms for element in inside))
+    common, arms, throughput, cameras = parts(description, elements)
+    every = (*common, *(element for _, inside, _ in arms for element in inside))
     instrument = Instrument(
         name=description.name,
         sources=sources(),
-        elements=made.elements,
-        arms=tuple(Arm(*arm) for arm in made.arms),
-        throughput=made.throughput,
-        cameras=made.cameras,
+        elements=common,
+        arms=tuple(Arm(*arm) for arm in arms),
+        throughput=throughput,
+        cameras=cameras,
         path=description.path,
         field_limit=description.field_limit,
         site=description.place,
