@@ -147,6 +147,10 @@ GOOD = 'angle = { does = "turn of polariser", unit = "deg", width = 0.1, about =
         ),
         (f"[a]\n{ENTRY}{GOOD.replace(', width = 0.1', '')}", "angle: needs unit, about, and width"),
         (f'[a]\n{ENTRY}{GOOD}on_sided = ["angle"]\n', "there is no key 'on_sided'; did you mean 'one_sided'"),
+        (
+            f"[a]\n{ENTRY}{GOOD.replace('angle', 'moon')}",
+            r"\[a\] moon: every effect has something of this name",
+        ),
         (f"[clp_zero]\n{ENTRY}{GOOD}", "has the name of another effect"),
         ("a = 3\n", "must be a table"),
         ("", "defines no effect"),

@@ -28,6 +28,7 @@ this one).
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import inspect
 import os
@@ -89,6 +90,9 @@ def _entry(name: str, table: Mapping[str, Any]) -> Entry:
     if not parameters and "arrangement" not in table:
         raise ValueError("needs a parameter, a key that holds a table with does = …")
     choices = {key: of if isinstance(of, str) else tuple(of) for key, of in table.get("choices", {}).items()}
+    for key in (*parameters, *choices):
+        if hasattr(Named, key) or key in {field.name for field in dataclasses.fields(Named)}:
+            raise ValueError(f"{key}: every effect has something of this name; give it another one")
     return Entry(
         name=name,
         members=tuple(_member(key, parameters, table["source"], choices) for key in parameters),
