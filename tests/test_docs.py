@@ -309,8 +309,7 @@ def test_example_of_a_model_file():
 
 def catalogue_tables() -> str:
     """The tables of all effects in docs: effects, as Markdown, from the catalogue."""
-    from walop_jax.model.effects import EFFECTS
-    from walop_jax.model.parameters import field_declarations
+    from walop_jax.model.effects import EFFECTS, Context
 
     lines: list[str] = []
     entries = tomllib.loads((ROOT / "walop_jax" / "model" / "effects" / "catalogue.toml").read_text())
@@ -318,15 +317,14 @@ def catalogue_tables() -> str:
         if part := entries[effect.name].get("part"):
             lines += ["", f"### {part}", ""]
             lines += ["| effect | parameter | unit | width | what it is |", "| --- | --- | --- | --- | --- |"]
-        choices = [f.name for f in dataclasses.fields(effect) if f.metadata.get("static")]
-        choices = [name for name in choices if name not in ("positions", "ids")]
+        choices = effect.neutral(Context()).choices()
         equation = re.split(r"\n(?=Symbols|Source)", effect.head().partition("Equation")[2])[0]
         told = [
             inspect.cleandoc(effect.__doc__ or "").splitlines()[0].rstrip("."),
             *(f"choice: `{name}`" for name in choices),
             " ".join(equation.split()),
         ]
-        declared = field_declarations(effect)
+        declared = effect.numbers()
         for name, d in declared.items() or [("none", None)]:
             width = "" if d is None or d.width is None else f"{d.width:g}"
             what = "" if d is None else d.about + ("" if d.width else " (shape)")
@@ -367,7 +365,6 @@ def test_kinds_and_factors_of_descriptions_are_in_their_tables():
 
 def test_effects_with_parameters_units_and_widths():
     from walop_jax.model.effects import EFFECTS
-    from walop_jax.model.parameters import field_declarations
 
     told: dict[str, dict[str, tuple[str, float | None]]] = {}
     name = ""
@@ -377,8 +374,7 @@ def test_effects_with_parameters_units_and_widths():
         if row[1] != "none":
             parameters[row[1]] = row[2], float(row[3]) if row[3] else None
     assert told == {
-        kind.name: {field: (d.unit, d.width) for field, d in field_declarations(kind).items()}
-        for kind in EFFECTS
+        kind.name: {field: (d.unit, d.width) for field, d in kind.numbers().items()} for kind in EFFECTS
     }
 
 

@@ -11,7 +11,6 @@ verdict of a scene is written before its truth is looked at; a study goes on whe
 from __future__ import annotations
 
 import collections
-import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -29,7 +28,7 @@ from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Effect
-from walop_jax.model.parameters import field_declarations, leaves, values_of
+from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import effect_context
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate
@@ -80,12 +79,12 @@ class Hiding:
 
 
 def _jittered(effect: Effect, rng: np.random.Generator) -> Effect:
-    declared = field_declarations(type(effect))
+    declared = effect.declarations()
     moved = {
         name: np.asarray(getattr(effect, name)) + rng.uniform(-1, 1) * (declared[name].scale or 0.0)
         for name in effect.shape
     }
-    return dataclasses.replace(effect, **moved)
+    return effect.replaced(**moved)
 
 
 def scene(hiding: Hiding, number: int) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from walop_jax.simulation.simulate import simulate
 @pytest.fixture(scope="module")
 def leaking():
     """A set with some leakage, its fit without and with that effect, and the context."""
-    effect = dataclasses.replace(effect_by_name("camera_leakage")(), share=4e-4)
+    effect = effect_by_name("camera_leakage").of(PLAN.context(), share=4e-4)
     calset, _ = simulate(PLAN, seed=8, effects=[effect])
     model = base_model(calset)
     context = effect_context(model.template, calset.exposures)
@@ -52,7 +52,7 @@ def test_evidence_of_many_numbers_is_the_mean_over_fits_with_priors_of_four_widt
     context, rng = leaking[1], np.random.default_rng(1)
     neutral = effect_by_name("moon_patch").neutral(context)
     q, u = 5e-4 * rng.standard_normal((2, len(neutral.q)))
-    calset, _ = simulate(PLAN, seed=8, effects=[dataclasses.replace(neutral, q=q, u=u)])
+    calset, _ = simulate(PLAN, seed=8, effects=[neutral.replaced(q=q, u=u)])
     model = base_model(calset)
     base = fit(Likelihood.of(calset, model))
     with_patches, evidence = with_effects(model, ["moon_patch"], context), []
@@ -131,7 +131,7 @@ def test_patterns_do_not_know_the_noise(leaking):
     other, _ = simulate(
         PLAN,
         seed=8,
-        effects=[dataclasses.replace(effect_by_name("camera_leakage")(), share=4e-4)],
+        effects=[effect_by_name("camera_leakage").of(PLAN.context(), share=4e-4)],
         noiseless=True,
     )
     ours, exact = (Measured(Likelihood.of(s, base.model), base.values).level for s in (calset, other))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import ClassVar
 
 import effect_scenes as scenes
@@ -15,11 +14,11 @@ from walop_jax.likelihood import engine
 from walop_jax.model import light, mueller
 from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import needs, optical_indices
-from walop_jax.model.effects import EFFECTS, FreeForm, effect_by_name
+from walop_jax.model.effects import EFFECTS, EffectKind, FreeForm, effect_by_name
 from walop_jax.model.effects.base import Effect, Scalar
 from walop_jax.model.elements import Element, Retarder
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import field_declarations, leaves, number, param, values_of, with_values
+from walop_jax.model.parameters import leaves, number, param, values_of, with_values
 from walop_jax.model.ray import NotPlannedError, Ray
 
 # ------------------------------------------------------------------- effects that the package has never heard of
@@ -59,16 +58,16 @@ class WarmWindow(Effect):
 # -------------------------------------------------------------- derivatives of a fit against those of its formula
 
 
-def away_from_neutral(kind: type[Effect], rng: np.random.Generator) -> Effect:
+def away_from_neutral(kind: EffectKind, rng: np.random.Generator) -> Effect:
     """An effect whose every parameter matters: amplitudes of some prior widths, shapes as in its first probe."""
     neutral = kind.neutral(scenes.CONTEXT)
     probe = next((group[0] for group in kind.probes(scenes.CONTEXT)), neutral)
     values = {}
-    for name, declaration in field_declarations(kind).items():
+    for name, declaration in kind.numbers().items():
         value = np.asarray(getattr(probe, name))
         size = declaration.width or declaration.scale or 0.0
         values[name] = jnp.asarray(value + size * rng.uniform(0.5, 1.5, value.shape))
-    return dataclasses.replace(probe, **values)
+    return probe.replaced(**values)
 
 
 def measured(*effects: Effect) -> tuple[Instrument, object, engine.PointData]:
@@ -218,7 +217,10 @@ def test_what_the_optics_ask_for_has_derivatives():
 
 @pytest.mark.parametrize(
     ("effect", "quantity"),
-    [(WarmWindow(rate=jnp.asarray(0.01)), "temperature"), (effect_by_name("flexure")(), "hour_angle")],
+    [
+        (WarmWindow(rate=jnp.asarray(0.01)), "temperature"),
+        (effect_by_name("flexure").neutral(scenes.CONTEXT), "hour_angle"),
+    ],
     ids=["temperature", "hour angle"],
 )
 def test_a_plan_for_another_instrument_is_refused_with_advice(effect, quantity):

@@ -111,23 +111,6 @@ def test_a_damaged_program_is_made_again(programs):
     compiled(untraceable, kept_as="double")(1.0)
 
 
-def test_answers_are_kept_like_programs(programs):
-    """What depends on structure and shapes alone is found once; another structure is another question."""
-    structure = jax.tree.structure({"a": 1, "b": 2})
-    asked = []
-
-    def find():
-        asked.append(1)
-        return frozenset({"tilt"}), (True, False)
-
-    first = kept.answer("what", structure, ((2,), (3,)), find)
-    assert kept.answer("what", structure, ((2,), (3,)), find) == first == find()
-    assert len(asked) == 2
-    kept.answer("what", structure, ((2,), (4,)), find)
-    kept.answer("what", jax.tree.structure([1, 2]), ((2,), (3,)), find)
-    assert len(asked) == 4
-
-
 def test_source_that_was_changed_since_is_not_trusted(programs, monkeypatch):
     monkeypatch.setattr(kept, "_STARTED", 0.0)
     kept._source.cache_clear()

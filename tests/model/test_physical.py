@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from walop_jax.model import fold, light
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, Effect, EffectKind
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import field_declarations, leaves, values_of, with_values
+from walop_jax.model.parameters import leaves, values_of, with_values
 from walop_jax.model.ray import Ray
 
 PAULI = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, -1j], [1j, 0]]])
@@ -52,15 +52,15 @@ def anywhere(rng: np.random.Generator) -> Instrument:
     return with_values(scenes.BASE)(jnp.asarray(start + WIDTHS * width * rng.uniform(-1, 1, len(start))))
 
 
-def with_effect(kind: type[Effect], rng: np.random.Generator) -> Effect:
+def with_effect(kind: EffectKind, rng: np.random.Generator) -> Effect:
     """An effect with every amplitude anywhere within three prior widths, of either sign where it has two."""
     probe = kind.probes(scenes.CONTEXT)[0][0]
     changes = {}
     for name in kind.amplitudes():
-        size = WIDTHS * (field_declarations(kind)[name].width or 0.0)
+        size = WIDTHS * (kind.numbers()[name].width or 0.0)
         drawn = size * rng.uniform(-1, 1, np.shape(getattr(probe, name)))
         changes[name] = jnp.asarray(np.abs(drawn) if name in kind.one_sided else drawn)
-    return dataclasses.replace(probe, **changes)
+    return probe.replaced(**changes)
 
 
 def unphysical(instrument: Instrument) -> list[str]:
@@ -95,7 +95,7 @@ def test_elements_within_three_prior_widths(seed):
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", [k for k in EFFECTS if not k.is_structural()], ids=lambda kind: kind.name)
-def test_effects_within_three_prior_widths(kind: type[Effect]):
+def test_effects_within_three_prior_widths(kind: EffectKind):
     rng = np.random.default_rng(1)
     for _ in range(3):
         device = dataclasses.replace(anywhere(rng), effects=(with_effect(kind, rng),))

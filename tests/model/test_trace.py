@@ -12,9 +12,9 @@ from quick import quick
 
 from walop_jax.data.settings import Settings, builtin_filter
 from walop_jax.model import light
-from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects import FreeForm, effect_by_name
 from walop_jax.model.effects.base import Context
-from walop_jax.model.instrument import nominal_instrument
+from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.planning import plan_for
 from walop_jax.model.sources import Sight
 from walop_jax.model.trace import STOKES, LightStage, Sightline, trace
@@ -68,9 +68,20 @@ def named(stages: tuple[LightStage, ...], name: str) -> np.ndarray:
 @pytest.mark.parametrize("sightline", SIGHTLINES.values(), ids=SIGHTLINES)
 def test_the_last_stage_is_what_a_fit_computes(sightline: Sightline):
     instrument = built()
-    last = trace(instrument, builders.broad_band(), sightline)[-1]
-    assert last.name == "counts"
-    np.testing.assert_allclose(last.value[0], counts_of(instrument, sightline), rtol=0, atol=1e-14)
+    stages = trace(instrument, builders.broad_band(), sightline)
+    assert stages[-1].name == "counts"
+    np.testing.assert_allclose(stages[-1].value[0], counts_of(instrument, sightline), rtol=0, atol=1e-14)
+    both_ends_meet(instrument, stages)
+
+
+def both_ends_meet(instrument: Instrument, stages: tuple[LightStage, ...]) -> None:
+    """The light that has come forward to the analysers is what the fold from behind says that they share out."""
+    for arm, beam in zip(instrument.patched().arms, named(stages, "arms"), strict=True):
+        cameras = [instrument.cameras.names.index(name) for name in arm.analyser.cameras]
+        seen = arm.analyser.seen(jnp.zeros((4, 4)).at[:, 0].set(beam))[:, 0]
+        np.testing.assert_allclose(
+            named(stages, "analysers")[0, cameras], arm.analyser.shares() @ seen, rtol=0, atol=1e-14
+        )
 
 
 # One effect for every stage at which the path can be changed.
@@ -86,10 +97,20 @@ def test_effects_are_followed(name: str):
     effect = kind.neutral(CONTEXT)
     names = kind.amplitudes()
     changed = {name: jnp.full(np.shape(getattr(effect, name)), 0.01) for name in names}
-    instrument = built(dataclasses.replace(effect, **changed))
+    instrument = built(effect.replaced(**changed))
     sightline = SIGHTLINES["polariser, plate in" if name == "clp_ellipticity" else "star"]
-    last = trace(instrument, builders.broad_band(), sightline)[-1]
-    np.testing.assert_allclose(last.value[0], counts_of(instrument, sightline), rtol=0, atol=1e-14)
+    stages = trace(instrument, builders.broad_band(), sightline)
+    np.testing.assert_allclose(stages[-1].value[0], counts_of(instrument, sightline), rtol=0, atol=1e-14)
+    both_ends_meet(instrument, stages)
+
+
+def test_patterns_of_the_analysis_vectors_are_followed():
+    """They add to what a camera makes of q, so the sum over the beams is not all that there is."""
+    free = FreeForm.of(CONTEXT, blocks=("vectors",))
+    instrument = built(dataclasses.replace(free, vectors=0.01 + free.vectors))
+    sightline = SIGHTLINES["polariser"]
+    last = trace(instrument, builders.broad_band(), sightline)[-1].value[0]
+    np.testing.assert_allclose(last, counts_of(instrument, sightline), rtol=1e-13)
 
 
 def test_beams_that_differ_in_wavelength_are_followed():

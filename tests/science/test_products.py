@@ -173,7 +173,7 @@ def test_a_camera_that_has_become_fainter_is_found_with_its_size(first):
 def test_a_plate_that_has_turned_is_a_change_and_not_errors_that_became_large(first):
     """The old model lacks an axis: its fit of the new data is nothing to compare with, that of a larger one is."""
     truth, old = first
-    turned = dataclasses.replace(effect_by_name("hwp1_axis").neutral(SMALL.context()), angle=np.asarray(0.05))
+    turned = effect_by_name("hwp1_axis").of(SMALL.context(), angle=0.05)
     calset = simulate(SMALL, seed=220, instrument=truth, effects=[turned]).calset
     unlike = fit_like(old, calset).judged()
     assert not unlike.trusted

@@ -56,7 +56,7 @@ def test_standards_lie_within_the_field():
 def at_truth(simulated: Simulated) -> tuple[Likelihood, np.ndarray]:
     """The base model of a set, with the effects that are in it, at the true values."""
     model = base_model(simulated.calset)
-    added = [type(e).of(SMALL.context(), **e.choices()) for e in simulated.truth.effects]
+    added = [e.kind.of(SMALL.context(), **e.choices()) for e in simulated.truth.effects]
     model = with_effects(model, added, SMALL.context()) if added else model
     return Likelihood.of(simulated.calset, model), np.asarray(values_of(simulated.truth))
 

@@ -44,7 +44,6 @@ from walop_jax.io.errors import DataError  # noqa: E402
 from walop_jax.model import light  # noqa: E402
 from walop_jax.model.effects import EFFECTS  # noqa: E402
 from walop_jax.model.instrument import Instrument  # noqa: E402
-from walop_jax.model.parameters import field_declarations  # noqa: E402
 from walop_jax.model.planning import plan_for_settings  # noqa: E402
 from walop_jax.model.specification import with_effects  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
@@ -268,7 +267,7 @@ def judged(number: int, seed: int) -> Judged:
         size = {
             name: np.asarray(getattr(neutral, name))
             + 10.0 ** rng.uniform(-1.5, 0.5)
-            * field_declarations(effect)[name].width
+            * effect.numbers()[name].width
             * rng.standard_normal(np.shape(getattr(neutral, name)))
             for name in effect.amplitudes()
         }

@@ -48,7 +48,7 @@ from walop_jax.io.display import Display
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.text import in_ascii
 from walop_jax.model.dependence import left_behind, needs
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.elements import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
@@ -159,7 +159,7 @@ class Product(Contents):
         name = f"the description of {self.instrument} in the product"
         return build(parsed("\n".join(self.description), name), elements=defined_elements())
 
-    def rebuilt(self, catalogue: tuple[type[Effect], ...] = EFFECTS) -> Calibration:
+    def rebuilt(self, catalogue: tuple[EffectKind, ...] = EFFECTS) -> Calibration:
         """The calibration, its model rebuilt from `model_lines`; parameters go by name.
 
         `catalogue` are the effects that the model may have. Raises ValueError if it cannot be rebuilt, or has other

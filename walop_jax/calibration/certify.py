@@ -19,7 +19,7 @@ from walop_jax.calibration.could_hide import could_hide, off_by, unmeasured
 from walop_jax.data.settings import BUILTIN_FILTERS, Settings
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import rounded
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, EffectKind
 
 MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine
 DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
@@ -58,7 +58,7 @@ def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
     return (float(known.min()), float(known.max())) if known.size else (float("nan"), float("nan"))
 
 
-def certify(product: Product, catalogue: tuple[type[Effect], ...] = EFFECTS) -> list[Check]:
+def certify(product: Product, catalogue: tuple[EffectKind, ...] = EFFECTS) -> list[Check]:
     """All checks of a product that could be read, in a fixed order; those behind a failed one may be missing.
 
     `catalogue` are the effects that its model may have.

@@ -32,7 +32,6 @@ from walop_jax.likelihood.field_table import Vector
 from walop_jax.model import light, responses
 from walop_jax.model.effects import Effect, effect_by_name, in_order
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import field_declarations
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import effect_context
 
@@ -138,7 +137,7 @@ def hidden_errors(
 
 def as_text(effect: Effect) -> str:
     """An effect at its values, for `Hidden.acts`."""
-    values = {name: np.asarray(getattr(effect, name)).tolist() for name in field_declarations(type(effect))}
+    values = {name: np.asarray(getattr(effect, name)).tolist() for name in effect.declarations()}
     return json.dumps({"effect": effect.name, **values, **effect.choices()})
 
 

@@ -34,7 +34,7 @@ from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.fits_reading import OpenFile, open_fits
 from walop_jax.io.names import PRODUCT
 from walop_jax.io.text import in_ascii
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.parameters import NAME, Parameter
 
 HASHRULE = 2
@@ -301,7 +301,7 @@ def _hidden_hdu(hidden: Hidden) -> fits.ImageHDU:
 # ------------------------------------------------------------------------------------------------- reading
 
 
-def read_calibration(run: str | os.PathLike[str], catalogue: Sequence[type[Effect]] = EFFECTS) -> Calibration:
+def read_calibration(run: str | os.PathLike[str], catalogue: Sequence[EffectKind] = EFFECTS) -> Calibration:
     """Read and check a calibration, given by its file or by the folder of a run.
 
     `catalogue` are the effects that its model may have. Raises `DataError` as `read_product` does, and if the model

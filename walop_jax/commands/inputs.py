@@ -18,9 +18,10 @@ from walop_jax.io.errors import DataError, errors_naming, fail
 from walop_jax.io.text import in_ascii, read_text
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, CalibrationSet, Effect, FitResult, Instrument, Model, Run
+    from walop_jax import Calibration, CalibrationSet, FitResult, Instrument, Model, Run
     from walop_jax.data.user_tables import InputTable
     from walop_jax.fit.verdict import Quality
+    from walop_jax.model.effects import EffectKind
 
 GIGABYTE = 1e9
 IN_MEMORY = "in memory"
@@ -52,7 +53,7 @@ InstrumentLike = Annotated[
         str,
     ),
 ]
-Effects = Annotated["PathLike | Sequence[type[Effect]] | None", EFFECTS]
+Effects = Annotated["PathLike | Sequence[EffectKind] | None", EFFECTS]
 Product = Annotated[
     "Calibration | FitResult | Run | PathLike",
     Argument("Calibration product, or the folder of a run.", "RUN/calibration.fits", Path),
@@ -122,7 +123,7 @@ def read(
     return read_calibration_set(*paths, kinds=kinds)
 
 
-def catalogue_of(effects: Effects) -> tuple[type[Effect], ...]:
+def catalogue_of(effects: Effects) -> tuple[EffectKind, ...]:
     """The effects that a model may have: those of the package, of the package and a file, or those given."""
     from walop_jax.model.effects.catalogue import catalogue_with
 

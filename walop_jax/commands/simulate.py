@@ -200,11 +200,9 @@ def _sized(effect: Effect) -> str:
     """An effect as `--effect` writes it, with its units: wollaston_axis=angle:0.3 deg."""
     import numpy as np
 
-    from walop_jax.model.parameters import field_declarations
-
     numbers = [
         f"{name}:{'/'.join(rounded(float(v)) for v in np.ravel(getattr(effect, name)))} {declared.unit}".rstrip()
-        for name, declared in field_declarations(type(effect)).items()
+        for name, declared in effect.declarations().items()
     ]
     return f"{effect.name}={', '.join(numbers)}" if numbers else effect.name
 

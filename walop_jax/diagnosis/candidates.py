@@ -40,7 +40,7 @@ from walop_jax.likelihood.columns import Change, Columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.conventions import Units
 from walop_jax.model.dependence import conditions_of_effect
-from walop_jax.model.effects import Context, Described, Effect
+from walop_jax.model.effects import Context, Described, Effect, EffectKind
 from walop_jax.model.effects.catalogue import applies
 from walop_jax.model.effects.change import BAND, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
@@ -49,7 +49,6 @@ from walop_jax.model.effects.numbers import OF_SOURCES
 from walop_jax.model.effects.optics import DISPLACEMENTS
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import field_declarations
 from walop_jax.model.plan import hours_of
 from walop_jax.model.ray import CONDITIONS
 from walop_jax.model.responses import acts
@@ -66,7 +65,7 @@ class Probe:
     """One group of probes of an effect: the place in its shape space from which a linear step is taken."""
 
     name: str
-    effect: type[Effect]
+    effect: EffectKind
     group: tuple[Effect, ...]
 
     def _fields(self) -> Iterator[str]:
@@ -83,7 +82,7 @@ class Probe:
     @property
     def widths(self) -> Vector:
         """Prior widths of the amplitudes, member by member."""
-        declared = field_declarations(self.effect)
+        declared = self.effect.numbers()
         return np.array([declared[name].width or DEFAULT_WIDTH for name in self._fields()])
 
     @property
@@ -93,13 +92,13 @@ class Probe:
 
 
 def applicable(
-    catalogue: Sequence[type[Effect]], context: Context, instrument: Instrument
-) -> tuple[type[Effect], ...]:
+    catalogue: Sequence[EffectKind], context: Context, instrument: Instrument
+) -> tuple[EffectKind, ...]:
     """The effects of a catalogue that have what they act on in an instrument; ValueError as `applies`."""
     return tuple(kind for kind in catalogue if applies(kind.neutral(context), instrument))
 
 
-def probes(catalogue: Sequence[type[Effect]], context: Context) -> Iterator[Probe]:
+def probes(catalogue: Sequence[EffectKind], context: Context) -> Iterator[Probe]:
     """Every group of probes of every effect that has an amplitude in this context."""
     for effect in catalogue:
         if effect.is_structural():
@@ -113,7 +112,7 @@ def probes(catalogue: Sequence[type[Effect]], context: Context) -> Iterator[Prob
 
 def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) -> bool:
     """True if a set has what an effect acts on: several field points, or the conditions that its elements ask for."""
-    if effect.over_field and len(calset.points) < FEWEST_POINTS:
+    if effect.kind.over_field and len(calset.points) < FEWEST_POINTS:
         return False
     bare = dataclasses.replace(instrument, effects=())
     asked = conditions_of_effect(bare, effect)
@@ -123,7 +122,7 @@ def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) ->
 
 def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Probe]) -> list[Probe]:
     """The probes of effects that a set can show; shapes of one effect need the same."""
-    shown: dict[type[Effect], bool] = {}
+    shown: dict[EffectKind, bool] = {}
     for probe in wanted:
         if probe.effect not in shown:
             shown[probe.effect] = _can_show(calset, instrument, probe.group[0])
@@ -208,8 +207,8 @@ def _probe(group: tuple[Sentence, ...]) -> Probe:
 
 
 def beside_names(
-    probes: Sequence[Probe], catalogue: Sequence[type[Effect]], context: Context, instrument: Instrument
-) -> tuple[list[Probe], list[tuple[Probe, frozenset[type[Effect]]]]]:
+    probes: Sequence[Probe], catalogue: Sequence[EffectKind], context: Context, instrument: Instrument
+) -> tuple[list[Probe], list[tuple[Probe, frozenset[EffectKind]]]]:
     """The groups that are no effect of a catalogue by another name: those that none holds, and parts, with the holders.
 
     A part is a group that effects hold, none of them as a whole: one patch of all, the light in one camera.

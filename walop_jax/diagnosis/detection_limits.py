@@ -58,9 +58,8 @@ from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.stand_in import on_field_points
 from walop_jax.io.progress import Stage
-from walop_jax.model.effects import Effect
+from walop_jax.model.effects import EffectKind
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import field_declarations
 from walop_jax.model.specification import effect_context
 
 MANY_SHAPES = 8
@@ -73,7 +72,7 @@ _ABSORBED = 1e-9  # share of the square of a column that a rival leaves below wh
 def detection_limits(
     result: FitResult,
     *,
-    catalogue: Sequence[type[Effect]] | None = None,
+    catalogue: Sequence[EffectKind] | None = None,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> DetectionLimits:
@@ -191,7 +190,7 @@ def _has_fringes(probe: Probe, template: Instrument) -> bool:
 
 def _representative(columns: Sequence[_Column]) -> set[str]:
     """Names of the probes whose effect on the matrix is worked out."""
-    by_effect: dict[type[Effect], dict[str, float]] = {}
+    by_effect: dict[EffectKind, dict[str, float]] = {}
     for column in columns:
         by_effect.setdefault(column.probe.effect, {}).setdefault(column.probe.name, column.detected)
     chosen: set[str] = set()
@@ -205,10 +204,10 @@ def _collected(
     examination: Examination,
     columns: Sequence[_Column],
     errors: Float[np.ndarray, "c p"],
-    catalogue: Sequence[type[Effect]],
+    catalogue: Sequence[EffectKind],
     calibration: Calibration,
 ) -> DetectionLimits:
-    groups: dict[tuple[type[Effect], str], list[int]] = {}
+    groups: dict[tuple[EffectKind, str], list[int]] = {}
     for i, column in enumerate(columns):
         groups.setdefault((column.probe.effect, column.parameter), []).append(i)
     entries = []
@@ -219,7 +218,7 @@ def _collected(
             DetectionLimit(
                 effect=effect.name,
                 parameter=parameter,
-                unit=field_declarations(effect)[parameter].unit,
+                unit=effect.numbers()[parameter].unit,
                 detected=(min(c.detected for c in mine), max(c.detected for c in mine)),
                 named=max(c.named for c in mine),
                 taken_for=tuple(

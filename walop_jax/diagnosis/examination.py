@@ -42,20 +42,19 @@ from walop_jax.diagnosis.score import (
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import SUSPECT_SIGMA
 from walop_jax.likelihood import limits
-from walop_jax.model.effects import Described, Effect
+from walop_jax.model.effects import Described, EffectKind
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import field_declarations
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
-Parts = Sequence[tuple[Probe, Collection[type[Effect]]]]
+Parts = Sequence[tuple[Probe, Collection[EffectKind]]]
 
 
 @dataclasses.dataclass(frozen=True)
 class Ranked:
     """An effect or a sentence with its best probe, and its evidence; `others` are shapes that may be as good."""
 
-    effect: type[Effect]
+    effect: EffectKind
     probe: Probe
     score: Score
     log_bayes: float
@@ -67,7 +66,7 @@ class Ranked:
 
 def rank(table: ScoreTable, probes: Sequence[Probe], policy: Policy = POLICY) -> list[Ranked]:
     """Effects by evidence, best first; alternative shapes share the prior of their effect."""
-    by_effect: dict[type[Effect], list[tuple[Probe, Score]]] = {}
+    by_effect: dict[EffectKind, list[tuple[Probe, Score]]] = {}
     for probe in probes:
         by_effect.setdefault(probe.effect, []).append((probe, table[probe.name]))
     ranked = []
@@ -278,7 +277,7 @@ class Evidence:
         return gain
 
     def is_worth_telling(
-        self, effect: type[Effect], evidence: float, left: float, *, noise: bool, item: Ranked | None = None
+        self, effect: EffectKind, evidence: float, left: float, *, noise: bool, item: Ranked | None = None
     ) -> bool:
         """True if an addition explains a good part of what is missing, and patterns without a name do not do better.
 
@@ -399,7 +398,7 @@ class Evidence:
             if len(item.score.amplitudes) != 1 or sum(p.effect is item.effect for p in self.probes) > 1:
                 continue
             value, sigma = float(item.score.amplitudes[0]), float(np.sqrt(item.score.covariance[0, 0]))
-            unit = field_declarations(item.effect)[names[0]].unit
+            unit = item.effect.numbers()[names[0]].unit
             one_sided = names[0] in item.effect.one_sided
             below = upper_limit(value, sigma, one_sided=one_sided, probability=self.policy.limit)
             yield {
@@ -457,7 +456,7 @@ class Examination(Evidence):
         """Chance that noise of the stated size alone leaves as much as this fit does."""
         return float(special.chdtrc(max(self.dof, 1), self.chi2))
 
-    def untestable(self, catalogue: Sequence[type[Effect]]) -> tuple[str, ...]:
+    def untestable(self, catalogue: Sequence[EffectKind]) -> tuple[str, ...]:
         """Effects that these data cannot show at any plausible size."""
         seen = {probe.effect.name for probe in self.probes if self.table[probe.name].testable}
         seen.update(self.result.model.effect_names)

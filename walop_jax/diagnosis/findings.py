@@ -20,7 +20,6 @@ from walop_jax.io.text import probability, some, value_and_error
 from walop_jax.model import legendre
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import Change
-from walop_jax.model.parameters import field_declarations
 
 HARMONICS = (0, 1, 2, 3, 4)
 FIELD_WORDS = ("uniform", "gradient", "quadratic", "cubic", "fourth order")
@@ -366,7 +365,7 @@ def told(result: FitResult) -> tuple[tuple[Change, float, float], ...]:
 
 
 def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
-    unit = field_declarations(Described)[change.parameter].unit
+    unit = Described.numbers()[change.parameter].unit
     value, error = value_and_error(amplitude, sigma)
     kind, *dependence = change.in_words().split(", ")
     return {

@@ -13,7 +13,6 @@ Limits      One mistake at a time, one amplitude of an effect at a time, to firs
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -37,7 +36,6 @@ from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Effect
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import field_declarations
 
 STAR_POINTS = 16  # field points at which stars are asked what a mistake does to them
 MOST_HIDDEN = 12  # mistakes that a product keeps: what a star needs for each is a product of two vectors
@@ -166,7 +164,7 @@ class _Starlight:
         alive: Bool[np.ndarray, " a"],
     ) -> Iterator[_Mistake]:
         """The amplitudes of a probe, each by itself."""
-        declared, fit = field_declarations(probe.effect), self.fit
+        declared, fit = probe.effect.numbers(), self.fit
         pairs, points = self.instrument.cameras.pairs, fit.calset.points
         for number, (parameter, effect) in enumerate(_at_sizes(probe, sizes)):
             if probe.name in self.added:
@@ -202,7 +200,7 @@ def _at_sizes(probe: Probe, sizes: Float[np.ndarray, " a"]) -> Iterator[tuple[st
             for at in np.ndindex(neutral.shape):
                 value = neutral.copy()
                 value[at] += next(rest)
-                yield name, dataclasses.replace(member, **{name: jnp.asarray(value)})
+                yield name, member.replaced(**{name: jnp.asarray(value)})
 
 
 def _usual(calset: CalibrationSet, instrument: Instrument) -> int:

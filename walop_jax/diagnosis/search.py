@@ -37,7 +37,7 @@ from walop_jax.diagnosis.score import SCALES, Candidate, log_bayes
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
 from walop_jax.fit.robust import field_cells, states
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Context, Described, Effect
+from walop_jax.model.effects import Context, Described, Effect, EffectKind
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import Model, with_effects
 
@@ -51,7 +51,7 @@ class Trial:
     evidence, or of which a part would do, `nameless` sentences that are not improbable beside it.
     """
 
-    effect: type[Effect]
+    effect: EffectKind
     evidence: float
     left: float
     noise: bool
@@ -118,7 +118,7 @@ def _of_amplitudes(result: FitResult, at: Sequence[int], scales: Float[np.ndarra
 def try_effect(base: FitResult, instance: Effect, context: Context, prior_shapes: int = 1) -> Trial:
     """Add an effect at the given values to the fitted model and fit everything again."""
     return try_model(
-        base, type(instance), with_effects(base.model, [instance], context), base.values, prior_shapes
+        base, instance.kind, with_effects(base.model, [instance], context), base.values, prior_shapes
     )
 
 
@@ -133,7 +133,7 @@ def try_sentences(base: FitResult, said: Described, context: Context, count: int
 
 
 def try_model(
-    base: FitResult, effect: type[Effect], model: Model, values: Float[np.ndarray, " n"], prior_shapes: int
+    base: FitResult, effect: EffectKind, model: Model, values: Float[np.ndarray, " n"], prior_shapes: int
 ) -> Trial:
     """Fit a model with an effect, from values of the parameters of the base and its own start values of others."""
     start = dict(zip(base.model.names, values, strict=True))
@@ -192,7 +192,7 @@ def spoken_choices(effect: Effect) -> dict[str, Any]:
 def amplitude_positions(model: Model, name: str) -> list[int]:
     """Positions of the free amplitudes of an active effect that have a prior."""
     effect = model.template.effect(name)
-    at = [model.index(f"{name}.{label}") for f in effect.amplitudes() for label in effect.labels(f)]
+    at = [model.index(f"{name}.{label}") for f in effect.kind.amplitudes() for label in effect.labels(f)]
     return [i for i in at if model.parameters[i].free and model.parameters[i].prior is not None]
 
 
@@ -251,7 +251,7 @@ def refit_without(result: FitResult, name: str) -> FitResult:
 def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarray, " _"]:
     """Change of the residuals (data rows) by an active effect: theirs without it, minus theirs with it."""
     effect = result.model.template.effect(name)
-    if type(effect).is_structural():
+    if effect.kind.is_structural():
         model = model_without(result.model, name)
         kept = [result.model.index(n) for n in model.names]
         bare = Likelihood.of(result.calset, model).residuals(result.values[kept])[1]
@@ -270,7 +270,7 @@ def before_and_after(name: str, before: Design, after: Design) -> dict[str, Any]
     """The fields of a `Step` that compare the fits without and with an effect."""
     effect = after.fit.model.instrument(after.fit.values).effect(name)
     # An effect with a number for every exposure, or for one of them, cannot predict exposures that it has not seen.
-    many = any(np.size(getattr(effect, f)) > 4 for f in effect.amplitudes())
+    many = any(np.size(getattr(effect, f)) > 4 for f in effect.kind.amplitudes())
     many |= isinstance(effect, Described) and any("exposure" in text for text in effect.sentences)
     scheme = "field blocks" if many else "exposures"
     old, new = (instrument_matrices(design.fit) for design in (before, after))

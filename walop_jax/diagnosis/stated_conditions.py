@@ -50,7 +50,6 @@ from walop_jax.fit.refit import NEARLY, FitResult, fit
 from walop_jax.io.text import with_error
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.parameters import field_declarations
 from walop_jax.model.specification import effect_context
 
 _SHOWN = 4  # alternatives that are told in words
@@ -348,7 +347,7 @@ def _of_catalogue(design: Design, asked: Sequence[Probe]) -> Iterator[_Single]:
 
 
 def _effect_in_words(probe: Probe, score: Score, cameras: Sequence[str]) -> str:
-    effect, declared = probe.effect.combine(probe.group, score.amplitudes), field_declarations(probe.effect)
+    effect, declared = probe.effect.combine(probe.group, score.amplitudes), probe.effect.numbers()
     if len(score.amplitudes) > MOST_OF_ELEMENT:
         return f"{effect.name}, {len(score.amplitudes)} numbers"
     choices = effect.choices()

@@ -65,7 +65,7 @@ from walop_jax.likelihood import limits
 from walop_jax.likelihood.columns import columns
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Context, Described, Effect, FreeForm, OtherDescription
+from walop_jax.model.effects import Context, Described, EffectKind, FreeForm, OtherDescription
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model, effect_context
 
@@ -74,7 +74,7 @@ def diagnose(
     calset: CalibrationSet,
     model: Model | None = None,
     *,
-    catalogue: Sequence[type[Effect]] | None = None,
+    catalogue: Sequence[EffectKind] | None = None,
     seed: int = 0,
     minutes: float | None = None,
     as_written: bool = False,
@@ -188,10 +188,10 @@ class Refit:
 
     calset: CalibrationSet
     context: Context
-    catalogue: tuple[type[Effect], ...]
+    catalogue: tuple[EffectKind, ...]
     wanted: Sequence[Probe]
     sentences: Sequence[Probe]
-    parts: Sequence[tuple[Probe, frozenset[type[Effect]]]]
+    parts: Sequence[tuple[Probe, frozenset[EffectKind]]]
     rng: np.random.Generator
     tell: Callable[[str], None]
     policy: Policy
@@ -208,7 +208,7 @@ class Refit:
         cls,
         calset: CalibrationSet,
         model: Model,
-        catalogue: Sequence[type[Effect]],
+        catalogue: Sequence[EffectKind],
         sentences: Sequence[Probe],
         rng: np.random.Generator,
         tell: Callable[[str], None],
@@ -481,7 +481,7 @@ class Refit:
         close = {name for name, s in separation.items() if s < self.policy.separation} | set(step.equivalent)
         close -= {other.effect for other in self.steps}
         effect = self.fit.model.instrument(self.fit.values).effect(step.effect)
-        standard = np.asarray(values_of(effect.standard_form())) if not type(effect).is_structural() else ()
+        standard = np.asarray(values_of(effect.standard_form())) if not effect.kind.is_structural() else ()
         parameters = {}
         for i, value in zip(self.fit.model.positions(step.effect), standard, strict=True):
             p = self.fit.model.parameters[i]
@@ -496,7 +496,7 @@ class Refit:
             robust_ratio=state.design.robust_ratio(step.effect),
             equivalent=tuple(sorted(close, key=lambda name: (separation.get(name, np.inf), name))),
             separation=separation,
-            separated_by=effect.separated_by if close or step.nameless else "",
+            separated_by=effect.kind.separated_by if close or step.nameless else "",
             where=describe(state.design, change),
         )
 

@@ -22,7 +22,7 @@ from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import parse_toml
 from walop_jax.io.toml import Reader, Table
-from walop_jax.model.effects import EFFECTS, Context, Effect, effect_by_name
+from walop_jax.model.effects import EFFECTS, Context, EffectKind, effect_by_name
 from walop_jax.model.effects.catalogue import entries, is_own
 from walop_jax.model.instrument import Instrument, adapted, as_designed, nominal_instrument
 from walop_jax.model.laws import laws_of
@@ -64,7 +64,7 @@ def header_of(model: Model) -> ModelTable:
         throughput_degree=instrument.throughput.degree,
         effects=model.effect_names,
         choices={name: values for name, values in choices.items() if values},
-        entries={effect.name: effect.entry for effect in model.effects if is_own(effect)},
+        entries={effect.name: effect.entry.table for effect in model.effects if is_own(effect)},
     )
 
 
@@ -165,9 +165,7 @@ def _changes(parameter: Parameter, entry: Mapping[str, Any]) -> dict[str, Any]:
     return changes
 
 
-Catalogue = Sequence[type[Effect]]
-OWN_ENTRIES = "walop_jax_own_entries"
-"""Module of the effects that a model file brings along."""
+Catalogue = Sequence[EffectKind]
 
 
 GAUGE = "throughput.n0.p00"
@@ -312,7 +310,7 @@ def model_like(calset: CalibrationSet, old: Model) -> Model:
     """
     header = header_of(old)
     model = base_model(calset, old.template, plates=header.plates, throughput_degree=header.throughput_degree)
-    own = dict.fromkeys((*map(type, old.template.effects), *old.catalogue))
+    own = dict.fromkeys((*(effect.kind for effect in old.template.effects), *old.catalogue))
     model = dataclasses.replace(model, catalogue=tuple(own))
     model = _with_effects(model, header, effect_context(model.template, calset.exposures))
     kept = {p.name: p for p in old.parameters if p.name != GAUGE and p.part not in SKY_AND_STARS}
@@ -355,11 +353,11 @@ def model_without_data(
     return parse(text, build)
 
 
-def known_to(header: ModelTable, catalogue: Catalogue) -> tuple[type[Effect], ...]:
+def known_to(header: ModelTable, catalogue: Catalogue) -> tuple[EffectKind, ...]:
     """A catalogue with the entries that a model file brings along; those of the catalogue stay."""
     names = {effect.name for effect in catalogue}
     own = {name: table for name, table in header.entries.items() if name not in names}
-    return (*catalogue, *entries(own, OWN_ENTRIES))
+    return (*catalogue, *entries(own))
 
 
 def _with_effects(model: Model, header: ModelTable, context: Context) -> Model:

@@ -6,7 +6,7 @@ import dataclasses
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -31,15 +31,6 @@ Arm = tuple[str, tuple[Element, ...], tuple[str, ...]]
 Declared = tuple[tuple[str, Parameter], ...]
 
 
-class Parts(NamedTuple):
-    """Parts of an instrument that a description makes; an arm is its name, its elements and their order."""
-
-    elements: tuple[Element, ...]
-    arms: tuple[Arm, ...]
-    throughput: Throughput
-    cameras: Cameras
-
-
 def made_by(kind: str) -> str:
     """The beginning of the line of a description that says where the class of a kind of one's own comes from."""
     return f"# element {kind}: "
@@ -56,11 +47,13 @@ def with_origins(text: str, elements: Sequence[Element]) -> str:
     return "\n".join((text.rstrip("\n"), *lines.values(), "")) if lines else text
 
 
-def parts(description: Description, elements: Sequence[type[Element]] = ()) -> Parts:
+def parts(
+    description: Description, elements: Sequence[type[Element]] = ()
+) -> tuple[tuple[Element, ...], tuple[Arm, ...], Throughput, Cameras]:
     """The parts of an instrument that a description describes, at the values that it gives.
 
-    `elements` are further kinds of elements that it may name. Raises `DataError`, naming table and key, for what is
-    wrong.
+    An arm is its name, its elements and their order. `elements` are further kinds of elements that it may name. Raises
+    `DataError`, naming table and key, for what is wrong.
     """
     kinds = {kind.kind: kind for kind in (*ELEMENTS, *elements)}
     make = _Maker(description.read, description.source, kinds, description.text)
@@ -74,7 +67,7 @@ def parts(description: Description, elements: Sequence[type[Element]] = ()) -> P
         scale=description.field_scale,
         declared=Parameter("", "", SERIES, FREE, scale=description.scale, loose=description.loose),
     )
-    return Parts(common, arms, series, _cameras(description, arms))
+    return common, arms, series, _cameras(description, arms)
 
 
 def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:

@@ -1,6 +1,6 @@
 """Dependences of a light path, found by running it on shapes alone: nothing of this is declared by hand.
 
-`needs` runs the path until it asks for nothing more that a plan would have to hold. `optical_indices` follows every
+`needs` runs the path until it asks for nothing more that a plan would have to hold. `optical_reach` follows every
 parameter through the operations of `light.band_rows`: those that reach the result enter before the band integral.
 
 Not all of an instrument holds for other exposures than those it was fitted to. The instrument matrix and the analysis
@@ -22,16 +22,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from walop_jax.io.code import blank
 from walop_jax.model import light
 from walop_jax.model.cameras import DetectorPart
-from walop_jax.model.compiled import answer
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import Shapes, leaves, of_shapes, parameter_places, shapes_of
+from walop_jax.model.parameters import Shapes, of_shapes, parameter_places, shapes_of
 from walop_jax.model.plan import Plan, blank_plan
 from walop_jax.model.ray import Conditions, NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays, Sight
+
+AT = 0.11, 0.07
+"""A field point off the axis and at an odd place: a dependence must not vanish by symmetry in what is written."""
 
 
 class Needs(NamedTuple):
@@ -44,103 +47,70 @@ class Needs(NamedTuple):
 
 def needs(instrument: Instrument) -> Needs:
     """Requirements of the light path of an instrument, effects included; found by running it on shapes alone."""
-    return _followed(*shapes_of(instrument))[0]
+    return _needs(*shapes_of(instrument))
+
+
+@functools.lru_cache(maxsize=256)
+def _needs(structure: Any, shapes: Shapes) -> Needs:
+    def run(asked: Set[str], instrument: Instrument) -> tuple[Instrument, Array]:
+        patched, plan = instrument.patched(), blank_plan(instrument, asked - {"median"}, "median" in asked)
+        x, y = map(jnp.asarray, AT)
+        rows = light.band_rows(patched, plan, x, y)
+        each = jnp.zeros_like(plan.exposures.kind)
+        sight = Sight(plan.exposures, jnp.zeros((*each.shape, 2)), each - 1, x, y)
+        counts = light.counts(patched, rows, patched.throughput.at(x, y), sight, each)
+        return patched, light.detected(patched, plan.exposures, counts)
+
+    (patched, _), asked = _asking(run, of_shapes(structure, shapes))
+    parts = [*patched.elements, *(element for arm in patched.arms for element in arm.elements)]
+    longest = max((part.path_difference for part in parts), default=0.0)
+    return Needs(asked - {"median"}, "median" in asked, longest)
+
+
+def _asking(run: Callable[[Set[str], Any], Any], of: Any) -> tuple[Any, frozenset[str]]:
+    """Shapes of a computation for which all is there that it asks for, and what that is."""
+    asked: frozenset[str] = frozenset()
+    while True:
+        try:
+            return jax.eval_shape(functools.partial(run, asked), of), asked
+        except NotPlannedError as missing:
+            if missing.quantity in asked:
+                raise
+            asked |= {missing.quantity}
 
 
 def optical_indices(instrument: Instrument) -> Int[np.ndarray, " o"]:
     """Positions of the parameters that enter before the band integral."""
-    _, reached = _followed(*shapes_of(instrument))
-    flags = [reached[place] for place, count in parameter_places(instrument) for _ in range(count)]
-    assert len(flags) == len(leaves(instrument))
-    return np.flatnonzero(flags)
+    plan = blank_plan(instrument, needs(instrument).conditions)
+    return np.flatnonzero(optical_reach(instrument, plan).any(axis=0))
 
 
 def optical_reach(instrument: Instrument, plan: Plan) -> Bool[np.ndarray, "a n"]:
     """True where a parameter (columns) reaches the band rows of an arm (rows) in the settings of a plan."""
-    structure, shapes = shapes_of((instrument, plan))
-    reached = np.array(_reach(structure, shapes), bool)
+    reached = np.array(_reach(*shapes_of((instrument, plan))), bool)
     places = [place for place, count in parameter_places(instrument) for _ in range(count)]
     return reached[:, places]
 
 
 @functools.lru_cache(maxsize=256)
 def _reach(structure: Any, shapes: Shapes) -> tuple[tuple[bool, ...], ...]:
-    """For every arm the arrays of instrument and plan that reach its rows."""
+    """For every arm the arrays of instrument and plan that reach its rows; inner programs use all they are given."""
 
-    def find() -> tuple[tuple[bool, ...], ...]:
-        def rows_of(number: int) -> Any:
-            def run(*arrays: Array) -> Array:
-                instrument, plan = jax.tree_util.tree_unflatten(structure, arrays)
-                patched = instrument.patched()
-                one_arm = dataclasses.replace(patched, arms=patched.arms[number : number + 1])
-                # At an odd place, as in `_follow`.
-                return light.band_rows(one_arm, plan, jnp.asarray(0.11), jnp.asarray(0.07))
+    def reaching(number: int) -> tuple[bool, ...]:
+        def run(*arrays: Array) -> Array:
+            instrument, plan = jax.tree_util.tree_unflatten(structure, arrays)
+            patched = instrument.patched()
+            one_arm = dataclasses.replace(patched, arms=patched.arms[number : number + 1])
+            return light.band_rows(one_arm, plan, *map(jnp.asarray, AT))
 
-            return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(s, d) for s, d in shapes))
+        program = jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(s, d) for s, d in shapes)).jaxpr
+        needed = {id(program.outvars[0])}
+        for equation in reversed(program.eqns):
+            if any(id(v) in needed for v in equation.outvars):
+                needed |= {id(v) for v in equation.invars}
+        return tuple(id(v) in needed for v in program.invars)
 
-        arms = len(of_shapes(structure, shapes)[0].arms)
-        programs = map(rows_of, range(arms))
-        return tuple(_reaching(program, program.jaxpr.outvars[0]) for program in programs)
-
-    return answer("optical_reach", structure, shapes, find)
-
-
-@functools.lru_cache(maxsize=256)
-def _followed(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
-    """Requirements of the light path, and the arrays of the instrument that reach the rows of its bands: in one go."""
-    return answer("light_path", structure, shapes, lambda: _follow(structure, shapes))
-
-
-def _asking(run: Callable[[Set[str]], Any]) -> tuple[Any, set[str]]:
-    """Result of a computation for which all is there that it asks for, and what that is."""
-    asked: set[str] = set()
-    while True:
-        try:
-            return run(asked), asked
-        except NotPlannedError as missing:
-            if missing.quantity in asked:
-                raise
-            asked.add(missing.quantity)
-
-
-def _follow(structure: Any, shapes: Shapes) -> tuple[Needs, tuple[bool, ...]]:
-    def traced(asked: Set[str]) -> Any:
-        def run(*arrays: Array) -> tuple[Array, Array]:
-            instrument = jax.tree_util.tree_unflatten(structure, arrays)
-            plan = blank_plan(instrument, asked - {"median"}, "median" in asked)
-            # Off the axis and at an odd place: a dependence must not vanish by symmetry in the operations that are
-            # written.
-            x, y = jnp.asarray(0.11), jnp.asarray(0.07)
-            rows = light.band_rows(instrument, plan, x, y)
-            each = jnp.zeros_like(plan.exposures.kind)
-            sight = Sight(plan.exposures, jnp.zeros((*each.shape, 2)), each - 1, x, y)
-            counts = light.counts(instrument, rows, instrument.throughput.at(x, y), sight, each)
-            return rows, light.detected(instrument, plan.exposures, counts)
-
-        return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(s, d) for s, d in shapes))
-
-    program, asked = _asking(traced)
-    patched = jax.eval_shape(lambda i: i.patched(), of_shapes(structure, shapes))
-    parts = [*patched.elements, *(element for arm in patched.arms for element in arm.elements)]
-    longest = max((part.path_difference for part in parts), default=0.0)
-    rows, _ = program.jaxpr.outvars
-    return Needs(frozenset(asked - {"median"}), "median" in asked, longest), _reaching(program, rows)
-
-
-def changed_elements(bare: Instrument, effect: Effect) -> tuple[Element, ...]:
-    """The elements behind the polariser that an effect puts into an instrument or changes, with shapes for numbers."""
-
-    def changed(bare: Instrument, effect: Effect) -> list[Element]:
-        before = {id(element) for element in _behind_polariser(bare)}
-        return [element for element in _behind_polariser(effect.patch(bare)) if id(element) not in before]
-
-    return tuple(jax.eval_shape(changed, bare, effect))
-
-
-def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
-    yield from instrument.behind_polariser()
-    for arm in instrument.arms:
-        yield from (*arm.train(), arm.analyser)
+    return tuple(map(reaching, range(len(of_shapes(structure, shapes)[0].arms))))
 
 
 def conditions_of_effect(bare: Instrument, effect: Effect) -> frozenset[str]:
@@ -150,34 +120,30 @@ def conditions_of_effect(bare: Instrument, effect: Effect) -> frozenset[str]:
 
 @functools.lru_cache(maxsize=1024)
 def _conditions_of_effect(structure: Any, shapes: Shapes) -> frozenset[str]:
-    def find() -> frozenset[str]:
-        changed = changed_elements(*of_shapes(structure, shapes))
-        return frozenset(name for element in changed for name in _conditions_asked(*shapes_of(element)))
+    def changed(both: tuple[Instrument, Effect]) -> list[Element]:
+        bare, effect = both
+        before = {id(element) for element in _behind_polariser(bare)}
+        return [element for element in _behind_polariser(effect.patch(bare)) if id(element) not in before]
 
-    return answer("conditions_of_effect", structure, shapes, find)
+    changed_elements = jax.eval_shape(changed, of_shapes(structure, shapes))
+    return frozenset(name for element in changed_elements for name in _conditions_asked(*shapes_of(element)))
+
+
+def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
+    yield from instrument.behind_polariser()
+    for arm in instrument.arms:
+        yield from (*arm.train(), arm.analyser)
 
 
 @functools.lru_cache(maxsize=1024)
 def _conditions_asked(structure: Any, shapes: Shapes) -> frozenset[str]:
-    def evaluated(asked: Set[str]) -> Any:
-        def run(element: Element) -> tuple[Any, Any]:
-            one, zero = jnp.ones(1), jnp.zeros(())
-            conditions = Conditions(band_width=0.1 * one, planned=dict.fromkeys(asked, one))
-            ray = Ray.entering(zero, zero, (0.62 * one, conditions))
-            return element.ray(ray), element.mueller(ray)
+    def run(asked: Set[str], element: Element) -> tuple[Any, Any]:
+        one, zero = jnp.ones(1), jnp.zeros(())
+        conditions = Conditions(band_width=0.1 * one, planned=dict.fromkeys(asked, one))
+        ray = Ray.entering(zero, zero, (0.62 * one, conditions))
+        return element.ray(ray), element.mueller(ray)
 
-        return jax.eval_shape(run, of_shapes(structure, shapes))
-
-    return frozenset(_asking(evaluated)[1])
-
-
-def _reaching(program: Any, result: Any) -> tuple[bool, ...]:
-    """True for inputs of a traced program that reach one of its results; an inner program uses all that it is given."""
-    needed = {id(result)}
-    for equation in reversed(program.jaxpr.eqns):
-        if any(id(v) in needed for v in equation.outvars):
-            needed |= {id(v) for v in equation.invars}
-    return tuple(id(v) in needed for v in program.jaxpr.invars)
+    return _asking(run, of_shapes(structure, shapes))[1]
 
 
 # --------------------------------------------------------------------------------------- what holds for other exposures
@@ -186,21 +152,17 @@ KNOWN = frozenset({"temperature", "hour_angle"})
 """Conditions of the optics that a table of points or a catalogue can say."""
 
 
-class _Untold(ExposureArrays):
+class _Unknown(ExposureArrays):
     """Exposures of which nothing is known: whatever is asked of them is an error."""
 
-    def __getattr__(self, name: str) -> object:
+    def __getattr__(self, name: str) -> Any:
         raise NotPlannedError(name)
-
-
-def _untold() -> _Untold:
-    return object.__new__(_Untold)
 
 
 def is_undone(part: DetectorPart, cameras: int) -> bool:
     """True if a detector asks for nothing but its own counts, so that a catalogue can be freed of it."""
     try:
-        jax.eval_shape(lambda p: p.reported(jnp.ones((1, cameras)), _untold()), part)
+        jax.eval_shape(lambda p: p.reported(jnp.ones((1, cameras)), blank(_Unknown)), part)
     except NotPlannedError:
         return False
     return True
@@ -223,5 +185,5 @@ def reported(instrument: Instrument, counts: Float[Array, "n k"]) -> Float[Array
     """Counts that are reported for counts (electrons) by the detectors that can be undone."""
     for part in instrument.patched().cameras.detectors:
         if is_undone(part, len(instrument.cameras)):
-            counts = part.reported(counts, _untold())
+            counts = part.reported(counts, blank(_Unknown))
     return counts

@@ -8,6 +8,7 @@ elements of one class over together: the half-wave plates are one computation, c
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import jax.numpy as jnp
@@ -57,6 +58,21 @@ def solved(every: Sequence[Station], moving: Sequence[str], states: Sequence[Sta
         matrices = kind.solved([(element, ray) for _, element, ray in own])
         result.update({key: matrix for (key, _, _), matrix in zip(own, matrices, strict=True)})
     return result
+
+
+def in_state(
+    common: Sequence[Station], arms: Sequence[Sequence[Station]], moving: Sequence[str], state: State
+) -> list[list[Mueller | None]]:
+    """Matrices of all stations in one state, of the common train, then of every arm; None: the identity."""
+    trains, number = (common, *arms), itertools.count()
+    matrices = solved([*itertools.chain(*trains)], moving, [state])
+
+    def of(element: Element) -> Mueller | None:
+        (angle,) = positions(element, moving, [state])
+        key = next(number), angle
+        return None if element.moves and angle is None else matrices[key]
+
+    return [[of(element) for element, _ in train] for train in trains]
 
 
 def backward(

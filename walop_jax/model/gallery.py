@@ -10,10 +10,10 @@ from collections.abc import Iterator, Mapping
 from importlib.resources import files
 from typing import Any
 
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.elements import ELEMENTS
 from walop_jax.model.elements.base import Element
-from walop_jax.model.parameters import field_declarations, numbers_of, unknown_name
+from walop_jax.model.parameters import numbers_of, unknown_name
 
 NUMBERS = "gallery.json"
 
@@ -21,7 +21,7 @@ _UNSEEN = 3.0  # standard deviations below which one effect may be taken for ano
 _NOTHING = 5e-4  # per cent of the matrix: not worth a number
 
 
-TOPICS: Mapping[str, Mapping[str, type[Any]]] = {
+TOPICS: Mapping[str, Mapping[str, Any]] = {
     "effect": {effect.name: effect for effect in EFFECTS},
     "element": {kind.kind: kind for kind in ELEMENTS},
 }
@@ -54,18 +54,18 @@ def numbers() -> dict[str, Any]:
     return json.loads((files("walop_jax") / "docs" / NUMBERS).read_text(encoding="utf-8"))
 
 
-def _about(kind: type[Any]) -> str:
+def _about(kind: Any) -> str:
     return inspect.cleandoc(kind.__doc__ or "").splitlines()[0].rstrip(".")
 
 
-def _effect(effect: type[Effect]) -> Iterator[str]:
+def _effect(effect: EffectKind) -> Iterator[str]:
     """The paragraphs of the page of an effect."""
     yield from (f"# {effect.name}", f"{_about(effect)}.", *_indented(effect.head()))
     yield from _table(
         ("parameter", "unit", "usual size", "what it is"),
         [
             (n, d.unit, "" if d.width is None else f"{d.width:g}", d.about)
-            for n, d in field_declarations(effect).items()
+            for n, d in effect.numbers().items()
         ],
     )
     said = f"\n{effect.head()}"

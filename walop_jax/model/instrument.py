@@ -236,16 +236,10 @@ class Instrument(Component):
         common, ray = fold.stations(instrument.behind_polariser(), ray)
         arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
         state = tuple(angles.get(prefix) for prefix in moving)
-        matrices = fold.solved([*common, *itertools.chain(*arms)], moving, [state])
-        of_arm, number = [], len(common)
-        for arm in arms:
-            numbers = (*range(len(common)), *range(number, number + len(arm)))
-            number += len(arm)
-            path = (
-                fold.stacked(matrices, i, element, moving, [state])
-                for i, (element, _) in zip(numbers, (*common, *arm), strict=True)
-            )
-            whole = fold.product(m[0] if m is not None and m.ndim == 4 else m for m in path)
+        ahead, *inside = fold.in_state(common, arms, moving, state)
+        of_arm = []
+        for behind in inside:
+            whole = fold.product((*ahead, *behind))
             whole = jnp.eye(4) if whole is None else whole
             of_arm.append(jnp.broadcast_to(whole, (len(nodes), 4, 4)).reshape(*jnp.shape(wavelength), 4, 4))
         place = {camera: i for i, arm in enumerate(instrument.arms) for camera in arm.analyser.cameras}
@@ -364,15 +358,15 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
     `elements` are further kinds of elements that the description may name. Raises `DataError`, naming table and key,
     for what does not exist or would do nothing where it stands.
     """
-    made = parts(description, elements)
-    every = (*made.elements, *(element for _, inside, _ in made.arms for element in inside))
+    common, arms, throughput, cameras = parts(description, elements)
+    every = (*common, *(element for _, inside, _ in arms for element in inside))
     instrument = Instrument(
         name=description.name,
         sources=sources(),
-        elements=made.elements,
-        arms=tuple(Arm(*arm) for arm in made.arms),
-        throughput=made.throughput,
-        cameras=made.cameras,
+        elements=common,
+        arms=tuple(Arm(*arm) for arm in arms),
+        throughput=throughput,
+        cameras=cameras,
         path=description.path,
         field_limit=description.field_limit,
         site=description.place,

@@ -113,7 +113,7 @@ def param(
     prior = None if width is None else (0.0, width)
     declared = Parameter("", unit, about, source, prior=prior, scale=scale or 0.0, loose=loose)
     extra: dict[str, Any] = {} if default is None else {"default": default}
-    return eqx.field(metadata={PARAMETER: declared}, converter=_array, **extra)
+    return eqx.field(metadata={PARAMETER: declared}, converter=as_number, **extra)
 
 
 def number(*, unit: str, about: str, default: float | None = 0.0, several: bool = False) -> Any:
@@ -122,11 +122,11 @@ def number(*, unit: str, about: str, default: float | None = 0.0, several: bool 
     Values become float64 arrays, None stays: nothing of the kind.
     """
     declared = Parameter("", unit, about, "")
-    return eqx.field(metadata={NUMBER: declared, SEVERAL: several}, converter=_array, default=default)
+    return eqx.field(metadata={NUMBER: declared, SEVERAL: several}, converter=as_number, default=default)
 
 
-def _array(value: Any) -> Any:
-    # With its type said: numbers of weak type would be compiled anew beside arrays.
+def as_number(value: Any) -> Any:
+    """A value as a float64 array; None stays. With its type said: weak types would be compiled anew beside arrays."""
     with float64():
         return None if value is None else jnp.asarray(value, float)
 
@@ -172,19 +172,27 @@ def _arrays(
             continue
         value, here = getattr(component, field.name), (*path, field.name)
         if field.name in declared:
-            labels, own = component.labels(field.name), declared[field.name]
-            if len(labels) != np.size(value):
-                raise ValueError(
-                    f"{type(component).__name__}.{field.name}: {len(labels)} labels, {np.size(value)} values"
-                )
-            names = (own.name or f"{part}.{label}".strip(".") for label in labels)
-            yield here, tuple(dataclasses.replace(own, name=name, part=part) for name in names)
+            yield here, _named(component, field.name, declared[field.name], value, part)
+        elif isinstance(value, dict):
+            for name in (name for name in declared if name in value):
+                yield (*here, name), _named(component, name, declared[name], value[name], part)
         elif isinstance(value, tuple):
             for i, child in enumerate(value):
                 if isinstance(child, Component) and hasattr(child, "name"):
                     yield from _arrays(child, f"{part}.{_name(child)}".strip("."), (*here, str(i)))
         elif isinstance(value, Component):
             yield from _arrays(value, f"{part}.{field.name}".strip("."), here)
+
+
+def _named(
+    component: Component, name: str, declared: Parameter, value: Any, part: str
+) -> tuple[Parameter, ...]:
+    """The parameters of one array."""
+    labels = component.labels(name)
+    if len(labels) != np.size(value):
+        raise ValueError(f"{type(component).__name__}.{name}: {len(labels)} labels, {np.size(value)} values")
+    names = (declared.name or f"{part}.{label}".strip(".") for label in labels)
+    return tuple(dataclasses.replace(declared, name=name, part=part) for name in names)
 
 
 def _name(component: Any) -> str:
@@ -228,7 +236,7 @@ def _places(structure: Any, shapes: Shapes) -> tuple[tuple[int, int], ...]:
 
 
 def _key(entry: Any) -> str:
-    return str(entry.name if hasattr(entry, "name") else entry.idx)
+    return str(next(getattr(entry, of) for of in ("name", "idx", "key") if hasattr(entry, of)))
 
 
 def values_of(component: Component) -> Vector:

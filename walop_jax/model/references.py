@@ -56,7 +56,9 @@ def references(model: Model, filters: Iterable[str] = ()) -> tuple[Reference, ..
         used = any(model.parameters[i].free for i in model.positions(source.name))
         if source.reference and used:
             found.append(Reference(f"light of KIND {source.kind}", source.reference))
-    found += [Reference(f"effect {effect.name}", effect.reference or _OWN) for effect in instrument.effects]
+    found += [
+        Reference(f"effect {effect.name}", effect.kind.reference or _OWN) for effect in instrument.effects
+    ]
     return tuple(dict.fromkeys(found))
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from walop_jax.data.records import Exposures
 from walop_jax.model.compiled import array
 from walop_jax.model.conventions import EXTINCTION
-from walop_jax.model.effects import EFFECTS, Described, effect_by_name, in_order
+from walop_jax.model.effects import EFFECTS, Described, EffectKind, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.elements import WavePlate
 from walop_jax.model.elements.wave_plate import Layer
@@ -43,7 +43,7 @@ class Model:
     name: str
     template: Instrument
     parameters: tuple[Parameter, ...]
-    catalogue: tuple[type[Effect], ...] = EFFECTS
+    catalogue: tuple[EffectKind, ...] = EFFECTS
     laws: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -224,7 +224,7 @@ def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
     )
 
 
-def with_effects(model: Model, effects: Sequence[str | type[Effect] | Effect], context: Context) -> Model:
+def with_effects(model: Model, effects: Sequence[str | EffectKind | Effect], context: Context) -> Model:
     """The model with effects added, in the order light meets them; what it had stays as it was.
 
     A name or a class adds the effect at its neutral value, at the shape of its first probe; an instance starts where it

@@ -1,7 +1,7 @@
 """Following the light: one source through the instrument, element by element, with the fold that a fit uses.
 
-`light.py` folds the train backwards from the analysers, once for all sources. Here the Stokes vector goes forward,
-averaged over the band from where the light depends on wavelength; both ends meet in the counts.
+`light.py` folds the train backwards from the analysers, once for all sources. Here the Stokes vector goes forward as
+far as there, averaged over the band from where the light depends on wavelength; what the cameras see of it is the fold.
 
 Units       Stokes vectors in units of the flux that arrives; counts per unit of flux, as in `light.counts`: ghosts of
             other field points and effects of the detectors, which act on electrons, come after.
@@ -10,11 +10,8 @@ Units       Stokes vectors in units of the flux that arrives; counts per unit of
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -22,7 +19,7 @@ from jaxtyping import Array, Float
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.model import fold, light
-from walop_jax.model.elements import Analyser, Element
+from walop_jax.model.elements import Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for_settings
@@ -86,84 +83,39 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
 
     # One Stokes vector per node, and its average over the band.
     wavelength, weight = light.node_wavelengths(instrument, plan), light.band_weights(instrument, plan)[0]
-
-    def along(wavelength: Float[Array, " n"]) -> _Way:
-        return _followed(instrument, plan, beam, Ray.entering(x, y, (wavelength, plan.conditions)))
-
-    behind, ahead = along(wavelength)
-    train = light.divided(instrument)
-    for element, nodes in zip((*train.leading, *train.banded), behind, strict=True):
-        if nodes is not None:
-            stages.append(_one(element.name, _about(element, plan), weight @ nodes))
-    # Where the beams of an analyser differ in wavelength, they see what λ ∂/∂λ of the light there adds as well.
-    slopes: Sequence[Any] = [None] * len(ahead)
-    if light.is_dispersed(instrument):
-        slopes = jax.jvp(lambda w: along(w).ahead, (wavelength,), (wavelength,))[1]
-    mean = weight @ wavelength
-    beams = jnp.zeros(len(instrument.cameras))
-    for arm, nodes, slope in zip(instrument.arms, ahead, slopes, strict=True):
-        cameras = np.array([instrument.cameras.names.index(name) for name in arm.analyser.cameras])
-        seen = arm.analyser.shares() @ _seen(arm.analyser, weight @ nodes, mean)
-        if slope is not None:
-            seen = seen + arm.analyser.shares_of_slopes() @ _seen(arm.analyser, weight @ slope, mean)
-        beams = beams.at[cameras].set(seen)
-    names = tuple(arm.name for arm in instrument.arms)
-    stages.append(
-        LightStage("arms", "ahead of the analysers", names, STOKES, np.asarray(weight @ jnp.stack(ahead)))
+    train, (state, *_) = light.divided(instrument), plan.settings[0]
+    common, ray = fold.stations(
+        (*train.leading, *train.banded), Ray.entering(x, y, (wavelength, plan.conditions))
     )
-    stages.append(_cameras(instrument, "analysers", "share of the light in each beam of its arm", beams))
+    arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
+    ahead, *inside = fold.in_state(common, arms, plan.moving, state)
+    nodes = jnp.broadcast_to(beam, (len(wavelength), 4))
+    for (element, _), matrix in zip(common, ahead, strict=True):
+        nodes = _through(matrix, nodes)
+        if matrix is not None or element.moves:
+            stages.append(_one(element.name, _about(element, plan), weight @ nodes))
+    of_arms = [
+        weight @ functools.reduce(lambda one, matrix: _through(matrix, one), arm, nodes) for arm in inside
+    ]
+    names = tuple(arm.name for arm in instrument.arms)
+    stages.append(LightStage("arms", "ahead of the analysers", names, STOKES, np.asarray(of_arms)))
 
-    throughput = instrument.throughput.at(x, y)
-    for part in instrument.cameras.transmission:
-        throughput = throughput * part.factors(x, y)
-    beams = throughput * beams
-    about = "behind lenses, filter and detector of each camera"
-    stages.append(_cameras(instrument, "cameras", about, beams))
-    # Mixing is linear in the cameras whatever the Stokes parameter: the beams stand where I does.
-    vectors = jnp.zeros((1, len(beams), 4)).at[0, :, 0].set(beams)
-    for part in instrument.cameras.mixing:
-        vectors = part.vectors(vectors, x, y)
-    stages.append(_cameras(instrument, "counts", "electrons per electron of flux", vectors[0, :, 0]))
+    # From there as in every fit: the rows that the analysers see, times the light.
+    rows, throughput = light.band_rows(instrument, plan, x, y), instrument.throughput.at(x, y)
+    unmixed = dataclasses.replace(instrument, cameras=dataclasses.replace(instrument.cameras, mixing=()))
+    for name, about, seen in (
+        ("analysers", "share of the light in each beam of its arm",
+         light.beams(instrument, rows) @ light.upstream(instrument, x, y)),
+        ("cameras", "behind lenses, filter and detector of each camera",
+         light.camera_vectors(unmixed, rows, throughput, x, y)),
+        ("counts", "electrons per electron of flux", light.camera_vectors(instrument, rows, throughput, x, y)),
+    ):  # fmt: skip
+        stages.append(LightStage(name, about, ("",), instrument.cameras.names, np.asarray(seen @ beam)))
     return tuple(stages)
 
 
-def _seen(analyser: Analyser, light: Float[Array, " 4"], wavelength: Float[Array, ""]) -> Float[Array, " 2"]:
-    """The rows that the beams are made of, of a matrix whose columns are this light and nothing else."""
-    seen = analyser.seen(jnp.zeros((4, 4)).at[:, 0].set(light))
-    return analyser.in_band(seen[None], wavelength[None])[0, :, 0]
-
-
-class _Way(NamedTuple):
-    """The light at every node: behind each element of the common train (None: it does nothing), ahead of analysers."""
-
-    behind: list[Float[Array, "n 4"] | None]
-    ahead: list[Float[Array, "n 4"]]
-
-
-def _followed(instrument: Instrument, plan: Plan, beam: Float[Array, " 4"], ray: Ray) -> _Way:
-    train, (state, *_) = light.divided(instrument), plan.settings[0]
-    common, ray = fold.stations((*train.leading, *train.banded), ray)
-    arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
-    matrices = fold.solved([*common, *(one for arm in arms for one in arm)], plan.moving, [state])
-    nodes, numbers = jnp.broadcast_to(beam, (len(plan.wavelength), 4)), itertools.count()
-
-    def through(element: Element, nodes: Float[Array, "n 4"]) -> Float[Array, "n 4"] | None:
-        own = fold.stacked(matrices, next(numbers), element, plan.moving, [state])
-        if own is None:
-            return nodes if element.moves else None
-        return jnp.einsum("...st,...t->...s", own[0] if element.moves else own, nodes)
-
-    behind, ahead = [], []
-    for element, _ in common:
-        behind.append(through(element, nodes))
-        nodes = nodes if behind[-1] is None else behind[-1]
-    for arm in arms:
-        here = nodes
-        for element, _ in arm:
-            there = through(element, here)
-            here = here if there is None else there
-        ahead.append(here)
-    return _Way(behind, ahead)
+def _through(matrix: Float[Array, "... 4 4"] | None, nodes: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
+    return nodes if matrix is None else jnp.einsum("...st,...t->...s", matrix, nodes)
 
 
 def _about(element: Element, plan: Plan) -> str:
@@ -183,7 +135,3 @@ def _with_source(instrument: Instrument, sightline: Sightline) -> Instrument:
 
 def _one(name: str, about: str, beam: Float[Array, " 4"]) -> LightStage:
     return LightStage(name, about.splitlines()[0].rstrip("."), ("",), STOKES, np.asarray(beam)[None])
-
-
-def _cameras(instrument: Instrument, name: str, about: str, beams: Float[Array, " k"]) -> LightStage:
-    return LightStage(name, about, ("",), instrument.cameras.names, np.asarray(beams)[None])

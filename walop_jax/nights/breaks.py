@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special
 
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.laws import YEAR, Law
 from walop_jax.nights import changes
 from walop_jax.nights.algebra import Solution, System, UndeterminedError, solve
@@ -185,7 +185,7 @@ def solved(data: Together, laws: Sequence[Law | None]) -> Solution:
 def find(
     data: Together,
     laws: Sequence[Law | None],
-    catalogue: Sequence[type[Effect]] = EFFECTS,
+    catalogue: Sequence[EffectKind] = EFFECTS,
     carried: Carried | None = None,
 ) -> tuple[tuple[Break, ...], tuple[Law | None, ...], Solution]:
     """The breaks of a series, the laws with them, and the solution under these.
@@ -255,7 +255,7 @@ def _largest(
     data: Together,
     solution: Solution,
     chance: float,
-    catalogue: Sequence[type[Effect]],
+    catalogue: Sequence[EffectKind],
     carried: Carried | None,
 ) -> Break | None:
     """The change that stands out most, of those alike the first that is carried; None where chance does as well."""

@@ -32,7 +32,7 @@ from walop_jax.likelihood import engine
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, used_rows
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.effects.catalogue import applies
 from walop_jax.model.parameters import Parameter, leaves
 from walop_jax.model.specification import Model, effect_context
@@ -156,7 +156,7 @@ Candidates = dict[str, tuple[Parameter, Change]]
 
 
 def candidates_of(
-    model: Model, exposures: Exposures, catalogue: Sequence[type[Effect]] = EFFECTS
+    model: Model, exposures: Exposures, catalogue: Sequence[EffectKind] = EFFECTS
 ) -> Candidates:
     """Amplitudes of the effects that a model lacks, and its gauges, with the change that each is to first order."""
     context, found = effect_context(model.template, exposures), {}

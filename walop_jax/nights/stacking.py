@@ -30,7 +30,7 @@ from walop_jax.io.fits_reading import primary_keywords
 from walop_jax.io.names import NIGHTS, PRODUCT, REFERENCE, SURVEY, TRACKS
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import check_input, parse_toml, read_text
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.laws import Law, laws_of, resolved
 from walop_jax.model.specification import effect_context
 from walop_jax.nights.algebra import Solution, UndeterminedError
@@ -81,7 +81,7 @@ def stack(
     partial: Path | None = None,
     executor: Executor | None = None,
     tell: Callable[[str], None] = lambda text: None,
-    catalogue: Sequence[type[Effect]] = EFFECTS,
+    catalogue: Sequence[EffectKind] = EFFECTS,
 ) -> Survey:
     """Fit all nights together under laws of time, from their normal equations.
 
@@ -178,7 +178,7 @@ def writers(survey: Survey) -> dict[str, Callable[[Path], object]]:
     }
 
 
-def read_survey(folder: str | os.PathLike[str], catalogue: Sequence[type[Effect]] = EFFECTS) -> Survey:
+def read_survey(folder: str | os.PathLike[str], catalogue: Sequence[EffectKind] = EFFECTS) -> Survey:
     """The survey of a folder, solved again. Raises `DataError` for a folder that is none."""
     return stack([folder], find=False, catalogue=catalogue)
 
@@ -208,7 +208,7 @@ def calibration_of_stars(survey: Survey, stars: InputTable, *, force: bool = Fal
     return survey.at(0.5 * (low + high), force=force)
 
 
-def _opened(one: Given, catalogue: Sequence[type[Effect]]) -> _Opened:
+def _opened(one: Given, catalogue: Sequence[EffectKind]) -> _Opened:
     """Nights, or data that they can be made of, with the fit, breaks and events that come with them."""
     if isinstance(one, Night):
         return _Opened([one])
@@ -311,7 +311,7 @@ def _in_units(
     return data.origin + solution.values * scale, np.maximum(solution.errors() * scale, 1e-12 * scale)
 
 
-def _carried(like: Calibration, catalogue: Sequence[type[Effect]], name: str) -> bool:
+def _carried(like: Calibration, catalogue: Sequence[EffectKind], name: str) -> bool:
     """True unless a candidate is an effect of which a star at another time and flux says nothing.
 
     Such are the median counts of a field, the exposure before, the time since the first exposure of a night.

@@ -30,7 +30,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import two_digits, value_and_error
-from walop_jax.model.effects import Effect
+from walop_jax.model.effects import EffectKind
 from walop_jax.model.laws import Law
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights.algebra import Solution
@@ -273,7 +273,7 @@ class Survey(Displayed):
                     f"{p.name} is one shape of its effect, and the model has another",
                     advice="put the effect into the model file and fit the nights again",
                 )
-            kind: type[Effect] = next(one for one in model.catalogue if one.name == part)
+            kind: EffectKind = next(one for one in model.catalogue if one.name == part)
             if part not in model.effect_names:
                 group, _, member = shape.partition("#")
                 chosen = (

@@ -32,7 +32,7 @@ from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
 from walop_jax.model.compiled import compiled
-from walop_jax.model.effects import EFFECTS, Effect, effect_by_name
+from walop_jax.model.effects import EFFECTS, Effect, EffectKind, effect_by_name
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import Model, effect_context, with_effects
@@ -109,7 +109,7 @@ def candidates(
     around: Calibration | None = None,
     angles: int = ANGLES,
     effects: Sequence[str | Effect] = (),
-    catalogue: Sequence[type[Effect]] = EFFECTS,
+    catalogue: Sequence[EffectKind] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> Candidates:
     """The exposures that could be taken, each with its information in `draws` draws of the instrument.
@@ -132,7 +132,7 @@ def candidates(
     tell("expected counts")
     calset = simulate(plan, seed=seed, noiseless=True, steady=True).calset
     model = base_model(calset, plan.design, throughput_degree=plan.throughput_degree)
-    kinds = (*catalogue, *(type(effect) for effect in effects if isinstance(effect, Effect)))
+    kinds = (*catalogue, *(effect.kind for effect in effects if isinstance(effect, Effect)))
     model, stated = _with(dataclasses.replace(model, catalogue=kinds), calset, effects)
     values = drawn(model, draws, seed, around)
     for i in (model.index(name) for name in model.names if _effect_of(name, stated)):

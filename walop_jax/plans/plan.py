@@ -27,7 +27,7 @@ from walop_jax.data.user_tables import InputTable
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
 from walop_jax.likelihood.inverses import pseudo_inverse
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, Effect, EffectKind
 from walop_jax.plans.could import Could, separation
 from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
 from walop_jax.plans.optimal import (
@@ -246,7 +246,7 @@ def plan_exposures(
     seed: int = 0,
     gap: float = GAP,
     apart: Sequence[str | Effect] = (),
-    catalogue: Sequence[type[Effect]] = EFFECTS,
+    catalogue: Sequence[EffectKind] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> ExposurePlan:
     """The calibration exposures of `minutes` that make a criterion (`wanted`) best.

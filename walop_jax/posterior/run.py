@@ -26,7 +26,7 @@ from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import two_digits
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.posterior.draws import read_groups
 
 VERDICTS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
@@ -55,7 +55,7 @@ class Run(RunFolder, Result):
     15.6675 ± 0.0051
     """
 
-    catalogue: Sequence[type[Effect]] = EFFECTS
+    catalogue: Sequence[EffectKind] = EFFECTS
     data: Sequence[str | os.PathLike[str]] = ()
 
     @functools.cached_property

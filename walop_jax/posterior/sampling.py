@@ -164,7 +164,7 @@ def fingerprint(target: Target, options: Options) -> dict[str, str]:
         del chain[name]
     sampler = options.make_sampler()
     versions = versions_of((*SOFTWARE, *sampler.software))
-    effects = [type(effect).__name__ for effect in model.template.effects]
+    effects = [effect.name for effect in model.template.effects]
     return {
         "data": digest(*data, *plan, *exposures, laid_out.settings),
         "model": digest(model.name, parameters, effects, model.template.plates),

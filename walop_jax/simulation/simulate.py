@@ -22,11 +22,11 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre, light
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
-from walop_jax.model.effects import EFFECTS, effect_by_name, in_order
+from walop_jax.model.effects import EFFECTS, EffectKind, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.elements import Analyser
 from walop_jax.model.instrument import Instrument, adapted
-from walop_jax.model.parameters import field_declarations, leaves, unknown_name, values_of
+from walop_jax.model.parameters import leaves, unknown_name, values_of
 from walop_jax.model.plan import with_median
 from walop_jax.model.sources import Standards
 from walop_jax.model.specification import Model, make_model, series_indices
@@ -259,7 +259,7 @@ def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, 
     return counts
 
 
-def effect_from_text(text: str, context: Context, catalogue: Sequence[type[Effect]] = EFFECTS) -> Effect:
+def effect_from_text(text: str, context: Context, catalogue: Sequence[EffectKind] = EFFECTS) -> Effect:
     """The effect of `catalogue` that a text stands for.
 
     A value is a number, numbers between slashes (one for each element of the parameter), or a word for a discrete
@@ -267,7 +267,7 @@ def effect_from_text(text: str, context: Context, catalogue: Sequence[type[Effec
     """
     name, _, rest = (part.strip() for part in text.partition("="))
     kind = effect_by_name(name, catalogue)
-    parameters = tuple(field_declarations(kind))
+    parameters = tuple(kind.numbers())
     values: dict[str, Any] = {}
     if rest and ":" not in rest:
         if len(parameters) != 1:
@@ -276,7 +276,7 @@ def effect_from_text(text: str, context: Context, catalogue: Sequence[type[Effec
         values[parameters[0]] = _value(rest, name)
     elif rest:
         values = _named_values(rest, name)
-    known = [field.name for field in dataclasses.fields(kind)]
+    known = [*parameters, *kind.neutral(context).choices()]
     for parameter in values:
         if parameter not in known:
             error = unknown_name(f"parameter of {name}", parameter, known)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import effect_scenes as scenes
 import jax
 import jax.numpy as jnp
@@ -12,9 +10,8 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from walop_jax.model.compiled import compiled
-from walop_jax.model.effects import EFFECTS, effect_by_name
-from walop_jax.model.effects.base import Effect
-from walop_jax.model.parameters import field_declarations, leaves, values_of
+from walop_jax.model.effects import EFFECTS, EffectKind, effect_by_name
+from walop_jax.model.parameters import leaves, values_of
 
 # Names, parameters and units of docs: effects, typed by hand.
 CONTRACT = {
@@ -65,15 +62,15 @@ def test_unknown_effect_lists_the_nearest():
 
 
 @every_effect
-def test_parameters_units_and_sources(kind: type[Effect]):
+def test_parameters_units_and_sources(kind: EffectKind):
     effect = kind.neutral(scenes.CONTEXT)
     expected = CONTRACT[kind.name]
-    assert {name: d.unit for name, d in field_declarations(kind).items()} == {
+    assert {name: d.unit for name, d in kind.numbers().items()} == {
         name: unit for name, unit in expected.items() if unit is not None
     }
     # Which crystal is cut has a default; every other choice is part of the name.
     assert {*effect.choices()} - {"crystal"} == {name for name, unit in expected.items() if unit is None}
-    for declaration in field_declarations(kind).values():
+    for declaration in kind.numbers().values():
         assert declaration.about
         assert declaration.source
         assert declaration.width or declaration.loose, "an amplitude has a prior, a shape a weak pull"
@@ -84,7 +81,7 @@ def test_parameters_units_and_sources(kind: type[Effect]):
 
 
 @every_effect
-def test_its_page_says_what_it_is(kind: type[Effect]):
+def test_its_page_says_what_it_is(kind: EffectKind):
     text = kind.head()
     for section in ("Equation", "Source", "Neutral", "Revealed by"):
         assert section in text, section
@@ -92,8 +89,8 @@ def test_its_page_says_what_it_is(kind: type[Effect]):
 
 
 @every_effect
-def test_names_in_class_variables_are_parameters(kind: type[Effect]):
-    names = set(field_declarations(kind))
+def test_names_in_class_variables_are_parameters(kind: EffectKind):
+    names = set(kind.numbers())
     assert {*kind.shape, *kind.one_sided} <= names
     assert not {*kind.shape} & {*kind.one_sided}
     for group in kind.probes(scenes.CONTEXT):
@@ -103,7 +100,7 @@ def test_names_in_class_variables_are_parameters(kind: type[Effect]):
 
 
 @every_effect
-def test_unknown_value_lists_the_nearest(kind: type[Effect]):
+def test_unknown_value_lists_the_nearest(kind: EffectKind):
     with pytest.raises(ValueError, match=f"there is no parameter of {kind.name}"):
         kind.of(scenes.CONTEXT, no_such_thing=1.0)
 
@@ -114,26 +111,25 @@ def test_unknown_value_lists_the_nearest(kind: type[Effect]):
     [with_parameters, *(pytest.param([kind], marks=pytest.mark.long) for kind in with_parameters)],
     ids=lambda kinds: kinds[0].name if len(kinds) == 1 else "all",
 )
-def test_neutral_and_derivatives(kinds: list[type[Effect]]):
+def test_neutral_and_derivatives(kinds: list[EffectKind]):
     """Neutral changes nothing; every amplitude does something; forward derivative = central difference."""
     probes = [kind.probes(scenes.CONTEXT)[0][0] for kind in kinds]
     layout = scenes.plan(probes)
     data = scenes.points(layout)
     neutral, unravel = ravel_pytree(
-        [{name: getattr(probe, name) for name in probe.amplitudes()} for probe in probes]
+        [{name: getattr(probe, name) for name in probe.kind.amplitudes()} for probe in probes]
     )
     labels = [
-        (probe.name, name, field_declarations(type(probe))[name].width)
+        (probe.name, name, probe.declarations()[name].width)
         for probe in probes
-        for name in sorted(probe.amplitudes())  # the order of a dictionary's leaves
+        for name in sorted(probe.kind.amplitudes())  # the order of a dictionary's leaves
         for _ in range(np.size(getattr(probe, name)))
     ]
     step = 1e-3 * np.array([width for *_, width in labels])
 
     def counts(amplitudes: jax.Array) -> jax.Array:
         effects = [
-            dataclasses.replace(probe, **values)
-            for probe, values in zip(probes, unravel(amplitudes), strict=True)
+            probe.replaced(**values) for probe, values in zip(probes, unravel(amplitudes), strict=True)
         ]
         return scenes.counts(scenes.instrument(*effects), layout, data)
 

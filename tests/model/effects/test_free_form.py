@@ -114,5 +114,8 @@ def test_it_survives_a_model_file():
 
 
 def test_effects_that_no_catalogue_lists_come_last():
-    wobble, free = effect_by_name("clp_wobble")(), FreeForm.of(scenes.CONTEXT, blocks=())
+    wobble, free = (
+        effect_by_name("clp_wobble").neutral(scenes.CONTEXT),
+        FreeForm.of(scenes.CONTEXT, blocks=()),
+    )
     assert [e.name for e in in_order([free, wobble])] == ["clp_wobble", "free_form"]

@@ -42,4 +42,4 @@ def test_beside_a_change_of_the_same_number_it_would_be_another_number(first):
 def test_no_other_number_can_be_stated():
     """Its value without the effect would be that of the polariser."""
     with pytest.raises(ValueError, match="d: absolute is for the extinction of the polariser alone"):
-        entries({"other_plate": ENTRY}, "tests_of_stated_numbers")
+        entries({"other_plate": ENTRY})

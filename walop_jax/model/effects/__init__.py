@@ -4,14 +4,14 @@ from collections.abc import Iterable, Sequence
 
 from walop_jax.model.effects import cameras, numbers, optics
 from walop_jax.model.effects.base import Context, Effect
-from walop_jax.model.effects.catalogue import EFFECTS
+from walop_jax.model.effects.catalogue import EFFECTS, EffectKind
 from walop_jax.model.effects.change import Change
 from walop_jax.model.effects.described import Described, OtherDescription
 from walop_jax.model.effects.free_form import FreeForm
 from walop_jax.model.parameters import unknown_name
 
 
-def effect_by_name(name: str, catalogue: Sequence[type[Effect]] = EFFECTS) -> type[Effect]:
+def effect_by_name(name: str, catalogue: Sequence[EffectKind] = EFFECTS) -> EffectKind:
     """The effect of a catalogue by its name; ValueError with the nearest names when there is none.
 
     >>> walop.effect_by_name("hwp1_axis").__doc__

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from walop_jax.model.conventions import CAMERAS, EXTINCTION, OF_WALOP, Units
 from walop_jax.model.effects.change import Change
 from walop_jax.model.instrument import Instrument, NoSuchPlaceError
-from walop_jax.model.parameters import Component, field_declarations, unknown_name
+from walop_jax.model.parameters import Component, Parameter, field_declarations, unknown_name
 
 Scalar = Float[Array, ""]
 
@@ -55,8 +55,8 @@ class Effect(Component):
     keeps above neutral; `over_field` says that only a number of field points can show it; `reference` says where
     the effect is known from; `said` are the changes that it is (`change`), none where no change holds it.
 
-    >>> walop.effect_by_name("hwp1_axis").__mro__[1] is not object
-    True
+    >>> walop.effect_by_name("hwp1_axis").neutral(walop.ObservingPlan(grid=3).context()).name
+    'hwp1_axis'
     """
 
     name: ClassVar[str] = ""
@@ -87,16 +87,7 @@ class Effect(Component):
         A camera goes by its name, or by its number from 0. Raises ValueError, with the nearest names, for a parameter
         that the effect does not have, and for a camera that does not exist.
         """
-        effect = cls.neutral(context)
-        names = [field.name for field in dataclasses.fields(effect)]
-        for name, value in values.items():
-            if name not in names:
-                raise unknown_name(f"parameter of {cls.name}", name, names)
-            if name in field_declarations(cls):
-                values[name] = jnp.broadcast_to(jnp.asarray(value, float), np.shape(getattr(effect, name)))
-        if "camera" in values:
-            values["camera"] = numbered_camera(cls.name, values["camera"], context.cameras)
-        return dataclasses.replace(effect, **values)
+        return cls.neutral(context).given(context, **values)
 
     @classmethod
     def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
@@ -112,13 +103,7 @@ class Effect(Component):
         """
         if len(group) != 1:
             raise NotImplementedError(f"{cls.name} does not say how its probes combine")
-        rest = np.asarray(amplitudes, float)
-        changed: dict[str, Any] = {}
-        for name in cls.amplitudes():
-            value = np.asarray(getattr(group[0], name))
-            changed[name] = value + rest[: value.size].reshape(value.shape)
-            rest = rest[value.size :]
-        return dataclasses.replace(group[0], **changed)
+        return group[0].moved(amplitudes)
 
     @classmethod
     def head(cls) -> str:
@@ -126,14 +111,55 @@ class Effect(Component):
         return inspect.cleandoc(sys.modules[cls.__module__].__doc__ or "").partition("\n")[2].strip("\n")
 
     @classmethod
+    def numbers(cls) -> dict[str, Parameter]:
+        """Its parameters, by name."""
+        return field_declarations(cls)
+
+    @classmethod
     def amplitudes(cls) -> tuple[str, ...]:
         """Names of the parameters in which the effect is linear at neutral."""
-        return tuple(name for name in field_declarations(cls) if name not in cls.shape)
+        return tuple(name for name in cls.numbers() if name not in cls.shape)
 
     @classmethod
     def is_structural(cls) -> bool:
         """True if the effect has no parameter: it is there or it is not."""
-        return not field_declarations(cls)
+        return not cls.numbers()
+
+    # ------------------------------------------------------------------------------------- an effect at some values
+
+    @property
+    def kind(self) -> Any:
+        """Its class, or its entry in the catalogue: what effects of one name have in common."""
+        return type(self)
+
+    def declarations(self) -> Mapping[str, Parameter]:
+        """Its parameters, by name."""
+        return self.kind.numbers()
+
+    def replaced(self, **values: Any) -> Self:
+        """With other values of parameters, or other choices."""
+        return dataclasses.replace(self, **values)
+
+    def given(self, context: Context, **values: Any) -> Self:
+        """With values as for `of`."""
+        numbers, choices = self.declarations(), self.choices()
+        for name, value in values.items():
+            if name in numbers:
+                values[name] = jnp.broadcast_to(jnp.asarray(value, float), np.shape(getattr(self, name)))
+            elif name not in choices:
+                raise unknown_name(f"parameter of {self.name}", name, [*numbers, *choices])
+        if "camera" in values:
+            values["camera"] = numbered_camera(self.name, values["camera"], context.cameras)
+        return self.replaced(**values)
+
+    def moved(self, amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
+        """With numbers added to its amplitudes, in the order of its parameters."""
+        rest, changed = np.asarray(amplitudes, float), {}
+        for name in self.kind.amplitudes():
+            value = np.asarray(getattr(self, name))
+            changed[name] = value + rest[: value.size].reshape(value.shape)
+            rest = rest[value.size :]
+        return self.replaced(**changed)
 
     def choices(self) -> dict[str, Any]:
         """Discrete choices that belong to the description of the effect, e.g. the number of a camera."""
@@ -154,7 +180,7 @@ class Effect(Component):
 
     def at_neutral(self, context: Context) -> Self:
         """The same effect, discrete choices included, with values that change nothing."""
-        return type(self).of(context, **self.choices())
+        return self.kind.of(context, **self.choices())
 
     def standard_form(self) -> Self:
         """The same effect with positive amplitude and with angles in their principal range."""
@@ -173,12 +199,12 @@ def with_amplitudes(
     instrument: Instrument, effects: Sequence[Effect]
 ) -> tuple[list[Float[Array, ...]], Callable[[list[Float[Array, ...]]], Instrument]]:
     """The amplitudes of effects, one after the other, and the function that adds the effects with other ones."""
-    names = [(i, name) for i, effect in enumerate(effects) for name in effect.amplitudes()]
+    names = [(i, name) for i, effect in enumerate(effects) for name in effect.kind.amplitudes()]
 
     def put(amplitudes: list[Float[Array, ...]]) -> Instrument:
         changed = list(effects)
         for (i, name), value in zip(names, amplitudes, strict=True):
-            changed[i] = dataclasses.replace(changed[i], **{name: value})
+            changed[i] = changed[i].replaced(**{name: value})
         return dataclasses.replace(instrument, effects=(*instrument.effects, *changed))
 
     return [getattr(effects[i], name) for i, name in names], put

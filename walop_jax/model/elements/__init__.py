@@ -1,7 +1,7 @@
 """The elements of a train: one class each, and `ELEMENTS`, the kinds that a description file may name."""
 
 from walop_jax.model.elements.base import Element
-from walop_jax.model.elements.geometry import FieldShift, PupilMapping, Wedge
+from walop_jax.model.elements.geometry import PupilMapping, Wedge
 from walop_jax.model.elements.simple import (
     AddedPolarisation,
     Analyser,
@@ -22,7 +22,6 @@ ELEMENTS: tuple[type[Element], ...] = (
     Collimator,
     RadialRetarder,
     PupilMapping,
-    FieldShift,
     Wedge,
     WavePlate,
     Retarder,

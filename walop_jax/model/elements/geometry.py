@@ -1,4 +1,4 @@
-"""Elements that change where a ray goes: the mapping from field to pupil, wedges, flexure.
+"""Elements that change where a ray goes: the mapping from field to pupil, wedges.
 
 Pupil       (X, Y) leaves the collimator along (tan M X′, tan M (1 + a) Y′, 1), X′ = X (1 + κ r²): M magnification,
             κ distortion [deg⁻²], r² = X² + Y² [deg²], a aspect.
@@ -155,25 +155,3 @@ class Wedge(Element):
         if self.frame == "kept":
             return None
         return mueller.rotation(-wedge_rotation(self.direction(ray), self.turn, self.index(ray)))
-
-
-class FieldShift(Element):
-    """Field coordinates displaced: by a constant, and in proportion to the hour angle."""
-
-    x: Scalar | None = number(unit="deg", about="displacement along X", default=None)
-    y: Scalar | None = number(unit="deg", about="displacement along Y", default=None)
-    rate_x: Scalar | None = number(unit="deg/h", about="displacement along X per hour", default=None)
-    rate_y: Scalar | None = number(unit="deg/h", about="displacement along Y per hour", default=None)
-
-    kind: ClassVar[str] = "field_shift"
-
-    def ray(self, ray: Ray) -> Ray:
-        """The ray from the place that the optics behind see."""
-        x = ray.x if self.x is None else ray.x + self.x
-        y = ray.y if self.y is None else ray.y + self.y
-        if self.rate_x is not None:
-            x = x + self.rate_x * ray.conditions.hour_angle
-        if self.rate_y is not None:
-            y = y + self.rate_y * ray.conditions.hour_angle
-        x, y = jnp.broadcast_arrays(x, y)
-        return ray.moved(x, y)

@@ -1,0 +1,337 @@
+"""Effects that are values: parameters that are amplitudes of changes, as an entry of a catalogue describes them.
+
+An effect is to first order Σ_p v_p Σ_i s_pi c_i over its parameters p, v their values, c changes and s the sizes of
+these for one unit. Of a polar pair, which has a size and an angle, two changes have cos and sin of the angle.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from walop_jax.model.alternatives import alternatives, changed
+from walop_jax.model.conventions import EXTINCTION
+from walop_jax.model.effects.base import Context, Effect, Scalar, numbered_camera
+from walop_jax.model.effects.change import Change, patched
+from walop_jax.model.elements import WavePlate
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import Parameter, as_number, unknown_name
+
+NO_STANDARD = "there is no standard star"
+
+EVERY: Mapping[str, Callable[[Instrument], Sequence[str]]] = {
+    "camera": lambda instrument: instrument.cameras.names,
+    "analyser": lambda instrument: [f"{arm.name}.{arm.path[-1]}" for arm in instrument.arms],
+    "wave_plate": lambda instrument: instrument.places(WavePlate),
+}
+"""Places that `every` stands for."""
+
+
+class Member(NamedTuple):
+    """A parameter of an entry: keys of its table in a file. The angle of a polar pair does nothing by itself.
+
+    `turns` is the phase of cos and sin (rad) for one unit of that angle.
+    """
+
+    name: str
+    declared: Parameter
+    does: tuple[str, ...] = ()
+    per_unit: tuple[float, ...] = ()
+    said: tuple[str, ...] = ()
+    each: str = ""
+    polar: str = ""
+    turns: float = 1.0
+    is_axis: bool = False
+    absolute: bool = False
+    neutral: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Entry:
+    """An effect of a catalogue; its `table` is that of the file. What a class of effects says, it says as well.
+
+    `choices` are words, or "cameras" or "stars"; `arrangement` is one of `alternatives`.
+    """
+
+    name: str
+    members: tuple[Member, ...]
+    choices: tuple[tuple[str, str | tuple[str, ...]], ...]
+    arrangement: str
+    reference: str
+    revealed_by: str
+    separated_by: str
+    one_sided: tuple[str, ...]
+    over_field: bool
+    table: Mapping[str, Any] = dataclasses.field(compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "__doc__", f"{self.table['about']}.")
+
+    def __hash__(self) -> int:
+        return hash(self.name)
+
+    @property
+    def polar(self) -> Member | None:
+        """The size of its polar pair, if it has one."""
+        return next((member for member in self.members if member.polar), None)
+
+    @property
+    def shape(self) -> tuple[str, ...]:
+        """Parameters that act non-linearly: angles."""
+        return tuple(member.polar for member in self.members if member.polar)
+
+    def numbers(self) -> dict[str, Parameter]:
+        """Its parameters, by name."""
+        return {member.name: member.declared for member in self.members}
+
+    def amplitudes(self) -> tuple[str, ...]:
+        """Names of the parameters in which it is linear at neutral."""
+        return tuple(member.name for member in self.members if member.does)
+
+    def is_structural(self) -> bool:
+        """True if it has no parameter: it is there or it is not."""
+        return not self.members
+
+    def head(self) -> str:
+        """Equation, symbols, source, neutral values and what reveals it."""
+        neutral = [f"{one.name} = {one.neutral:g}" for one in self.members if one.does]
+        units = {
+            name: f" [{declared.unit}]" * bool(declared.unit) for name, declared in self.numbers().items()
+        }
+        page = {
+            "Equation": self.table.get("equation"),
+            "Symbols": "; ".join(f"{n}{units[n]} {declared.about}" for n, declared in self.numbers().items()),
+            "Source": self.reference,
+            "Neutral": ", ".join(neutral + [f"whatever the {angle}" for angle in self.shape])
+            or "none: it is there or it is not",
+            "Revealed by": self.revealed_by,
+            "Note": self.table.get("note"),
+        }
+        return "\n".join(f"{title:<12}{text}" for title, text in page.items() if text)
+
+    def neutral(self, context: Context) -> Named:
+        """The effect with values that change nothing; choices are the first there are."""
+        count = {"camera": (len(context.cameras),), "moon exposure": (len(context.moon),)}
+        values = {
+            one.name: as_number(
+                np.full(count.get(one.each, ()), context.extinction if one.absolute else one.neutral)
+            )
+            for one in self.members
+        }
+        first = {"cameras": 0, "stars": next(iter(context.sources), "")}
+        chosen = tuple((name, first[of] if isinstance(of, str) else of[0]) for name, of in self.choices)
+        of_moon = any(member.each == "moon exposure" for member in self.members)
+        moon = tuple(zip(context.moon, context.moon_ids, strict=True)) if of_moon else ()
+        return Named(values=values, entry=self, chosen=chosen, moon=moon)
+
+    def of(self, context: Context, **values: Any) -> Named:
+        """As for any effect (`Effect.of`)."""
+        return self.neutral(context).given(context, **values)
+
+    def probes(self, context: Context) -> tuple[tuple[Named, ...], ...]:
+        """Every choice; of a polar pair both directions."""
+        known: Mapping[Any, Sequence[Any]] = {
+            "cameras": range(len(context.cameras)),
+            "stars": context.sources,
+        }
+        names, polar = [name for name, _ in self.choices], self.polar
+        shapes: list[dict[str, Any]] = [{}]
+        if polar is not None:
+            shapes = [{polar.polar: phase / polar.turns} for phase in (0.0, 0.5 * np.pi)]
+        return tuple(
+            tuple(self.of(context, **dict(zip(names, chosen, strict=True)), **shape) for shape in shapes)
+            for chosen in itertools.product(*(known.get(of, of) for _, of in self.choices))
+        )
+
+    def combine(self, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Named:
+        """As for any effect; size and angle from the two directions of a polar pair."""
+        if (polar := self.polar) is None:
+            return group[0].moved(amplitudes)
+        first, second = amplitudes
+        angle = np.arctan2(second, first) / polar.turns
+        return group[0].replaced(**{polar.name: np.hypot(first, second), polar.polar: angle})
+
+
+class Named(Effect):
+    """An effect of an entry. Parameters and choices, by name, are its attributes as well.
+
+    `moon` holds position and EXPOSURE number of every exposure of the Moon that it has a value for.
+    """
+
+    values: dict[str, Array]
+    entry: Entry = eqx.field(static=True)
+    chosen: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    moon: tuple[tuple[int, int], ...] = eqx.field(static=True)
+
+    def __check_init__(self) -> None:
+        chosen = self.choices()
+        for choice, known in self.entry.choices:
+            if not isinstance(known, str) and chosen[choice] not in known:
+                what = f"{choice} {chosen[choice]!r} does not exist"
+                raise ValueError(f"{self.name}: {what}, choose {' or '.join(known)}")
+
+    def __getattr__(self, name: str) -> Any:
+        for inside in (vars(self).get("values", {}), dict(vars(self).get("chosen", ()))):
+            if name in inside:
+                return inside[name]
+        raise AttributeError(f"there is no parameter or choice {name!r}")
+
+    @property
+    def kind(self) -> Any:
+        """Its entry."""
+        return self.entry
+
+    @property
+    def name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """That of its entry."""
+        return self.entry.name
+
+    def labels(self, field: str) -> Sequence[str]:
+        """One value for each camera, or for each exposure of the Moon by its EXPOSURE number."""
+        each = next(member.each for member in self.entry.members if member.name == field)
+        if not each:
+            return (field,)
+        of_cameras = [f"n{k}" for k in range(len(self.values[field]))]
+        return tuple(
+            f"{field}.{one}" for one in (of_cameras if each == "camera" else [n for _, n in self.moon])
+        )
+
+    def choices(self) -> dict[str, Any]:
+        """Those of the entry."""
+        return dict(self.chosen)
+
+    def replaced(self, **values: Any) -> Named:
+        """With other values of parameters, or other choices."""
+        numbers = {name: as_number(values.get(name, old)) for name, old in self.values.items()}
+        chosen = tuple((name, values.get(name, old)) for name, old in self.chosen)
+        return dataclasses.replace(self, values=numbers, chosen=chosen)
+
+    def standard_form(self) -> Named:
+        """Sizes of polar pairs positive, angles in (−π, π] or, of an axis, [0°, 180°)."""
+        if (polar := self.entry.polar) is None:
+            return self
+        size, angle = float(self.values[polar.name]), float(self.values[polar.polar])
+        phase = polar.turns * angle + (np.pi if size < 0 else 0.0)
+        phase = phase % (2.0 * np.pi) if polar.is_axis else np.angle(np.exp(1j * phase))
+        return self.replaced(**{polar.name: abs(size), polar.polar: phase / polar.turns})
+
+    def lacks(self, instrument: Instrument) -> str:
+        """As for any effect; there may be no star that a choice could name."""
+        if "" in self.choices().values():
+            return NO_STANDARD
+        if not (wanted := self.entry.arrangement):
+            return super().lacks(instrument)
+        known = alternatives(dataclasses.replace(instrument, effects=()))
+        return "" if wanted in known else str(unknown_name("arrangement", wanted, known))
+
+    # ------------------------------------------------------------------------------------ what it does
+
+    def patch(self, instrument: Instrument) -> Instrument:
+        """All changes at their sizes."""
+        if self.entry.arrangement:
+            return changed(instrument, self.entry.arrangement)
+        terms = [
+            (change, size * value)
+            for member in self.entry.members
+            for value, each in zip(
+                self._values(member, instrument), self._parts(member, instrument), strict=False
+            )
+            for size, change in each
+        ]
+        return patched(instrument, terms)
+
+    def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
+        """The changes of each amplitude, with what one unit of it is of them."""
+        return tuple(
+            tuple((float(size), change) for size, change in each)
+            for member in self.entry.members
+            for each in self._parts(member, instrument)
+        )
+
+    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+        """The changes as the grammar of a diagnosis writes them."""
+        return tuple(
+            _behind(Change.parsed(text), instrument).text
+            for member in self.entry.members
+            for said in member.said
+            for each in self._each(member, said, instrument)
+            for text in each
+        )
+
+    @property
+    def stated(self) -> tuple[str, ...]:
+        """The changes of the numbers that its parameters are themselves."""
+        return tuple(text for member in self.entry.members if member.absolute for text in member.does)
+
+    def _values(self, member: Member, instrument: Instrument) -> list[Scalar]:
+        value = self.values[member.name]
+        if member.absolute:
+            polariser = instrument.polariser
+            value = value - (EXTINCTION if polariser is None else polariser.extinction)
+        return list(value) if jnp.ndim(value) else [value]
+
+    def _parts(self, member: Member, instrument: Instrument) -> list[list[tuple[Any, Change]]]:
+        """For each value of a parameter the changes, with their sizes for one unit of it."""
+        weights: tuple[Any, ...] = (1.0,) * len(member.does)
+        if member.polar:
+            angle = self.values[member.polar]
+            phase = member.turns * (angle if isinstance(angle, Tracer) else np.asarray(angle))
+            of = jnp if isinstance(phase, jax.Array) else np  # known ones need no program
+            weights = (of.cos(phase), of.sin(phase))
+        texts = [self._each(member, text, instrument) for text in member.does]
+        return [
+            [
+                (size * weight, Change.parsed(text))
+                for size, weight, some in zip(member.per_unit, weights, parts, strict=True)
+                for text in some
+            ]
+            for parts in zip(*texts, strict=True)
+        ]
+
+    def _each(self, member: Member, text: str, instrument: Instrument) -> list[list[str]]:
+        """The texts that one stands for, for each value of a parameter."""
+        chosen = self.choices()
+        if "camera" in chosen:
+            names = instrument.cameras.names
+            chosen["camera"] = names[numbered_camera(self.name, chosen["camera"], names)]
+        text = text.format_map({name: str(value).replace(" ", "_") for name, value in chosen.items()})
+        every = list(_expanded(text, instrument))
+        if member.each == "camera":
+            return [[one] for one in every]
+        if member.each:
+            return [[f"{one} * exposure {at}" for one in every] for at, _ in self.moon]
+        return [every]
+
+
+def _expanded(text: str, instrument: Instrument) -> Iterator[str]:
+    head, every, tail = text.partition("every ")
+    if not every:
+        yield text
+        return
+    name, blank, rest = tail.partition(" ")
+    for number, place in enumerate(EVERY[name](instrument)):
+        origin = instrument.cameras.orthogonal[number] if name == "camera" else 0
+        yield f"{head.replace(' of orthogonal ', f' of {instrument.cameras.names[origin]} ')}{place}{blank}{rest}"
+
+
+def _behind(change: Change, instrument: Instrument) -> Change:
+    """The same place told from the other side, where there is an element ahead of it."""
+    if change.where != "ahead of" or change.kind.startswith("displacement"):
+        return change
+    arm, _, name = change.place.rpartition(".")
+    path = next((one.path for one in instrument.arms if one.name == arm), instrument.path)
+    at = path.index(name) if name in path else 0
+    polariser = instrument.polariser
+    if not at or (polariser is not None and name == polariser.name):
+        return change
+    before = f"{arm}.{path[at - 1]}" if arm else path[at - 1]
+    return dataclasses.replace(change, where="behind", place=before)
