@@ -92,7 +92,7 @@ def test_resume_refuses_what_has_changed(scene: Scene, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="other settings"):
         sample(result, dataclasses.replace(options, seed=4), folder=tmp_path / "chain", resume=True)
     changed = model.change(model.names[model.free[0]], prior=(0.81, 0.02))
-    likelihood = Likelihood.of(result.calset, changed, points_per_chunk=result.likelihood.layout.chunk)
+    likelihood = Likelihood.of(result.calset, changed, batch=result.likelihood.layout.batch)
     other = dataclasses.replace(result, likelihood=likelihood)
     with pytest.raises(DataError, match="other priors"):
         sample(other, options, folder=tmp_path / "chain", resume=True)

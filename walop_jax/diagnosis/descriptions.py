@@ -22,13 +22,15 @@ from walop_jax.diagnosis.exact import Trial, try_model
 from walop_jax.diagnosis.findings import Choice
 from walop_jax.diagnosis.policy import Policy
 from walop_jax.fit.refit import FitResult, Vector
-from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import JOINED, alternatives, other_curves
 from walop_jax.model.effects import Context, OtherDescription
 from walop_jax.model.instrument import NoSuchPlaceError
 from walop_jax.model.specification import Model, model_without, with_effects
+
+CHOICE_ROWS = 6000
+"""(Exposure, point) pairs on which other descriptions of an instrument are compared before any of them is fitted."""
 
 NO_DIFFERENCE = 1e-6  # change of the residuals, in standard deviations, that is none
 
@@ -86,7 +88,7 @@ def _screened(
     result: FitResult, sentences: Iterable[str], context: Context
 ) -> Iterator[tuple[Choice, float, Vector]]:
     """Each change that is one, with what it leaves, its gain in χ² and its place: the better of two places."""
-    every = max(1, limits.CHOICE_ROWS // max(len(result.calset.exposures), 1))
+    every = max(1, CHOICE_ROWS // max(len(result.calset.exposures), 1))
     calset = thinned(result.calset, every, neighbours=1)
     start = result.model.start.copy()  # but effects as they have been fitted
     for name in result.model.effect_names:

@@ -55,7 +55,6 @@ LONG = 60.0  # days without a night that are worth a remark
 FAR = 0.02  # standard errors from the solution up to which a night need not be linearised again
 EXACT = 1e-3  # standard errors by which linearising all nights again may move the solution at most
 ROUNDS = 6
-MANY = 20  # sets from which on programs are better compiled for longer
 FILES = (NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY)
 """The files of a survey."""
 PARTIAL = "partial"
@@ -100,7 +99,7 @@ def stack(
     opened = [_opened(one, catalogue) for one in nights]
     fits = [one for one in (like, *(some.fit for some in opened)) if one is not None]
     held = [Calibration.from_fit(one) if isinstance(one, FitResult) else one for one in fits[:1]]
-    maker = Maker(held[0].rebuilt() if held else None, partial, len(opened) < MANY)
+    maker = Maker(held[0] if held else None, partial, len(opened))
     makers = Makers(maker, executor)
     made: list[Night] = []
     at_hand: dict[tuple[str, int], Data] = {}

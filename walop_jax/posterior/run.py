@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.product import read_calibration
+from walop_jax.calibration.calibration import Calibration, Product
+from walop_jax.calibration.product import read_product
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_file import model_for
@@ -59,9 +59,9 @@ class Run(RunFolder, Result):
     data: Sequence[str | os.PathLike[str]] = ()
 
     @functools.cached_property
-    def product(self) -> Calibration | None:
-        """The calibration as its file holds it, its model not rebuilt."""
-        return read_calibration(self.folder, self.catalogue, rebuild=False) if PRODUCT in self else None
+    def product(self) -> Product | None:
+        """Contents of the file of the calibration, its model not rebuilt."""
+        return read_product(self.folder) if PRODUCT in self else None
 
     @functools.cached_property
     def calibration(self) -> Calibration | None:
@@ -69,7 +69,7 @@ class Run(RunFolder, Result):
         if self.product is None:
             return None
         with errors_naming(self.folder / PRODUCT):
-            return self.product.rebuilt()
+            return self.product.rebuilt(tuple(self.catalogue))
 
     @property
     def rebuilt(self) -> Calibration:
@@ -118,7 +118,7 @@ class Run(RunFolder, Result):
         those of the calibration were, and the verdict is its verdict.
         """
         calibration, calset = self.rebuilt, self.calset
-        text = "\n".join(calibration.model_lines) if model_text is None else model_text
+        text = "\n".join(calibration.product.model_lines) if model_text is None else model_text
         model = model_for(calset, text, calibration.design, self.catalogue)
         if model.names != calibration.model.names:
             advice = "run walop-jax refit with this model first"

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.calibration import Calibration, Product
 from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.user_tables import read_input_table
@@ -98,12 +98,12 @@ class FigureSource:
         return self.held[name]
 
     @property
-    def product(self) -> Calibration | None:
-        """The calibration as its file holds it, which needs no model; None without one."""
+    def product(self) -> Calibration | Product | None:
+        """Contents of the file of the calibration, or the calibration in memory; None without either."""
         return self.held.get(PRODUCT) if self.run is None else self.run.product
 
     @property
-    def stored(self) -> Calibration:
+    def stored(self) -> Calibration | Product:
         """The same; `DataError` without one."""
         if self.run is not None:
             self.run.wanted(PRODUCT)
@@ -128,7 +128,8 @@ class FigureSource:
     def prior_width(self) -> Mapping[str, float]:
         """Widths of the priors by name, as far as they are known."""
         if self.sample is None:
-            return {} if self.product is None else self.product.prior_width
+            parameters = () if self.product is None else self.product.parameters
+            return {p.name: np.nan if p.prior is None else p.prior[1] for p in parameters}
         likelihood = self.sample.likelihood
         return {} if likelihood is None else {p.name: p.width or np.nan for p in likelihood.model.parameters}
 
@@ -179,7 +180,7 @@ class RunContents:
 
     source: FigureSource
     summary: dict[str, Any]
-    product: Calibration | None
+    product: Calibration | Product | None
     diagnosis: dict[str, Any] | None
     figure_data: DiagnosisFigureData | None
     sample: dict[str, Any] | None
