@@ -154,7 +154,6 @@ def test_a_chain_comes_back_and_refuses_what_is_not_its_own(tmp_path: Path) -> N
 
 SCRIPT = """
 import sys, numpy as np
-from walop_jax.posterior.emcee import Emcee
 from walop_jax.posterior.files import Chain
 from walop_jax.posterior.result import Options
 from walop_jax.posterior.samplers import Density

@@ -10,15 +10,15 @@ import pytest
 
 WRITERS = {
     "posterior": """
-        import arviz
+        from xarray import DataTree
+        from walop_jax.posterior.draws import group_of_draws
         from walop_jax.posterior.files import write_posterior
         class Sample:
-            def to_arviz(self):
-                return arviz.from_dict(posterior={"a": np.ones((4, 20000))})
+            def groups(self):
+                return DataTree.from_dict({"posterior": group_of_draws({"a": np.ones((4, 20000))})})
         write = lambda path: write_posterior(path, Sample())
     """,
     "chain": """
-        from walop_jax.posterior.emcee import Emcee
         from walop_jax.posterior.files import Chain
         from walop_jax.posterior.samplers import Stretch
         def write(path):

@@ -203,7 +203,8 @@ def test_arviz_finds_what_it_looks_for(scene: Scene, posterior: PosteriorSample)
         -0.5 * scene.target.data(posterior.mean[scene.target.free])
         - 0.5 * scene.target.measured * np.log(2 * np.pi) - np.log(block.sigma[block.used]).sum()
     )  # fmt: skip
-    assert az.loo(data).p_loo == pytest.approx(worth, rel=0.35)
+    loo = az.loo(data)
+    assert (loo.p if hasattr(loo, "p") else loo.p_loo) == pytest.approx(worth, rel=0.35)  # ArviZ 1, 0
 
 
 def test_matrix_by_draws_agrees_with_the_covariance(

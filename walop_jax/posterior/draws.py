@@ -1,4 +1,4 @@
-"""Draws of a posterior as `posterior.nc` holds them, ArviZ InferenceData, and calibrations that use them.
+"""Draws of a posterior as `posterior.nc` holds them, in the groups of ArviZ, and calibrations that use them.
 
 posterior.nc   draws of every coefficient that varies. Walkers of an ensemble are not independent chains, so a chain
                here is an ensemble: its draws are all walkers at steps spread evenly over the run. R-hat and effective
@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import importlib.metadata
 import json
 import os
 import warnings
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -22,18 +23,32 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import InputFile
 from walop_jax.io.errors import fail
 
+if TYPE_CHECKING:  # slow to import, and most commands read no posterior
+    from xarray import Dataset, DataTree
+
 DRAWS = 200  # of a posterior, that stand for it in matrices
 INFLATION = "noise.ln_f"
 _AGAIN = "run walop-jax sample again"
 
 
-def arviz() -> Any:
-    """ArviZ, without the announcement that it makes when it is imported."""
+def as_arviz(groups: DataTree) -> Any:
+    """Groups of a posterior as the installed ArviZ takes them: InferenceData (before ArviZ 1), or the tree itself."""
+    if int(importlib.metadata.version("arviz").split(".")[0]) >= 1:
+        return groups
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+        warnings.simplefilter("ignore")  # the announcement that it makes when it is imported
         import arviz
+    data: dict[str, Any] = {name: node.to_dataset() for name, node in groups.children.items()}
+    return arviz.InferenceData(**data)
 
-    return arviz
+
+def group_of_draws(draws: Mapping[str, Float[np.ndarray, "c d"]]) -> Dataset:
+    """Draws of quantities as a group: chains × draws, by number."""
+    from xarray import Dataset
+
+    chains, count = next(iter(draws.values())).shape
+    place = {"chain": np.arange(chains), "draw": np.arange(count)}
+    return Dataset({name: (("chain", "draw"), values) for name, values in draws.items()}, coords=place)
 
 
 def digest(*parts: Any) -> str:
@@ -52,12 +67,14 @@ def digest_of_fit(inputs: Sequence[InputFile], names: Sequence[str], values: np.
     return digest(sorted(entry.sha256 for entry in inputs), list(names), np.asarray(values, float))
 
 
-def read_inference_data(path: str | os.PathLike[str]) -> Any:
-    """A `posterior.nc` as ArviZ InferenceData; `DataError` if it cannot be read."""
+def read_groups(path: str | os.PathLike[str]) -> DataTree:
+    """The groups of a `posterior.nc`; `DataError` if it cannot be read."""
+    import xarray
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return arviz().from_netcdf(str(path), engine="h5netcdf")
+            return xarray.open_datatree(path, engine="h5netcdf").load()
     except Exception as error:
         raise fail(f"cannot be read: {error}", file=path, advice=_AGAIN) from error
 
@@ -70,12 +87,12 @@ def read_draws(
     `fit` is the `digest_of_fit` that was sampled around; None: whichever. Raises `DataError` for a file that cannot be
     read, is of another model or another fit, or may not be trusted.
     """
-    data = read_inference_data(path)
+    groups = read_groups(path)
     try:
-        posterior = data.posterior
+        posterior = groups["posterior"]
         fixed = json.loads(posterior.attrs["fixed"])
         trusted = bool(posterior.attrs["trusted"])
-        held = {str(name): np.asarray(posterior[name].values).ravel() for name in posterior.data_vars}
+        held = {name: np.asarray(posterior[name].values).ravel() for name in map(str, posterior.data_vars)}
     except Exception as error:
         raise fail(f"cannot be read: {error}", file=path, advice=_AGAIN) from error
     held.pop(INFLATION, None)

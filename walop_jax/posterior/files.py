@@ -37,13 +37,13 @@ def write_posterior(path: str | os.PathLike[str], sample: PosteriorSample) -> No
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 
-    data = sample.to_arviz()
+    groups = sample.groups()
 
     def fill(file: h5py.File) -> None:
         with warnings.catch_warnings(), h5netcdf.File(file, "a") as content:
             warnings.simplefilter("ignore")
-            for group in data.groups():
-                data[group].dump_to_store(H5NetCDFStore(content, group=group, mode="a"))
+            for name, node in groups.children.items():
+                node.to_dataset().dump_to_store(H5NetCDFStore(content, group=name, mode="a"))
 
     _write_hdf5(path, fill)
 

@@ -27,7 +27,7 @@ from walop_jax.io.text import two_digits
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Effect
-from walop_jax.posterior.draws import read_inference_data
+from walop_jax.posterior.draws import read_groups
 
 VERDICTS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "diagnosis": lambda d: str(d["verdict"]),
@@ -81,7 +81,7 @@ class Run(RunFolder, Result):
     @functools.cached_property
     def posterior(self) -> Any:
         """The draws as ArviZ InferenceData."""
-        return read_inference_data(self.folder / POSTERIOR) if POSTERIOR in self else None
+        return read_groups(self.folder / POSTERIOR) if POSTERIOR in self else None
 
     @functools.cached_property
     def calset(self) -> CalibrationSet:

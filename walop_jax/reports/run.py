@@ -73,7 +73,7 @@ class FigureSource:
         if isinstance(given, Run):
             return cls(given, **options)
         if isinstance(given, PosteriorSample):
-            return cls(held={POSTERIOR: given.to_arviz()}, sample=given, **options)
+            return cls(held={POSTERIOR: given.groups()}, sample=given, **options)
         held = {FIGURE_DATA: figure_data(given)} if isinstance(given, Diagnosis) else {}
         fit = given.after if isinstance(given, Diagnosis) else given
         if isinstance(fit, FitResult):
