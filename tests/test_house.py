@@ -130,7 +130,16 @@ def test_no_room_calls_upward_through_a_string():
                     calls.add((module.split(".", 1)[1], str(node.value).split(".", 1)[1]))
     assert calls == set()
 
-MOST_REACHED = {}
+
+MOST_REACHED = {
+    "model.light": 6000,
+    "likelihood.flux": 100,
+    "diagnosis.score": 800,
+    "commands.matrix": 22400,
+    "commands.refit": 28400,
+    "commands.diagnose": 30700,
+    "commands.apply": 28700,
+}
 """Lines that one must be able to follow from a module, all its imports followed: these may only become fewer."""
 
 
@@ -172,7 +181,25 @@ def test_the_core_is_reached_without_the_rest(entry):
     assert reached(entry) <= MOST_REACHED[entry]
 
 
-MOST_LINES = {}
+MOST_LINES = {
+    "io": 1650,
+    "instruments": 250,
+    "data": 4400,
+    "sky": 250,
+    "model": 9000,
+    "likelihood": 3600,
+    "simulation": 900,
+    "fit": 2200,
+    "calibration": 2700,
+    "posterior": 2400,
+    "science": 4950,
+    "diagnosis": 7500,
+    "nights": 2800,
+    "plans": 2350,
+    "paper": 860,
+    "reports": 2750,
+    "commands": 4600,
+}
 """Lines of each room: raising one is a decision of its own."""
 
 
