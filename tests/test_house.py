@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import sys
 import tomllib
@@ -128,6 +129,84 @@ def test_no_room_calls_upward_through_a_string():
                 if target in ROOMS and ROOMS.index(target) > ROOMS.index(room):
                     calls.add((module.split(".", 1)[1], str(node.value).split(".", 1)[1]))
     assert calls == set()
+
+
+MOST_REACHED = {
+    "model.light": 6000,
+    "likelihood.flux": 100,
+    "diagnosis.score": 800,
+    "commands.matrix": 22400,
+    "commands.refit": 28400,
+    "commands.diagnose": 30700,
+    "commands.apply": 28700,
+}
+"""Lines that one must be able to follow from a module, all its imports followed: these may only become fewer."""
+
+
+class _AtRunTime(ast.NodeTransformer):
+    """Without the imports of type checkers."""
+
+    def visit_If(self, node: ast.If) -> ast.AST | None:
+        return None if "TYPE_CHECKING" in ast.dump(node.test) else self.generic_visit(node)
+
+
+@functools.cache
+def followed() -> dict[str, set[str]]:
+    """Modules that each module of the package imports, inside functions too; public names count as their homes."""
+    stub = ast.parse((PACKAGE / "__init__.pyi").read_text())
+    public = {a.asname: n.module for n in stub.body if isinstance(n, ast.ImportFrom) for a in n.names}
+    modules, edges = {module_name(path): path for path in files()}, {}
+    for module, path in modules.items():
+        tree = _AtRunTime().visit(ast.parse(path.read_text()))
+        names = [name for _, name in imports(tree, module, path.name == "__init__.py")]
+        names = [str(public.get(name.removeprefix("walop_jax."), name)) for name in names]
+        homes = (name if name in modules else name.rpartition(".")[0] for name in names)
+        edges[module] = {home for home in homes if home in modules and home != PACKAGE.name}
+    return edges
+
+
+def reached(entry: str) -> int:
+    """Lines of a module and of all that it imports, and these import."""
+    seen, waiting = set[str](), [f"walop_jax.{entry}"]
+    while waiting:
+        module = waiting.pop()
+        if module not in seen:
+            seen.add(module)
+            waiting += followed()[module]
+    return sum(len(path.read_text().splitlines()) for path in files() if module_name(path) in seen)
+
+
+@pytest.mark.parametrize("entry", MOST_REACHED)
+def test_the_core_is_reached_without_the_rest(entry):
+    assert reached(entry) <= MOST_REACHED[entry]
+
+
+MOST_LINES = {
+    "io": 1650,
+    "instruments": 250,
+    "data": 4400,
+    "sky": 250,
+    "model": 9000,
+    "likelihood": 3600,
+    "simulation": 900,
+    "fit": 2200,
+    "calibration": 2700,
+    "posterior": 2400,
+    "science": 4950,
+    "diagnosis": 7500,
+    "nights": 2800,
+    "plans": 2350,
+    "paper": 860,
+    "reports": 2750,
+    "commands": 4600,
+}
+"""Lines of each room: raising one is a decision of its own."""
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_rooms_keep_to_their_size(room):
+    lines = sum(len(path.read_text().splitlines()) for path in files() if room_of(module_name(path)) == room)
+    assert lines <= MOST_LINES[room]
 
 
 def questions(tree: ast.AST) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import walop_jax as walop
-from walop_jax.diagnosis.candidates import applicable
+from walop_jax.diagnosis.hypotheses import applicable
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.effects.catalogue import EFFECTS, own_entries
 from walop_jax.model.instrument import nominal_instrument

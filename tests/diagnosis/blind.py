@@ -25,13 +25,14 @@ import numpy as np
 from linear_judge import Linear
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import candidates
-from walop_jax.diagnosis.candidates import Probe, probes
+from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Measured
-from walop_jax.diagnosis.examination import Evidence, Examination, Ranked, examine
+from walop_jax.diagnosis.exact import Trial
+from walop_jax.diagnosis.examination import Evidence, Examination, examine
+from walop_jax.diagnosis.hypotheses import Probe, Ranked, probes, said_by
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import ScoreSpace, separations
-from walop_jax.diagnosis.search import Trial, search
+from walop_jax.diagnosis.search import search
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.flux import project_flux
@@ -196,12 +197,12 @@ class Blind:
         self.rng = np.random.default_rng(seed)
         wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
         self.context, self.template = effect_context(model.template, calset.exposures), model.template
-        every = candidates.sentences(model.template, calset.exposures, len(calset.points))
+        every = grammar.sentences(model.template, calset.exposures, len(calset.points))
         examination = examined(result, wanted, self.rng, None, every)
         self.sentences = examination.sentences
         self.probes = list(examination.probes)
         self.in_sentences = {p.name: set(p.group[0].in_sentences(model.template)) for p in self.probes}
-        texts = [text for probe in self.sentences for text in candidates.said_by(probe)]
+        texts = [text for probe in self.sentences for text in said_by(probe)]
         self.in_sentences |= {name: truth_of(name, texts) for name in OUTSIDE}
         self.effect_of = {p.name: p.effect.name for p in self.probes}
         self.space = examination.bare
@@ -213,9 +214,7 @@ class Blind:
         self.said = {
             text: column
             for probe in self.sentences
-            for text, column in zip(
-                candidates.said_by(probe), examination.said[probe.name].columns.T, strict=True
-            )
+            for text, column in zip(said_by(probe), examination.said[probe.name].columns.T, strict=True)
         }
         for name, shape in outside(examination.design.measured, self.said):
             column = examination.design.projector(examination.design.stacked([shape[:, None]])[:, 0])
@@ -303,7 +302,7 @@ class Blind:
         """What is asked of a scene, without what is not in the catalogue; the residuals are those of the design."""
         catalogue = [effect for effect in EFFECTS if effect.name not in removed]
         names = [p for p in self.probes if p.effect.name not in removed]
-        said, parts = candidates.beside_names(self.sentences, catalogue, self.context, self.template)
+        said, parts = grammar.beside_names(self.sentences, catalogue, self.context, self.template)
         asked = [*(p.name for p in (*names, *said)), *(p.name for p, _ in parts), *self.patterns]
         space = self._behind_nuisance.subset(asked)
         if not removed:

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.diagnosis.candidates import Probe, all_candidates, probes
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import Diagnosis
+from walop_jax.diagnosis.hypotheses import Probe, all_candidates, probes
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from walop_jax.diagnosis.search import Trial
+from walop_jax.diagnosis.exact import Trial
 
 
 class Linear:

@@ -18,8 +18,8 @@ import numpy as np  # noqa: E402
 
 import walop_jax as walop  # noqa: E402
 from walop_jax.calibration.matrix import effect_slopes, first_setting  # noqa: E402
-from walop_jax.diagnosis.candidates import probes  # noqa: E402
 from walop_jax.diagnosis.detection_limits import detection_limits  # noqa: E402
+from walop_jax.diagnosis.hypotheses import probes  # noqa: E402
 from walop_jax.model.specification import effect_context  # noqa: E402
 from walop_jax.simulation.observing_plan import polariser_turn  # noqa: E402
 

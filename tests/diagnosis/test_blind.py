@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.linalg import orth
 
-from walop_jax.diagnosis.candidates import said_by
+from walop_jax.diagnosis.hypotheses import said_by
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenes import PLAN
 
-from walop_jax.diagnosis.alternatives import other_descriptions
+from walop_jax.diagnosis.descriptions import other_descriptions
 from walop_jax.diagnosis.findings import Choice, document
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose

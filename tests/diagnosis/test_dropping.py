@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scenes import PLAN
 
-from walop_jax.diagnosis import search, workflow
+from walop_jax.diagnosis import workflow
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.figure_data import figure_data
@@ -19,6 +19,7 @@ from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import FreeForm, effect_by_name
+from walop_jax.model.specification import model_without
 from walop_jax.simulation.simulate import simulate
 
 ZERO, WOBBLE, LEAKAGE, DRIFT = map(
@@ -122,7 +123,7 @@ def test_after_a_drop_several_steps_follow_one_another():
     assert "clp_zero is no longer needed" in told
     assert [step.effect for step in found.steps] == ["clp_wobble", "camera_leakage"]
     assert lead_from_the_first_fit_to_the_last(found)
-    model = search.model_without(found.after.model, "camera_leakage")
+    model = model_without(found.after.model, "camera_leakage")
     alone = fit(Likelihood.of(found.after.calset, model))
     assert found.steps[0].chi2_after == pytest.approx(alone.chi2, rel=1e-6)
     assert [list(step.far) for step in found.steps] == [["amplitude"], []]

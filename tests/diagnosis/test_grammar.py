@@ -7,8 +7,8 @@ import scenes
 from own_instrument import OWN
 
 from walop_jax.data.records import Position
-from walop_jax.diagnosis import candidates
-from walop_jax.diagnosis.candidates import all_candidates, applicable, probes
+from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis.hypotheses import all_candidates, applicable, probes
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.instruments.description import parsed
@@ -52,7 +52,7 @@ def laid():
 @pytest.fixture(scope="module")
 def said(laid, request):
     """Columns of some listed groups; of all that there are where there is time."""
-    found = candidates.sentences(laid.model.template, laid.calset.exposures, len(laid.calset.points))
+    found = grammar.sentences(laid.model.template, laid.calset.exposures, len(laid.calset.points))
     if not request.config.getoption("--long"):
         found = [probe for probe in found if probe.name in QUICK]
         assert len(found) == len(QUICK)
@@ -90,8 +90,8 @@ def test_names_are_sentences(laid, said):
 def test_sentences_that_have_a_name_are_left_to_it(laid):
     template = laid.model.template
     context = effect_context(template, laid.calset.exposures)
-    every = candidates.sentences(template, laid.calset.exposures, len(laid.calset.points))
-    left = {p.name for p in candidates.beside_names(every, EFFECTS, context, template)[0]}
+    every = grammar.sentences(template, laid.calset.exposures, len(laid.calset.points))
+    left = {p.name for p in grammar.beside_names(every, EFFECTS, context, template)[0]}
     gone = {p.name for p in every} - left
     assert "turn of polariser" in gone
     assert "retardance q behind collimator; retardance u behind collimator" in gone
@@ -104,16 +104,16 @@ def test_parts_of_effects_stand_for_them(laid):
     """One Moon patch of all, the light in one camera of four: no sentences of their own, but no longer than one."""
     template = laid.model.template
     context = effect_context(template, laid.calset.exposures)
-    every = candidates.sentences(template, laid.calset.exposures, len(laid.calset.points))
+    every = grammar.sentences(template, laid.calset.exposures, len(laid.calset.points))
     found = {
         p.name: {e.name for e in effects}
-        for p, effects in candidates.beside_names(every, EFFECTS, context, template)[1]
+        for p, effects in grammar.beside_names(every, EFFECTS, context, template)[1]
     }
     assert found["light in O1"] == {"pedestal"}
     patches = [name for name in found if name.startswith("polarisation q of sky * exposure")]
     assert len(patches) == 4
     assert all(found[name] == {"moon_patch"} for name in patches)
-    left = {p.name for p in candidates.beside_names(every, EFFECTS, context, template)[0]}
+    left = {p.name for p in grammar.beside_names(every, EFFECTS, context, template)[0]}
     assert not left & set(found)
     assert "turn of polariser" not in found, "this is clp_zero as a whole"
 
@@ -126,7 +126,7 @@ def test_grammar_of_another_instrument():
     instrument = build(parsed(OWN, "own.toml"))
     window = Position(np.ones(5, bool), np.array([0.0, 10.0, 20.0, 40.0, 80.0]))
     exposures = builders.exposures(*turns).placed(WIN=window)
-    said = {p.name for p in candidates.sentences(instrument, exposures, 25)}
+    said = {p.name for p in grammar.sentences(instrument, exposures, 25)}
     assert "retardance q behind window; retardance u behind window" in said
     assert "depolarisation of window * cos 2 WIN; depolarisation of window * sin 2 WIN" in said
     assert "axis of main.plate.second" in said
@@ -137,13 +137,13 @@ def test_grammar_of_another_instrument():
 def test_steps_part_the_exposures_evenly_and_are_dated_between():
     """Midway between exposures; of many exposures every fourth time at first, then all times of the neighbourhood."""
     few = builders.exposures(*({"mjd": 61000.0 + hour / 24.0} for hour in (0, 1, 3, 4)))
-    assert candidates.starts_of_steps(few) == pytest.approx([0.5, 2.0, 3.5], abs=1e-6)
-    assert candidates.between(2.0, candidates.end_of(few)) == "hours 2.0 to 4.5"
+    assert grammar.starts_of_steps(few) == pytest.approx([0.5, 2.0, 3.5], abs=1e-6)
+    assert grammar.between(2.0, grammar.end_of(few)) == "hours 2.0 to 4.5"
     instrument = nominal_instrument("WALOP-SOUTH")
     many = builders.exposures(
         *({"mjd": 61000.0 + hour / 24.0, "clp_angle": 3.0 * hour} for hour in range(65))
     )
-    said = [p.group[0].sentences[0] for p in candidates.sentences(instrument, many, 25)]
+    said = [p.group[0].sentences[0] for p in grammar.sentences(instrument, many, 25)]
     steps = [text for text in said if text.startswith("axis of half1.plate * hours ")]
     assert len(steps) == 16
     assert (steps[0], steps[-1]) == (
@@ -156,7 +156,7 @@ def test_steps_part_the_exposures_evenly_and_are_dated_between():
     assert spells[-1] == "turn of polariser * hours 30.5 to 62.5"
 
     def near(text: str, end: int) -> list[str]:
-        return [change.factors[0] for change in candidates.retimed(Change.parsed(text), many, end)]
+        return [change.factors[0] for change in grammar.retimed(Change.parsed(text), many, end)]
 
     assert near(steps[5], 0) == [f"hours {hour}.5 to 64.5" for hour in range(18, 27)]
     assert near(steps[5], 1) == []

@@ -11,7 +11,7 @@ from scipy import integrate, stats
 
 from walop_jax.calibration.accuracy import largest_change
 from walop_jax.data.records import Position
-from walop_jax.diagnosis import search, workflow
+from walop_jax.diagnosis import exact, search, workflow
 from walop_jax.diagnosis.design import Design, Measured, strata
 from walop_jax.diagnosis.examination import Evidence, upper_limit
 from walop_jax.diagnosis.findings import Diagnosis
@@ -42,9 +42,9 @@ def leaking():
 def test_density_at_neutral_is_the_evidence_of_two_fits(leaking):
     """Savage–Dickey against Laplace evidence of the models with and without: both Gaussian, so alike."""
     _, _, base, extended = leaking
-    by_fits = search.log_evidence_ratio(base, extended)
+    by_fits = exact.log_evidence_ratio(base, extended)
     assert by_fits > 5.0
-    assert search.evidence_of_presence(extended, "camera_leakage") == pytest.approx(by_fits, abs=0.5)
+    assert exact.evidence_of_presence(extended, "camera_leakage") == pytest.approx(by_fits, abs=0.5)
 
 
 def test_evidence_of_many_numbers_is_the_mean_over_fits_with_priors_of_four_widths(leaking):
@@ -67,8 +67,8 @@ def test_evidence_of_many_numbers_is_the_mean_over_fits_with_priors_of_four_widt
         evidence.append(0.5 * gain - len(added) * np.log(scale * 0.005))
     extended = fit(Likelihood.of(calset, with_patches))
     mean = np.logaddexp.reduce(evidence) - np.log(4.0)
-    assert search.log_evidence_ratio(base, extended) == pytest.approx(mean, abs=0.05)
-    assert search.evidence_of_presence(extended, "moon_patch") == pytest.approx(mean, abs=0.05)
+    assert exact.log_evidence_ratio(base, extended) == pytest.approx(mean, abs=0.05)
+    assert exact.evidence_of_presence(extended, "moon_patch") == pytest.approx(mean, abs=0.05)
     assert mean > evidence[0] + 5.0
 
 
@@ -80,13 +80,13 @@ def test_signature_is_what_taking_the_effect_away_does(leaking):
     kept = [extended.model.index(name) for name in base.model.names]
     column = own_columns(bare, extended.values[kept], probe)[:, 0]
     share, _ = extended.value("camera_leakage.share")
-    found = search.signature(extended, "camera_leakage", context)
+    found = exact.signature(extended, "camera_leakage", context)
     np.testing.assert_allclose(found, -column * share, atol=2e-2 * np.abs(found).max())
 
 
 def test_taking_it_out_again_gives_the_fit_without(leaking):
     _, _, base, extended = leaking
-    again = search.refit_without(extended, "camera_leakage")
+    again = exact.refit_without(extended, "camera_leakage")
     assert again.model.names == base.model.names
     assert again.chi2 == pytest.approx(base.chi2, abs=1e-3)
 
@@ -98,11 +98,11 @@ def test_a_prior_is_widened_only_where_the_data_refute_it(leaking):
     for away, expected in ((3.9, width), (-3.9, width), (12.0, 12.0 * width), (-12.0, 12.0 * width)):
         values = extended.values.copy()
         values[at] = mean + away * width
-        wide = search.with_refuted_priors_widened(model, values, "camera_leakage")
+        wide = exact.with_refuted_priors_widened(model, values, "camera_leakage")
         assert wide["camera_leakage.share"].prior == (mean, pytest.approx(expected))
         assert wide.change("camera_leakage.share", prior=(mean, width)) == model
         widened = dataclasses.replace(extended.likelihood, model=wide)
-        beyond = search.beyond_prior(
+        beyond = exact.beyond_prior(
             dataclasses.replace(extended, likelihood=widened, values=values), "camera_leakage"
         )
         assert beyond == ({"share": pytest.approx(12.0)} if abs(away) > 4.0 else {})
@@ -311,7 +311,7 @@ def test_decided_keeps_every_trial_once(monkeypatch):
         return found
 
     def trial(name, evidence, effect):
-        return search.Trial(effect, evidence, 0.0, False, fit=result(name))
+        return exact.Trial(effect, evidence, 0.0, False, fit=result(name))
 
     monkeypatch.setattr(workflow, "fit", lambda likelihood, **_: result(likelihood))
     names = [effect_by_name(name) for name in ("blemish", "clp_zero", "hwp1_axis")]

@@ -14,7 +14,7 @@ from small_run import SEED, SMALL
 from walop_jax.data.inspection import inspect
 from walop_jax.data.records import CalibrationSet, Position
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.diagnosis.alternatives import _angles, mixups
+from walop_jax.diagnosis.readings import _angles, mixups
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import FitResult

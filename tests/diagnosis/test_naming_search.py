@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from linear_judge import Linear
 
-from walop_jax.diagnosis.candidates import Probe
 from walop_jax.diagnosis.examination import Evidence
+from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import Projector, ScoreSpace
 from walop_jax.diagnosis.search import search

@@ -18,12 +18,11 @@ from walop_jax.calibration.matrix import first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import stated_conditions as conditions
-from walop_jax.diagnosis.alternatives import with_places
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.detection_limits import condition_limits
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
-from walop_jax.diagnosis.limits_found import PROBABILITY
-from walop_jax.diagnosis.policy import POLICY
+from walop_jax.diagnosis.policy import POLICY, PROBABILITY
+from walop_jax.diagnosis.readings import with_places
 from walop_jax.diagnosis.stated_conditions import (
     Singles,
     condition_scores,

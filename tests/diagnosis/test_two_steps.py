@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from walop_jax.diagnosis.candidates import Probe
-from walop_jax.diagnosis.examination import Ranked, name_first
+from walop_jax.diagnosis.examination import name_first
+from walop_jax.diagnosis.hypotheses import Probe, Ranked
 from walop_jax.diagnosis.score import Score
 from walop_jax.model.effects import Described, effect_by_name
 

@@ -11,10 +11,10 @@ from scenes import PLAN
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.diagnosis.candidates import probes
 from walop_jax.diagnosis.design import Design, exposure_folds, field_folds, held_out
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import document
+from walop_jax.diagnosis.hypotheses import probes
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit, refit

@@ -7,8 +7,8 @@ import pytest
 from quick import quick
 from small_run import SMALL, WITH_PLATE
 
-from walop_jax.diagnosis import candidates
-from walop_jax.diagnosis.candidates import applicable, probes, showable
+from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis.hypotheses import applicable, probes, said_by, showable
 from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood.columns import Columns, columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
@@ -162,9 +162,9 @@ def test_by_hand():
 def test_every_sentence_of_the_grammar_has_a_column(laid):
     likelihood, values = laid
     found = Columns(likelihood, values)
-    every = candidates.sentences(likelihood.model.template, likelihood.calset.exposures, 25)
+    every = grammar.sentences(likelihood.model.template, likelihood.calset.exposures, 25)
     for probe in every:
-        for text in candidates.said_by(probe):
+        for text in said_by(probe):
             assert found.has(_said(text)), text
 
 

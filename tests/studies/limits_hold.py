@@ -31,14 +31,14 @@ from score_draws import alarms, noise_scores  # noqa: E402
 
 from walop_jax.calibration.accuracy import change_of_qu  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
-from walop_jax.diagnosis import candidates  # noqa: E402
-from walop_jax.diagnosis.candidates import Probe, probes  # noqa: E402
+from walop_jax.diagnosis import grammar  # noqa: E402
 from walop_jax.diagnosis.detection_limits import (  # noqa: E402
     PROBABILITY,
     _columns,
     detection_limits,
 )
 from walop_jax.diagnosis.examination import Examination, examine  # noqa: E402
+from walop_jax.diagnosis.hypotheses import Probe, probes  # noqa: E402
 from walop_jax.diagnosis.policy import POLICY  # noqa: E402
 from walop_jax.diagnosis.score import separations  # noqa: E402
 from walop_jax.fit.refit import FitResult, refit  # noqa: E402
@@ -76,8 +76,8 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
     template, calset = result.model.template, result.calset
     context = effect_context(template, calset.exposures)
     every = list(probes(EFFECTS, context))
-    said = candidates.sentences(template, calset.exposures, len(calset.points))
-    said = candidates.beside_names(said, EFFECTS, context, template)[0]
+    said = grammar.sentences(template, calset.exposures, len(calset.points))
+    said = grammar.beside_names(said, EFFECTS, context, template)[0]
     names = examine(result, every, np.random.default_rng(0))
     whole = examine(result, every, np.random.default_rng(0), None, said)
     p = names.table.local(POLICY.alarm)

@@ -11,7 +11,7 @@ import functools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -40,7 +40,6 @@ from walop_jax.data.settings import (
 )
 from walop_jax.fit.model_file import model_without_data, render, standard_names
 from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
-from walop_jax.fit.refit import FitResult, Matrix, Vector
 from walop_jax.fit.verdict import NOT_MEASURED, Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
 from walop_jax.io.code import software_versions
@@ -53,8 +52,12 @@ from walop_jax.model.elements import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.planning import plan_for_settings
-from walop_jax.model.specification import Model, effect_context
+from walop_jax.model.specification import Model, Vector, effect_context
 
+if TYPE_CHECKING:
+    from walop_jax.fit.refit import FitResult
+
+Matrix = Float[np.ndarray, "n n"]
 Columns = dict[str, tuple[np.ndarray, str]]  # values, description
 
 MAP_SIZE = 31  # pixels along each axis of the maps: 0.02° over ±0.3°

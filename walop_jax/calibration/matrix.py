@@ -11,7 +11,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,6 @@ from jaxtyping import Array, Float
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
-from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import Structure
 from walop_jax.likelihood import limits, optics
 from walop_jax.likelihood.field_table import Vector, accurate_table
@@ -37,6 +36,9 @@ from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan, with_numbers
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model, series_indices
+
+if TYPE_CHECKING:
+    from walop_jax.fit.refit import FitResult
 
 _MARK = 2.0**40
 """A value that no parameter has: it finds the amplitudes of effects among all parameters."""

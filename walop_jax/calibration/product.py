@@ -25,7 +25,8 @@ from walop_jax.data.calset import empty_sources
 from walop_jax.data.checks import instrument_name, make_exposures, make_filters, make_sources
 from walop_jax.data.frames import Grid, read_grid
 from walop_jax.data.records import CALIBRATION_PLATE, PREFIX, InputFile, Site
-from walop_jax.data.schema import Column, Place, column_names, read_table, table_rules
+from walop_jax.data.schema import Column, column_names, read_table, table_rules
+from walop_jax.data.units import Place
 from walop_jax.data.write import filter_columns, grid_cards, set_table_hdu, sign_and_write, table_hdu
 from walop_jax.fit.verdict import DATA, STATED, Hidden, Structure, Verdict
 from walop_jax.instruments.description import shipped

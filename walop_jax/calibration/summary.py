@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from walop_jax.calibration.matrix import ResidualMap
-from walop_jax.fit.misfit import Misfit
-from walop_jax.fit.refit import FitResult
 from walop_jax.io.code import software_versions
+
+if TYPE_CHECKING:
+    from walop_jax.fit.misfit import Misfit
+    from walop_jax.fit.refit import FitResult
 
 
 def summary(

@@ -37,7 +37,6 @@ from walop_jax.data.records import (
 )
 from walop_jax.data.schema import (
     CALVERS,
-    Place,
     column_names,
     in_unit,
     read_table,
@@ -53,6 +52,7 @@ from walop_jax.data.table_intensities import (
     table_intensities,
     usable,
 )
+from walop_jax.data.units import Place, check_units, unit_of
 from walop_jax.data.write import EXTENSION, filter_columns, read_compression, remark, set_tables
 from walop_jax.io.errors import fail, nearest
 from walop_jax.io.fits_reading import OpenFile, open_fits
@@ -332,9 +332,9 @@ def from_arrays(
     >>> made.exposures.clp_angle
     array([ 0., 30., 60., 90.])
     """
-    units = {"counts": schema.unit_of(counts), "errors": schema.unit_of(errors)}
+    units = {"counts": unit_of(counts), "errors": unit_of(errors)}
     counts, errors = in_unit(counts, "electron", "counts"), in_unit(errors, "electron", "errors")
-    schema.check_units(units, "electron", Place(NAME, ""))
+    check_units(units, "electron", Place(NAME, ""))
     x, y, angles = (np.atleast_1d(in_unit(v, "deg", n)) for v, n in ((x, "x"), (y, "y"), (angles, "angles")))
     if counts.ndim != 3 or counts.shape[:2] != (len(x), len(angles)) or len(x) != len(y):
         raise fail(

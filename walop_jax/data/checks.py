@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.records import KINDS, WAVELENGTHS, Exposures, FilterCurve, Points, Site, Sources
-from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, Place, check
+from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, check
 from walop_jax.data.settings import BUILTIN_FILTERS
+from walop_jax.data.units import Place
 from walop_jax.instruments.description import described, shipped
 from walop_jax.io.errors import nearest, rows_text
 

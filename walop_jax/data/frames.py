@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from walop_jax.data.records import Block, DataFlag, Intensities, Points
-from walop_jax.data.schema import Place, check_units, convert_unit
 from walop_jax.data.table_intensities import empty_block, usable
+from walop_jax.data.units import Place, check_units, convert_unit
 from walop_jax.io.errors import fail
 
 _LONG = 1 << 28  # (exposure, pixel) pairs: gigabytes of frames, which are not counted without a word

@@ -20,7 +20,7 @@ from walop_jax.data.records import (
     Points,
     Sources,
 )
-from walop_jax.data.schema import Place
+from walop_jax.data.units import Place
 from walop_jax.io.errors import rows_text
 from walop_jax.io.text import some
 

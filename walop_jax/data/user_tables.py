@@ -16,17 +16,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from walop_jax.data.schema import (
-    MISSING,
-    Column,
-    Place,
-    check_units,
-    distinct,
-    plain_column,
-    unit_of,
-    values_of,
-)
+from walop_jax.data.schema import MISSING, Column, distinct, plain_column, values_of
 from walop_jax.data.table_files import read_table_file, table_of_hdu
+from walop_jax.data.units import Place, check_units, unit_of
 from walop_jax.io.errors import fail
 from walop_jax.io.fits_reading import one_line
 from walop_jax.io.text import in_ascii, some

@@ -19,8 +19,8 @@ from walop_jax.data import schema
 from walop_jax.data.checks import instrument_name
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import CalibrationSet, Compression, FilterCurve, InputFile
-from walop_jax.data.schema import Place
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.data.units import Place
 from walop_jax.io.atomic import atomic_path
 
 EXTENSION = "COMPRESSION"

@@ -39,19 +39,13 @@ from walop_jax.calibration.accuracy import change_of_qu
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import could_hide, hidden_errors
 from walop_jax.calibration.matrix import effect_slopes, first_setting, matrix_slopes
-from walop_jax.diagnosis.candidates import Probe, applicable, fringes_of
-from walop_jax.diagnosis.candidates import probes as all_probes
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import Examination, examine, most_points
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
-from walop_jax.diagnosis.limits_found import (
-    PROBABILITY,
-    ConditionLimit,
-    DetectionLimit,
-    DetectionLimits,
-    over_field,
-)
-from walop_jax.diagnosis.policy import ALARM, POLICY
+from walop_jax.diagnosis.hypotheses import Probe, applicable, fringes_of
+from walop_jax.diagnosis.hypotheses import probes as all_probes
+from walop_jax.diagnosis.limits_found import ConditionLimit, DetectionLimit, DetectionLimits, over_field
+from walop_jax.diagnosis.policy import ALARM, POLICY, PROBABILITY
 from walop_jax.diagnosis.score import ScoreSpace, local_p, noncentrality, separations
 from walop_jax.diagnosis.stated_conditions import STEP, Singles, condition_scores
 from walop_jax.diagnosis.trust import sampled

@@ -26,8 +26,8 @@ from jaxtyping import Float
 from scipy import special
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis.candidates import Probe, all_candidates, said_by
 from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Design, number_of_columns, strata
+from walop_jax.diagnosis.hypotheses import Probe, Ranked, all_candidates, said_by
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import (
     Candidate,
@@ -48,20 +48,6 @@ from walop_jax.model.instrument import Instrument
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
 Parts = Sequence[tuple[Probe, Collection[EffectKind]]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Ranked:
-    """An effect or a sentence with its best probe, and its evidence; `others` are shapes that may be as good."""
-
-    effect: EffectKind
-    probe: Probe
-    score: Score
-    log_bayes: float
-    others: tuple[tuple[Probe, Score], ...] = ()
-
-
-# ------------------------------------------------------------------------------------------- order of evidence
 
 
 def rank(table: ScoreTable, probes: Sequence[Probe], policy: Policy = POLICY) -> list[Ranked]:
@@ -153,7 +139,7 @@ class Evidence:
 
     `space` is that of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
     `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are told as the
-    effects that hold them (`candidates.beside_names`), `patterns` the names of patterns without a name. `chi2` and
+    effects that hold them (`grammar.beside_names`), `patterns` the names of patterns without a name. `chi2` and
     `dof` are those of the fit, `scale` the factor on the errors with which it was made.
     """
 
@@ -493,7 +479,7 @@ def examine(
     parts: Parts = (),
     policy: Policy = POLICY,
 ) -> Examination:
-    """Score effects that a model has not, sentences, `parts` (`candidates.beside_names`) and patterns against a fit.
+    """Score effects that a model has not, sentences, `parts` (`grammar.beside_names`) and patterns against a fit.
 
     `earlier` is of a smaller model; its columns serve again where the light has hardly changed.
     """

@@ -25,10 +25,9 @@ from walop_jax.calibration.could_hide import as_text, change_by_effect, moves_wi
 from walop_jax.calibration.matrix import first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
-from walop_jax.diagnosis.candidates import Probe
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.limits_found import PROBABILITY
-from walop_jax.diagnosis.policy import POLICY, Policy
+from walop_jax.diagnosis.hypotheses import Probe
+from walop_jax.diagnosis.policy import POLICY, PROBABILITY, Policy
 from walop_jax.diagnosis.score import local_p, noncentrality
 from walop_jax.diagnosis.stated_conditions import Singles
 from walop_jax.fit.verdict import DATA, EFFECT, Hidden

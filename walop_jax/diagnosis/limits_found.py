@@ -11,17 +11,14 @@ from jaxtyping import Float
 
 from walop_jax.calibration.could_hide import CouldHide
 from walop_jax.diagnosis.examination import Matrix, Vector
-from walop_jax.diagnosis.policy import ALARM
+from walop_jax.diagnosis.policy import ALARM, ASKED_BY_CAMERA, PROBABILITY
 from walop_jax.fit.verdict import DATA, EFFECT
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import two_digits, two_digits_range
 
 NO_LEVEL = "q and u cannot both be measured with one exposure"
-PROBABILITY = 0.99
 HEAD = ("amplitude", ">detected", ">named", "unit", ">error of q, u (%)", "can be mistaken for")
-ASKED_BY_CAMERA = ("pedestal", "nonlinearity")
-"""Effects that are asked camera by camera, under the names of what they are there."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -109,3 +109,9 @@ ALARM = POLICY.alarm
 
 RINGS = (3, 4, 5, 6, 7, 8)
 """Degrees of patterns of rings about the centre of the field; the throughput takes up what is smoother."""
+
+PROBABILITY = 0.99
+"""Probability with which an effect at its detection limit is detected."""
+
+ASKED_BY_CAMERA = ("pedestal", "nonlinearity")
+"""Effects that are asked camera by camera, under the names of what they are there."""

@@ -32,11 +32,11 @@ from jaxtyping import Bool, Float
 from scipy import special
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis.alternatives import with_exposures, with_places
-from walop_jax.diagnosis.candidates import Probe, all_candidates, applicable, probes, showable
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.limits_found import ASKED_BY_CAMERA
-from walop_jax.diagnosis.policy import POLICY, Policy
+from walop_jax.diagnosis.exact import log_evidence_ratio
+from walop_jax.diagnosis.hypotheses import Probe, all_candidates, applicable, probes, showable
+from walop_jax.diagnosis.policy import ASKED_BY_CAMERA, POLICY, Policy
+from walop_jax.diagnosis.readings import with_exposures, with_places
 from walop_jax.diagnosis.score import (
     Candidate,
     Score,
@@ -45,7 +45,6 @@ from walop_jax.diagnosis.score import (
     corrected_p,
     local_p,
 )
-from walop_jax.diagnosis.search import log_evidence_ratio
 from walop_jax.fit.refit import NEARLY, FitResult, fit
 from walop_jax.io.text import with_error
 from walop_jax.likelihood.flux import project_flux

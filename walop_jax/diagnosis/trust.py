@@ -35,10 +35,10 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import special
 
-from walop_jax.diagnosis.alternatives import refuse_dead_cameras, refuse_mixups
 from walop_jax.diagnosis.design import Design, pattern_scores
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.policy import POLICY, Policy
+from walop_jax.diagnosis.readings import refuse_dead_cameras, refuse_mixups
 from walop_jax.diagnosis.repeated_noise import repeated_noise
 from walop_jax.diagnosis.score import Projector, ScoreTable, local_p
 from walop_jax.diagnosis.stated_conditions import Singles, stated_conditions
@@ -74,7 +74,7 @@ def examined(
 ) -> FitResult:
     """The fit with the verdict on it: what its residuals say against it, beside χ², priors and convergence.
 
-    A fit that explains nothing is held against other readings of its data first (`alternatives`), unless these were
+    A fit that explains nothing is held against other readings of its data first (`readings`), unless these were
     tried already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p,
     `policy` holds the thresholds.
     Of a set with more than `TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at.

@@ -1,6 +1,6 @@
 """The workflow: alarm, name, addition, until the data are explained or what is left has no name.
 
-1. Fit the model. 2. Score every effect of the catalogue, every sentence (`candidates`) and every pattern without a
+1. Fit the model. 2. Score every effect of the catalogue, every sentence (`grammar`) and every pattern without a
 name; global p by Monte Carlo. 3. Below `Policy.alarm`: add names one after the other (`search`), each fitted together
 with everything before it is added. 4. Drop names that are not needed beside the others. 5. Names that leave a poor fit
 nearly as poor are told as parts of what is missing, and taken out again. 6. What no name explains is described, and the
@@ -24,36 +24,33 @@ import numpy as np
 from walop_jax.calibration.accuracy import largest_change
 from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import candidates
-from walop_jax.diagnosis.alternatives import mixups_of, other_descriptions, refusal
-from walop_jax.diagnosis.candidates import Probe, applicable
-from walop_jax.diagnosis.candidates import probes as all_probes
+from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis.descriptions import other_descriptions
 from walop_jax.diagnosis.design import Design, strata
-from walop_jax.diagnosis.examination import (
-    Examination,
-    Ranked,
-    examine,
-    most_points,
-    shortest,
-)
-from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained, describe, told
-from walop_jax.diagnosis.policy import POLICY, Policy
-from walop_jax.diagnosis.search import (
+from walop_jax.diagnosis.exact import (
     Trial,
-    before_and_after,
     beyond_prior,
     evidence_of_presence,
-    names_first,
-    predicts_unseen,
     refit_without,
-    refitted_in_order,
-    search,
     signature,
     spoken_choices,
     try_effect,
     try_sentences,
     try_shapes,
     with_refuted_priors_widened,
+)
+from walop_jax.diagnosis.examination import Examination, examine, most_points, shortest
+from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained, describe, told
+from walop_jax.diagnosis.hypotheses import Probe, Ranked, applicable, said_by
+from walop_jax.diagnosis.hypotheses import probes as all_probes
+from walop_jax.diagnosis.policy import POLICY, Policy
+from walop_jax.diagnosis.readings import mixups_of, refusal
+from walop_jax.diagnosis.search import (
+    before_and_after,
+    names_first,
+    predicts_unseen,
+    refitted_in_order,
+    search,
 )
 from walop_jax.diagnosis.stated_conditions import instead_of_names, rival_conditions
 from walop_jax.diagnosis.trust import examined, pixel_structure
@@ -89,7 +86,7 @@ def diagnose(
     (default: those of the policy for such a model);
     what is left then has no name, and `Diagnosis.caution` says so. Both fits are examined. Other readings of the data
     are not tried where the caller has done that already (`as_written`). Raises what `fit` raises, and `DataError` for
-    data that another reading explains (`alternatives`).
+    data that another reading explains (`readings`).
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
@@ -98,7 +95,7 @@ def diagnose(
     catalogue = model.catalogue if catalogue is None else catalogue
     calset = in_field_points(calset, model, tell, pixel_structure)
     context = effect_context(model.template, calset.exposures)
-    every = candidates.sentences(model.template, calset.exposures, len(calset.points))
+    every = grammar.sentences(model.template, calset.exposures, len(calset.points))
     amplitudes = sum(len(probe.widths) for probe in (*all_probes(tuple(catalogue), context), *every))
     some = thinned(calset, most_points(calset, model.template, amplitudes), neighbours=1)
     if len(some.points) < len(calset.points):
@@ -181,7 +178,7 @@ def _promise(choice: Choice) -> tuple[float, float]:
 class Refit:
     """The judge that fits: the current fit of a diagnosis, and the steps so far.
 
-    `wanted` are the probes of `catalogue`, `sentences` and `parts` what else can be said (`candidates`). `choices` are
+    `wanted` are the probes of `catalogue`, `sentences` and `parts` what else can be said (`grammar`). `choices` are
     other descriptions that were tried, `said` the groups of sentences that were added. `ended` says that there was no
     time for something.
     """
@@ -218,7 +215,7 @@ class Refit:
         """Fit a model to a set and lay out what may be said beyond it."""
         context = effect_context(model.template, calset.exposures)
         fitting = applicable(catalogue, context, model.template)
-        alone, parts = candidates.beside_names(sentences, fitting, context, model.template)
+        alone, parts = grammar.beside_names(sentences, fitting, context, model.template)
         tell(Stage("fitting the model", "fitting"))
         return cls(
             calset=calset,
@@ -269,7 +266,7 @@ class Refit:
         """A description that starts or stops in time, where it explains most by linear steps; any other as it is."""
         ((change, amplitude), *more) = said.terms()
         for end in (0, 1) if not more else ():
-            if times := candidates.retimed(change, self.calset.exposures, end):
+            if times := grammar.retimed(change, self.calset.exposures, end):
                 own = columns(self.fit.likelihood, self.fit.values, [[(1.0, one)] for one in times])
                 own = state.design.projector(state.design.stacked([own]))
                 along, square = own.T @ state.design.residual, np.sum(own**2, axis=0)
@@ -279,7 +276,7 @@ class Refit:
 
     def _hopeful(self, state: Examination, item: Ranked) -> bool:
         """True if a sentence predicts what it has not seen, by its linear step: nobody has a name for it to believe."""
-        single = any("exposure" in text for text in candidates.said_by(item.probe))
+        single = any("exposure" in text for text in said_by(item.probe))
         columns = [state.said[item.probe.name]]
         return predicts_unseen(state.design, columns, self.policy.hopeful, of_states=not single)
 

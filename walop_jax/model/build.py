@@ -290,7 +290,7 @@ class _Maker:
 
 def _converted(given: Table, unit: str) -> str:
     """Advice on numbers in another unit than theirs: what to write, where that can be told."""
-    from walop_jax.data.schema import Place, convert_unit
+    from walop_jax.data.units import Place, convert_unit
 
     try:
         written = {

@@ -21,7 +21,8 @@ from jaxtyping import Float
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.data.records import CalibrationSet
-from walop_jax.data.schema import EXPOSURES, Column, Place
+from walop_jax.data.schema import EXPOSURES, Column
+from walop_jax.data.units import Place
 from walop_jax.data.user_tables import InputTable, in_memory, numeric_column, read_input_table
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import STATED, Doubt, Quality

@@ -13,9 +13,10 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.schema import EXPOSURES, MISSING, Column, Place, check, finite, plain_column
+from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, finite, plain_column
 from walop_jax.data.settings import TEMPERATURE, Settings
 from walop_jax.data.table_intensities import equal_rows
+from walop_jax.data.units import Place
 from walop_jax.data.user_tables import (
     InputTable,
     empty_cells,

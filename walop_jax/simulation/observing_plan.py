@@ -29,8 +29,8 @@ from walop_jax.data.records import (
     Position,
     Site,
 )
-from walop_jax.data.schema import Place
 from walop_jax.data.settings import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
+from walop_jax.data.units import Place
 from walop_jax.instruments.description import default_name, described, shipped
 from walop_jax.io.errors import errors_naming, nearest
 from walop_jax.io.text import parse_toml, read_text

@@ -32,9 +32,9 @@ from blind import Blind, outside  # noqa: E402
 
 from walop_jax.data.records import Block, CalibrationSet, Points  # noqa: E402
 from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
-from walop_jax.diagnosis.candidates import Probe, all_candidates, said_by  # noqa: E402
 from walop_jax.diagnosis.design import Measured, strata  # noqa: E402
 from walop_jax.diagnosis.examination import Examination, examine  # noqa: E402
+from walop_jax.diagnosis.hypotheses import Probe, all_candidates, said_by  # noqa: E402
 from walop_jax.diagnosis.score import ABSORBED, FAINTEST  # noqa: E402
 from walop_jax.fit.refit import FitResult  # noqa: E402
 from walop_jax.likelihood.flux import project_flux  # noqa: E402

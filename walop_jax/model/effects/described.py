@@ -1,7 +1,7 @@
 """Missing physics without a name: changes (`change`), each with an amplitude; several of them are one effect.
 
 Not in the catalogue: `diagnose` tries all changes that an instrument and its exposures allow
-(`diagnosis/candidates.py`) beside the names, and adds one where it explains the data better than any name.
+(`diagnosis/grammar.py`) beside the names, and adds one where it explains the data better than any name.
 
 Equation    that of each change: `optics`, `numbers`, `cameras`
 Source      Lu & Chipman 1996, JOSA A 13, 1106: every Mueller matrix near the identity is a product of these
@@ -55,7 +55,7 @@ class Described(Effect):
     sentences: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
 
     name: ClassVar[str] = "described"
-    starts = ()  # changes are found by `diagnosis.candidates`
+    starts = ()  # changes are found by `diagnosis.grammar`
     reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "data that no name explains as well"
     separated_by: ClassVar[str] = "exposures in which its dependence differs from that of the others"

@@ -1,10 +1,4 @@
-"""All that could be missing, effects and sentences, and what each would do to the residuals.
-
-The columns of the score test come from the responses of the light path (`likelihood.columns`), but those of effects of
-a user's own, which are differentiated themselves. Structural effects have no amplitude: they can only be tried
-(`search.try_effect`).
-
-Sentences say all that an instrument may lack: kind × place × dependence, from its own train and its exposures.
+"""Sentences on all that an instrument may lack: kind × place × dependence, from its own train and its exposures.
 
 A *group* of sentences is one candidate of the score test: a linear retarder has two axes, a harmonic a cosine and a
 sine, a gradient two directions. Groups are short: at most two things are free beside the kind.
@@ -32,16 +26,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from walop_jax.data.records import CalibrationSet, Exposures
+from walop_jax.data.records import Exposures
+from walop_jax.diagnosis.hypotheses import FEWEST_POINTS, Probe, said_by
 from walop_jax.diagnosis.policy import RINGS
-from walop_jax.diagnosis.score import Candidate
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.columns import Change, Columns, own_columns
-from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.conventions import Units
-from walop_jax.model.dependence import conditions_of_effect
-from walop_jax.model.effects import Context, Described, Effect, EffectKind
-from walop_jax.model.effects.catalogue import applies
+from walop_jax.model.effects import Context, Described, EffectKind
 from walop_jax.model.effects.change import BAND, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.etalon import probed_gaps
@@ -50,131 +40,8 @@ from walop_jax.model.effects.optics import DISPLACEMENTS
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import hours_of
-from walop_jax.model.ray import CONDITIONS
 from walop_jax.model.responses import acts
 from walop_jax.sky.nights import first_of_nights
-
-DEFAULT_WIDTH = 1.0
-FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median
-
-Vector = Float[np.ndarray, " _"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Probe:
-    """One group of probes of an effect: the place in its shape space from which a linear step is taken."""
-
-    name: str
-    effect: EffectKind
-    group: tuple[Effect, ...]
-
-    def _fields(self) -> Iterator[str]:
-        """The parameter that each amplitude belongs to, member by member."""
-        for member in self.group:
-            for name in self.effect.amplitudes():
-                yield from [name] * np.size(getattr(member, name))
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that the amplitudes belong to, one for each."""
-        return tuple(self._fields())
-
-    @property
-    def widths(self) -> Vector:
-        """Prior widths of the amplitudes, member by member."""
-        declared = self.effect.numbers()
-        return np.array([declared[name].width or DEFAULT_WIDTH for name in self._fields()])
-
-    @property
-    def one_sided(self) -> Bool[np.ndarray, " _"]:
-        """True for amplitudes that physics keeps above neutral, member by member."""
-        return np.array([name in self.effect.one_sided for name in self._fields()], bool)
-
-
-def applicable(
-    catalogue: Sequence[EffectKind], context: Context, instrument: Instrument
-) -> tuple[EffectKind, ...]:
-    """The effects of a catalogue that have what they act on in an instrument; ValueError as `applies`."""
-    return tuple(kind for kind in catalogue if applies(kind.neutral(context), instrument))
-
-
-def probes(catalogue: Sequence[EffectKind], context: Context) -> Iterator[Probe]:
-    """Every group of probes of every effect that has an amplitude in this context."""
-    for effect in catalogue:
-        if effect.is_structural():
-            continue
-        groups = effect.probes(context)
-        for number, group in enumerate(groups):
-            probe = Probe(effect.name if len(groups) == 1 else f"{effect.name}#{number}", effect, group)
-            if len(probe.widths):
-                yield probe
-
-
-def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) -> bool:
-    """True if a set has what an effect acts on: several field points, or the conditions that its elements ask for."""
-    if effect.kind.over_field and len(calset.points) < FEWEST_POINTS:
-        return False
-    bare = dataclasses.replace(instrument, effects=())
-    asked = conditions_of_effect(bare, effect)
-    stated = {name: getattr(calset.exposures, column.lower()) for name, column in CONDITIONS.items()}
-    return all(np.isfinite(stated[name]).any() for name in asked if name in stated)
-
-
-def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Probe]) -> list[Probe]:
-    """The probes of effects that a set can show; shapes of one effect need the same."""
-    shown: dict[EffectKind, bool] = {}
-    for probe in wanted:
-        if probe.effect not in shown:
-            shown[probe.effect] = _can_show(calset, instrument, probe.group[0])
-    return [probe for probe in wanted if shown[probe.effect]]
-
-
-def all_candidates(
-    likelihood: Likelihood, values: Vector, effects: Sequence[Probe], sentences: Sequence[Probe]
-) -> tuple[dict[str, Candidate], dict[str, Candidate]]:
-    """Columns of effects and, in single precision, of sentences at the fit `values` of a model, by name.
-
-    Without effects that the set cannot show, and without fringes that the bands blur away.
-    """
-    calset, template = likelihood.calset, likelihood.model.template
-    shown = showable(calset, template, effects)
-    columns = Columns(likelihood, values)
-    changes: dict[int, list[Change]] = {}
-    for number, probe in enumerate([*shown, *sentences]):
-        each = [member.first_order(template) for member in probe.group]
-        if all(one and all(columns.has(change) for change in one) for one in each):
-            changes[number] = [change for one in each for change in one]
-    gaps = [sentence.gap for some in changes.values() for change in some for sentence in fringes_of(change)]
-    survives = columns.survives(gaps)
-    blurred = {
-        number
-        for number, some in changes.items()
-        if not all(survives[sentence.gap] for change in some for sentence in fringes_of(change))
-    }
-    kept = {number: some for number, some in changes.items() if number not in blurred}
-    exact = sum(len(some) for number, some in kept.items() if number < len(shown))
-    found = columns.rounded([change for some in kept.values() for change in some], exact)
-    named: dict[str, Candidate] = {}
-    said: dict[str, Candidate] = {}
-    first = [0, 0]
-    for number, probe in enumerate([*shown, *sentences]):
-        of_sentence = number >= len(shown)
-        if number in kept:
-            own = found[of_sentence][:, first[of_sentence] : first[of_sentence] + len(probe.widths)]
-            first[of_sentence] += len(probe.widths)
-        elif number in blurred:
-            continue
-        else:
-            own = own_columns(likelihood, values, probe.group)
-        into = said if of_sentence else named
-        into[probe.name] = Candidate(probe.name, own, probe.widths)
-    return named, said
-
-
-def fringes_of(change: Change) -> Iterator[Sentence]:
-    """The sentences of a change that are about fringes, which need more wavelength nodes than all others."""
-    return (sentence for _, sentence in change if sentence.kind == "fringes")
-
 
 # -------------------------------------------------------------------------------------------------------- all sentences
 
@@ -191,11 +58,6 @@ def sentences(instrument: Instrument, exposures: Exposures, points: int) -> tupl
     """All groups that an instrument and its exposures allow, short ones first; `points` counts the field points."""
     found = dict.fromkeys(_groups(dataclasses.replace(instrument, effects=()), exposures, points))
     return tuple(_probe(group) for group in sorted(found, key=len))
-
-
-def said_by(probe: Probe) -> tuple[str, ...]:
-    """The sentences of a group."""
-    return tuple(text for member in probe.group for text in member.sentences)  # type: ignore[attr-defined]
 
 
 def _probe(group: tuple[Sentence, ...]) -> Probe:

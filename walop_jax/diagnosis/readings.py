@@ -1,6 +1,6 @@
-"""Discrete alternatives, tried where a fit explains nothing: other readings of the data, other instruments.
+"""Recording mistakes, tried where a fit explains nothing: other readings of the data.
 
-Other readings: have the data been written down wrongly? Cameras in another order, angles that run the other way or
+Cameras in another order, angles that run the other way or
 start elsewhere, a field that is mirrored, turned or in other units, a polariser that was not in the beam, another
 instrument: each makes residuals far beyond what any effect makes, and each is undone by rewriting the set. An
 alternative is worth what a fit of the rewritten set at a few field points leaves,
@@ -14,32 +14,19 @@ off, is told.
 
 Symbols     J, r Jacobian and whitened residuals; P inverse prior variances; θ₀ start values.
 Limits      One mix-up at a time. Two that do the same to these data are told together.
-
-Other descriptions of the instrument:
-
-1. Every change that the instrument has a place for (`model/alternatives.py`) is put into the residuals at two places,
-   the fitted values and the start values: a description that is badly wrong has bent the fit. What the free parameters
-   could absorb of them, at the slopes of the description given, is projected out, priors included (one Gauss–Newton
-   step). Nothing is fitted; a sample of the field points is enough.
-2. The few that leave least are fitted, all parameters with them, and other curves of dispersion in any case: plates
-   grow to make up for those, by more than one step can tell. Their evidence against the description given is half
-   the gain in χ² less the logarithm of the number of changes that were looked at.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from walop_jax.data.records import POLARISER, CalibrationSet, Exposures, Points, Position
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.findings import Choice
 from walop_jax.diagnosis.policy import POLICY, Policy
-from walop_jax.diagnosis.search import Trial, model_without, try_model
 from walop_jax.fit.model_file import base_model, model_like
 from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.fit.search import FAR_OFF
@@ -48,13 +35,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.io.text import some
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.alternatives import JOINED, alternatives, other_curves
-from walop_jax.model.effects import Context, OtherDescription
-from walop_jax.model.instrument import NoSuchPlaceError
-from walop_jax.model.specification import Model, with_effects
-
-CHOICE_ROWS = 6000
-"""(Exposure, point) pairs on which other descriptions of an instrument are compared before any of them is fitted."""
+from walop_jax.model.specification import Model
 
 _POINTS, _FEW = 16, 64  # field points that are looked at; sets of so few are looked at whole
 _STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best
@@ -452,90 +433,3 @@ _TABLE: tuple[tuple[str, str, Callable[[CalibrationSet, Exposures], bool], Chang
     ("SITELAT has the other sign", "north is positive", _has_moon, _with_site("latitude")),
 )  # fmt: skip
 """Readings of sky and standards: what must have happened, what to do, the sets it can have happened to, the cure."""
-
-
-# --------------------------------------------------------------------------------- other descriptions of the instrument
-
-NO_DIFFERENCE = 1e-6  # change of the residuals, in standard deviations, that is none
-
-
-def described_otherwise(model: Model, sentence: str, context: Context) -> Model:
-    """The model of the instrument changed as a sentence says, on top of what has been changed before."""
-    name = OtherDescription.name
-    if name in model.effect_names:
-        before = model.template.effect(name)
-        assert isinstance(before, OtherDescription)
-        sentence, model = f"{before.change}{JOINED}{sentence}", model_without(model, name)
-    return with_effects(model, [OtherDescription(change=sentence)], context)
-
-
-def other_descriptions(
-    result: FitResult,
-    context: Context,
-    policy: Policy,
-    going_on: Callable[[], bool],
-    tell: Callable[[str], None],
-    tried: dict[str, Choice],
-    *,
-    all_of_them: bool = True,
-) -> Iterator[Trial]:
-    """Changes of the description of a fit: all are screened, the best of them fitted. `tried` takes what is found."""
-    template = dataclasses.replace(result.model.template, effects=())
-    if OtherDescription.name in result.model.effect_names:
-        template = result.model.template.effect(OtherDescription.name).patch(template)
-    curves = other_curves(template)
-    # What is turned, exchanged or left out changes the light by per cents: nothing of that kind is a small misfit.
-    sentences = tuple(alternatives(template)) if all_of_them else curves
-    tell(f"comparing {len(sentences)} other descriptions")
-    asked = itertools.takewhile(lambda _: going_on(), sentences)
-    found = sorted(_screened(result, asked, context), key=lambda one: one[0].left)
-    tried |= {choice.change: choice for choice, _, _ in found}
-    promising = [one for one in found if one[1] > policy.least_gain][: policy.descriptions_fitted]
-    chosen = {choice.change for choice, _, _ in promising}
-    rest = [one for one in found if one[0].change in curves and one[0].change not in chosen]
-    for choice, _, start in (*promising, *rest):
-        if not going_on():
-            return
-        tell(f"trying another description: {choice.change}")
-        model = described_otherwise(result.model, choice.change, context)
-        try:
-            trial = try_model(result, OtherDescription, model, start, len(sentences))
-        except ValueError:  # a free parameter of what was left out has no prior: nothing holds it
-            continue
-        assert trial.fit is not None
-        gain = (result.posterior.objective - trial.fit.posterior.objective) * result.noise_scale**2
-        tried[choice.change] = dataclasses.replace(choice, better_by=float(gain))
-        yield trial
-
-
-def _screened(
-    result: FitResult, sentences: Iterable[str], context: Context
-) -> Iterator[tuple[Choice, float, Vector]]:
-    """Each change that is one, with what it leaves, its gain in χ² and its place: the better of two places."""
-    every = max(1, CHOICE_ROWS // max(len(result.calset.exposures), 1))
-    calset = thinned(result.calset, every, neighbours=1)
-    start = result.model.start.copy()  # but effects as they have been fitted
-    for name in result.model.effect_names:
-        start[result.model.positions(name)] = result.values[result.model.positions(name)]
-    likelihood = Likelihood.of(calset, result.model)
-    places = [
-        Design.of(dataclasses.replace(result, likelihood=likelihood, values=values))
-        for values in (result.values, start)
-    ]
-    given = float(np.sum(places[0].projector(places[0].residual) ** 2))
-    for sentence in sentences:
-        try:
-            model = described_otherwise(result.model, sentence, context)
-        except NoSuchPlaceError:  # it leaves out what an effect of the model acts on
-            continue
-        changed, left = Likelihood.of(calset, model), []
-        for design in places:
-            rows = design.residual.copy()
-            residual = changed.residuals(design.fit.values)[1][design.measured.used].reshape(-1)
-            rows[: design.rows] = residual / design.fit.noise_scale
-            if np.abs(rows - design.residual).max() < NO_DIFFERENCE:
-                break
-            left.append(float(np.sum(design.projector(rows) ** 2)) / given)
-        if len(left) == len(places) and np.isfinite(left).any():
-            best = int(np.nanargmin(np.where(np.isfinite(left), left, np.nan)))
-            yield Choice(sentence, left[best]), (1.0 - left[best]) * given, places[best].fit.values

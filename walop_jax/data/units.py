@@ -1,0 +1,91 @@
+"""Units of columns, and the place of a column in messages about it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from astropy import units
+
+from walop_jax.io.errors import fail, rows_text
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Origin of a table, so that every check can name it."""
+
+    file: object
+    extension: str
+
+    def fail(self, what: str, column: str = "", advice: str = "") -> ValueError:
+        """Build the error of something wrong in this table."""
+        return fail(what, file=self.file, extension=self.extension, column=column, advice=advice)
+
+    def refuse(self, bad: np.ndarray, what: str, column: str, advice: str) -> None:
+        """Raise `DataError` naming the rows (first axis) where `bad` is set, if there are any."""
+        if np.any(bad):
+            rows = np.unique(np.nonzero(bad)[0])
+            raise self.fail(f"{what} in {rows_text(rows)}", column, advice)
+
+    def remark(self, what: str, column: str) -> str:
+        """A sentence about a column of this table."""
+        return f"{self.file} [{self.extension}] {column}: {what}"
+
+
+def unit_of(column: Any) -> str:
+    """The unit that a column, an array or a quantity brings along, "" for none."""
+    return str(getattr(column, "unit", None) or "")
+
+
+def check_units(given: Mapping[str, str], wanted: str, place: Place) -> None:
+    """Raise `DataError` where some of columns that belong together have a unit to be converted and others have none."""
+    converted = [name for name, unit in given.items() if unit and units.Unit(unit) != units.Unit(wanted)]
+    without = [name for name, unit in given.items() if not unit]
+    if converted and without:
+        what = f"has no unit, {converted[0]} is in {given[converted[0]]}"
+        raise place.fail(what, without[0], f"give all in one unit, or all in {wanted}")
+
+
+def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: Place) -> np.ndarray:
+    """Convert `values` from a FITS unit string to the wanted one.
+
+    Hour angles may come as angles, temperatures in kelvin. Raises `DataError` for an unknown unit and for
+    one of another physical type.
+    """
+    try:
+        # The generic reading, because `electron` is not a unit of the FITS standard.
+        given = units.Unit(unit.strip())
+    except (ValueError, TypeError) as error:
+        raise place.fail(f"the unit {unit!r} is not known", name, f"use {wanted or 'no unit'}") from error
+    target = units.Unit(wanted)
+    if _is_logarithmic(given):
+        advice = f"give the column in {wanted or 'fractions'}"
+        if wanted == "electron":
+            advice = (
+                "counts in electrons are needed: 10^(−0.4 (m − m₀)) of magnitudes m, m₀ that of one electron, and "
+                "N_ERR = 0.921 N · error of m; 10^d of dex"
+            )
+        raise place.fail(f"is logarithmic ({unit.strip()})", name, advice)
+    if given == target:
+        return values  # no arithmetic: what was written comes back bit for bit
+    if wanted == "h" and given.is_equivalent(units.deg):
+        target = units.hourangle
+    try:
+        return np.asarray(
+            units.Quantity(values, given).to_value(target, units.temperature()), dtype=np.float64
+        )
+    except units.UnitConversionError as error:
+        advice = f"convert the column to {wanted or 'a fraction without unit'}"
+        if wanted == "electron":
+            per_time = given.is_equivalent(units.electron / units.s)
+            advice += f" (multiply by the {'exposure time' if per_time else 'gain'})"
+        raise place.fail(
+            f"the unit {unit!r} cannot be converted to {wanted or 'none'!r}", name, advice
+        ) from error
+
+
+def _is_logarithmic(unit: Any) -> bool:
+    """True for mag, dex and dB, alone or of something: mag(electron)."""
+    return hasattr(unit, "physical_unit") or unit in (units.mag, units.dex, units.dB)

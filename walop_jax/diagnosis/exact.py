@@ -1,0 +1,236 @@
+"""Exact fits of what a diagnosis tries, adds and drops.
+
+Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det H_base) − Σ ln w, with O the objective (χ² of
+               data and priors), H half its Hessian and w the prior widths of the added parameters; those of amplitudes
+               are averaged over their scale (`score.log_bayes`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.diagnosis.hypotheses import Ranked, said_by
+from walop_jax.diagnosis.policy import Policy
+from walop_jax.diagnosis.score import SCALES, log_bayes
+from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import Context, Described, Effect, EffectKind
+from walop_jax.model.parameters import leaves, values_of
+from walop_jax.model.specification import Model, model_without, with_effects
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """An addition to a model that was tried: its evidence (ln B), and what it leaves, χ² and whether that is noise.
+
+    `item` is its linear step, `linear` the evidence of that (NaN where there was none). `fit` is None until it has been
+    fitted. `alternatives` are other shapes of the effect that do as well, in words. `rivals` are effects of nearly its
+    evidence, or of which a part would do, `nameless` sentences that are not improbable beside it.
+    """
+
+    effect: EffectKind
+    evidence: float
+    left: float
+    noise: bool
+    item: Ranked | None = None
+    linear: float = float("nan")
+    fit: FitResult | None = None
+    alternatives: tuple[str, ...] = ()
+    rivals: tuple[str, ...] = ()
+    nameless: tuple[str, ...] = ()
+
+    @property
+    def instance(self) -> Effect:
+        """The effect at its fitted values, in standard form."""
+        assert self.fit is not None
+        return self.fit.model.instrument(self.fit.values).effect(self.effect.name).standard_form()
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Its equivalent sentences, where it has no name."""
+        if self.effect is not Described:
+            return ()
+        if self.fit is None:
+            return () if self.item is None else said_by(self.item.probe)
+        return self.instance.sentences  # type: ignore[attr-defined]
+
+
+def _log_determinant(result: FitResult) -> float:
+    return float(np.linalg.slogdet(result.posterior.matrix)[1])
+
+
+def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
+    """Laplace evidence of an extended fit against the base (parameters without a prior carry no Occam factor).
+
+    Priors of amplitudes are those of the fit at all `SCALES`.
+    """
+    known, model = set(base.model.names), extended.model
+    widths = [
+        p.prior[1] if p.prior is not None else (p.loose or p.scale)
+        for p in model.parameters
+        if p.name not in known and p.free and p.tie is None
+    ]
+    amplitudes = [i for effect in model.effect_names for i in amplitude_positions(model, effect)]
+    at = [i for i in amplitudes if model.names[i] not in known]
+    gain = 0.5 * (base.posterior.objective - extended.posterior.objective)
+    occam = 0.5 * (_log_determinant(extended) - _log_determinant(base))
+    at_all_scales = _of_amplitudes(extended, at) - _of_amplitudes(extended, at, np.ones(1))
+    return gain - occam - float(np.sum(np.log(widths))) + at_all_scales
+
+
+def _of_amplitudes(result: FitResult, at: Sequence[int], scales: Float[np.ndarray, " t"] = SCALES) -> float:
+    """ln B of some parameters against their prior means: density of posterior and prior there, both Gaussian.
+
+    The Savage–Dickey ratio of nested models (Dickey 1971, Ann. Math. Stat. 42, 204), with the prior at all `scales`:
+    what the data alone say is the information of the posterior without that of the prior.
+    """
+    if not at:
+        return 0.0
+    mean, width = np.transpose([result.model.parameters[i].prior for i in at])  # type: ignore[arg-type]
+    information = np.linalg.inv(result.covariance[np.ix_(at, at)])
+    scores = information @ (result.values[at] - mean)
+    return log_bayes(information - np.diag(width**-2.0), scores, width, scales)
+
+
+def try_effect(base: FitResult, instance: Effect, context: Context, prior_shapes: int = 1) -> Trial:
+    """Add an effect at the given values to the fitted model and fit everything again."""
+    return try_model(
+        base, instance.kind, with_effects(base.model, [instance], context), base.values, prior_shapes
+    )
+
+
+def try_sentences(base: FitResult, said: Described, context: Context, count: int) -> Trial:
+    """Add sentences to the fitted model, beside those that it has, and fit again; they are among `count` of them."""
+    model = base.model
+    if Described.name in model.effect_names:
+        earlier = model.instrument(base.values).effect(Described.name)
+        assert isinstance(earlier, Described)
+        said, model = earlier.joined(said), model_without(model, Described.name)
+    return try_model(base, Described, with_effects(model, [said], context), base.values, count)
+
+
+def try_model(
+    base: FitResult, effect: EffectKind, model: Model, values: Float[np.ndarray, " n"], prior_shapes: int
+) -> Trial:
+    """Fit a model with an effect, from values of the parameters of the base and its own start values of others."""
+    start = dict(zip(base.model.names, values, strict=True))
+    likelihood = Likelihood.of(base.calset, model)
+    result = fit(
+        likelihood,
+        start=np.array([start.get(p.name, p.start) for p in model.parameters]),
+        noise_scale=base.noise_scale,
+        worth=base.posterior.objective,
+    )
+    bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
+    return Trial(effect, bayes, result.chi2, result.explains_data, fit=result)
+
+
+def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int, policy: Policy) -> Trial:
+    """Refit an effect from the amplitudes of its linear steps at the shapes that may be best, and keep the best."""
+    places = ((item.probe, item.score), *item.others)
+    trials = [
+        try_effect(base, item.effect.combine(probe.group, score.amplitudes), context, shapes)
+        for probe, score in places
+    ]
+    best = max(trials, key=lambda t: t.evidence if _converged(t) else -np.inf)
+    alike = [t for t in trials if _converged(t) and t.evidence > best.evidence - policy.even_odds]
+    told = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best, policy.separation))
+    return dataclasses.replace(best, alternatives=tuple(told))
+
+
+def _converged(trial: Trial) -> bool:
+    return trial.fit is not None and trial.fit.converged
+
+
+def _differ(one: Trial, other: Trial, separation: float) -> bool:
+    assert one.fit is not None
+    assert other.fit is not None
+    if one.instance.choices() != other.instance.choices():
+        return True
+    at = one.fit.model.positions(one.effect.name)
+    sigma = np.maximum(one.fit.sigma[at], other.fit.sigma[at])
+    away = np.asarray(values_of(one.instance)) - np.asarray(values_of(other.instance))
+    return bool(np.any(np.abs(away) > separation * np.where(sigma > 0, sigma, np.inf)))
+
+
+def in_words(effect: Effect) -> str:
+    """Choices and values of an effect, e.g. "camera = 2, depth = 0.006"."""
+    values = {
+        leaf.name: f"{v:.4g}" for leaf, v in zip(leaves(effect), np.asarray(values_of(effect)), strict=True)
+    }
+    return ", ".join(f"{name} = {value}" for name, value in (spoken_choices(effect) | values).items())
+
+
+def spoken_choices(effect: Effect) -> dict[str, Any]:
+    """Discrete choices that mean something to a reader: a camera, a crystal, a star."""
+    return {name: value for name, value in effect.choices().items() if isinstance(value, int | str)}
+
+
+def amplitude_positions(model: Model, name: str) -> list[int]:
+    """Positions of the free amplitudes of an active effect that have a prior."""
+    effect = model.template.effect(name)
+    at = [model.index(f"{name}.{label}") for f in effect.kind.amplitudes() for label in effect.labels(f)]
+    return [i for i in at if model.parameters[i].free and model.parameters[i].prior is not None]
+
+
+def with_refuted_priors_widened(model: Model, values: Float[np.ndarray, " n"], name: str) -> Model:
+    """The model with the priors of strongly deviating amplitudes widened to one width at the fitted value.
+
+    A prior says how large such an effect usually is. One that the data refute would go on pulling at the value and
+    count the square of its distance as a misfit, of data that are explained to within the noise.
+    """
+    for i in amplitude_positions(model, name):
+        mean, width = model.parameters[i].prior  # type: ignore[misc]
+        away = abs(float(values[i]) - mean)
+        if away > PRIOR_EDGE * width:
+            model = model.change(model.names[i], prior=(mean, away))
+    return model
+
+
+def beyond_prior(result: FitResult, name: str) -> dict[str, float]:
+    """Amplitudes of an effect that lie beyond the prior of their declaration, widened or not, in its widths."""
+    effect = result.model.template.effect(name)
+    declared = {f"{name}.{leaf.name}": leaf.width for leaf in leaves(effect)}
+    found = {}
+    for i in amplitude_positions(result.model, name):
+        p = result.model.parameters[i]
+        widths = abs(float(result.values[i]) - p.prior[0]) / (declared[p.name] or np.inf)  # type: ignore[index]
+        if widths > PRIOR_EDGE:
+            found[p.name.removeprefix(f"{name}.")] = widths
+    return found
+
+
+def evidence_of_presence(result: FitResult, name: str) -> float:
+    """ln B of a fitted model against the one without an effect: the density that prior and posterior have at neutral.
+
+    Infinite for an effect without parameters.
+    """
+    at = amplitude_positions(result.model, name)
+    return _of_amplitudes(result, at) if at else float("inf")
+
+
+def refit_without(result: FitResult, name: str) -> FitResult:
+    """Take an effect out of a fitted model and fit again, with errors scaled only if what is left needs it."""
+    model = model_without(result.model, name)
+    start = dict(zip(result.model.names, result.values, strict=True))
+    return fit(Likelihood.of(result.calset, model), start=np.array([start[n] for n in model.names]))
+
+
+def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarray, " _"]:
+    """Change of the residuals (data rows) by an active effect: theirs without it, minus theirs with it."""
+    effect = result.model.template.effect(name)
+    if effect.kind.is_structural():
+        model = model_without(result.model, name)
+        kept = [result.model.index(n) for n in model.names]
+        bare = Likelihood.of(result.calset, model).residuals(result.values[kept])[1]
+    else:
+        values = result.values.copy()
+        values[result.model.positions(name)] = np.asarray(values_of(effect.at_neutral(context)))
+        bare = result.likelihood.residuals(values)[1]
+    change = bare - result.likelihood.residuals(result.values)[1]
+    return change[result.likelihood.used].reshape(-1) / result.noise_scale
