@@ -110,7 +110,7 @@ def test_rows_with_different_numbers_of_cameras(two_cameras):
 
 def means_what_it_says(calset, made):
     written = {name.upper(): entry[2] for name, entry in made[E].items()}
-    for prefix, position in calset.exposures.positions.items():
+    for prefix, position in calset.exposures.further.items():
         assert re.fullmatch(r"[A-Z][A-Z0-9_]*", prefix)
         inside = written.get(f"{prefix}_IN", np.ones(8, bool))
         np.testing.assert_array_equal(position.inside, inside)

@@ -53,8 +53,8 @@ def instrument_name(value: object, place: Place) -> str:
 
 def check_cameras(instrument: str, cameras: int, place: Place, column: str) -> None:
     """Raise `DataError` for another number of cameras than a shipped instrument has."""
-    if instrument in shipped() and cameras != (known := len(described(instrument).cameras)):
-        what = f"has {cameras} camera(s), {instrument} has {known}"
+    if instrument in shipped() and cameras != (expected := len(described(instrument).cameras)):
+        what = f"has {cameras} camera(s), {instrument} has {expected}"
         raise place.fail(what, column, "write all of them, or correct the name of the instrument")
 
 

@@ -329,7 +329,7 @@ def values_of(
     Raises `DataError`, with rows, for values of another kind or shape, for whole numbers, truth values and names that
     are masked, and as `convert_unit` does.
     """
-    values, empty, own = plain_column(given, name, rule, place)
+    values, empty, stated = plain_column(given, name, rule, place)
     values, empty = (_shaped(array, name, rule, place) for array in (values, empty))
     strings, fill = values.dtype.kind in "OSU", rule.missing if lenient else None
     if rule.kind == "str":
@@ -353,7 +353,7 @@ def values_of(
     if rule.kind == "float":
         numbers = values.astype(np.float64)
         numbers[empty] = np.nan
-        numbers = convert_unit(numbers, own or unit, rule.unit, name, place) if own or unit else numbers
+        numbers = convert_unit(numbers, stated or unit, rule.unit, name, place) if stated or unit else numbers
         return numbers if fill is None else np.where(np.isnan(numbers), fill, numbers)
     if fill is not None:
         values = np.where(empty, fill, values)

@@ -220,8 +220,8 @@ def _keep_texts(table: Any, index: int, text: str, separator: str) -> None:
         return
     rows = csv.reader(io.StringIO(text), delimiter=separator, skipinitialspace=True)
     texts = [row[index].strip() for row in rows if row][1:]
-    known = np.unique(np.ma.compressed(np.ma.masked_invalid(numbers)))
-    if len({cell for cell in texts if cell.lower() not in MISSING}) > len(known):
+    values = np.unique(np.ma.compressed(np.ma.masked_invalid(numbers)))
+    if len({cell for cell in texts if cell.lower() not in MISSING}) > len(values):
         table.replace_column(table.colnames[index], np.array(texts))
 
 

@@ -286,16 +286,16 @@ def mask_repeats(
     remarks: list[str] = []
     alike: list[str] = []
     for first, *others in groups.values():
-        one = rows_of(first)
+        rows = rows_of(first)
         for other in others:
-            ids, two = (
+            ids, rows_again = (
                 f"exposures {exposures.exposure[first]} and {exposures.exposure[other]}",
                 rows_of(other),
             )
-            if len(one) and all(np.array_equal(v[one], v[two]) for v in (point, intensities.counts)):
+            if len(rows) and all(np.array_equal(v[rows], v[rows_again]) for v in (point, intensities.counts)):
                 remarks.append(f"{ids} are the same to the last bit, the second is not used")
-                used[two] = False
-            elif fine and np.isin(point[one[used[one]]], point[two[used[two]]]).any():
+                used[rows_again] = False
+            elif fine and np.isin(point[rows[used[rows]]], point[rows_again[used[rows_again]]]).any():
                 what = f"{ids} (rows {first} and {other}, counted from 0) have the same time and settings but"
                 advice = "no camera takes two exposures at once: correct the times, or write NaN"
                 raise Place(file, "EXPOSURES").fail(f"{what} different counts", "MJD", advice)

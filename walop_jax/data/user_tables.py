@@ -173,8 +173,8 @@ def vector_columns(
     """
     single = dataclasses.replace(rule, width=1)
     parts = {name: _side_by_side(source, name, rule.width or 1, cameras) for name in names}
-    found = {part: source.column(part) for name in names for part in parts[name]}
-    units = {part: unit_of(column) for part, column in found.items() if column is not None}
+    columns = {part: source.column(part) for name in names for part in parts[name]}
+    units = {part: unit_of(column) for part, column in columns.items() if column is not None}
     values = [
         numeric_column(source, name, rule)
         if parts[name] == [name]

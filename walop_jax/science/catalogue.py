@@ -358,13 +358,13 @@ def _copies(
     Noise does not repeat to the digits of a float32 in two cameras or more: such rows are one measurement, that with
     most cameras is kept.
     """
-    known = np.isfinite(counts)
-    measured = known.any(axis=1)
+    seen = np.isfinite(counts)
+    measured = seen.any(axis=1)
     same = equal_rows([*counts.T, *sigma.T, points.x, points.y])
-    for pattern in np.unique(known[measured & ~known.all(axis=1)], axis=0):
+    for pattern in np.unique(seen[measured & ~seen.all(axis=1)], axis=0):
         cameras = np.flatnonzero(pattern)
-        rows = np.flatnonzero(known[:, cameras].all(axis=1)) if len(cameras) > 1 else cameras[:0]
-        rows = rows[np.argsort(-known[rows].sum(axis=1), kind="stable")]
+        rows = np.flatnonzero(seen[:, cameras].all(axis=1)) if len(cameras) > 1 else cameras[:0]
+        rows = rows[np.argsort(-seen[rows].sum(axis=1), kind="stable")]
         group = equal_rows(
             [*counts[rows][:, cameras].T, *sigma[rows][:, cameras].T, points.x[rows], points.y[rows]]
         )
@@ -376,7 +376,7 @@ def _copies(
     settings = points.settings
     angles = [np.mod(angle, 360.0) for angle in (*settings.positions.values(), rotator)]
     _, band = np.unique(settings.filter, return_inverse=True)
-    order = np.argsort(-known.sum(axis=1), kind="stable")
+    order = np.argsort(-seen.sum(axis=1), kind="stable")
     group = equal_rows([same, star, band.reshape(-1), *angles])
     first = order[np.unique(group[order], return_index=True)[1]]
     copy = measured & ~np.isin(np.arange(len(star)), first)
