@@ -17,6 +17,7 @@ Exposures      are not compressed beforehand, although light is linear in them: 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -258,13 +259,16 @@ def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldT
     if points <= block or points % block:
         return _block_equations(instrument, plan, data, nodes)
     blocks = jax.tree.map(lambda v: v.reshape(-1, block, *v.shape[1:]), data)
-    size = values_of(instrument).size
-    nothing = Normal(jnp.zeros(()), jnp.zeros(size), jnp.zeros((size, size)))
+    return summed(lambda part: _block_equations(instrument, plan, part, nodes), blocks)
 
-    def add(total: Normal, part: PointData) -> tuple[Normal, None]:
-        return jax.tree.map(jnp.add, total, _block_equations(instrument, plan, part, nodes)), None
 
-    return jax.lax.scan(add, nothing, blocks)[0]
+def summed(function: Callable[[Any], Any], parts: Any) -> Any:
+    """Sums of what a function gives for each of the parts along the first axis, one part after the other."""
+    first = jax.eval_shape(function, jax.tree.map(lambda v: v[0], parts))
+    nothing = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), first)
+    return jax.lax.scan(
+        lambda total, part: (jax.tree.map(jnp.add, total, function(part)), None), nothing, parts
+    )[0]
 
 
 def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:

@@ -40,7 +40,7 @@ from walop_jax.nights.equations import (
     with_candidates_of,
 )
 from walop_jax.nights.night_file import read_nights, write_nights
-from walop_jax.posterior.files import Run
+from walop_jax.posterior.run import Run
 
 SKETCH = 512  # measurements by which sets are compared
 COPIED = 0.02  # their share that no two sets have in common by chance

@@ -19,7 +19,8 @@ from walop_jax.fit.verdict import STATED
 from walop_jax.io.code import versions_of
 from walop_jax.io.errors import fail
 from walop_jax.model.specification import Model
-from walop_jax.posterior.files import Chain, digest, digest_of_fit
+from walop_jax.posterior.draws import digest, digest_of_fit
+from walop_jax.posterior.files import Chain
 from walop_jax.posterior.result import (
     BURN_IN,
     Chains,

@@ -37,8 +37,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.model.compiled import compiled
+from walop_jax.posterior.draws import INFLATION
 from walop_jax.posterior.samplers import Density
-from walop_jax.posterior.target import INFLATION, LN_F_WIDTH, Target, choose_sampled
+from walop_jax.posterior.target import LN_F_WIDTH, Target, choose_sampled
 
 Matrix = Float[np.ndarray, "..."]
 Draws = Float[np.ndarray, "n k"]

@@ -23,12 +23,12 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import check_names, with_values
+from walop_jax.posterior.draws import INFLATION
 from walop_jax.posterior.samplers import Density
 
 Vector = Float[np.ndarray, " f"]
 LARGEST_SAMPLED = 20
 LN_F_WIDTH = 1.0  # prior of ln f, the noise inflation
-INFLATION = "noise.ln_f"
 NEAR_LINEAR = ("throughput", "standard")
 
 
