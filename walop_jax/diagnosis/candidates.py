@@ -52,7 +52,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.plan import hours_of
 from walop_jax.model.ray import CONDITIONS
-from walop_jax.model.responses import acts
+from walop_jax.model.slots import acts
 from walop_jax.sky.nights import first_of_nights
 
 DEFAULT_WIDTH = 1.0

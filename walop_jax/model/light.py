@@ -143,18 +143,23 @@ def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float
     else:
         rows = at(wavelength)
     weights = band_weights(instrument, plan)
+    return in_bands(instrument, integrated(plan, weights, rows), weights @ wavelength)
+
+
+def integrated(
+    plan: Plan, weights: Float[Array, "b n"], rows: Float[Array, "*s c n r 4"]
+) -> Float[Array, "*s b r 4"]:
+    """Sums over the nodes of every band, each in its own state."""
     sizes = {last - first for _, first, last in plan.settings}
     if len(sizes) == 1 and len(plan.settings) > FEW_SETTINGS:
         own = weights.reshape(len(plan.settings), *sizes, -1)
-        bands = jnp.einsum("cbn,cnrs->cbrs", own, rows).reshape(-1, *rows.shape[2:])
-    else:
-        bands = jnp.concatenate(
-            [
-                jnp.einsum("bn,nrs->brs", weights[first:last], rows[i])
-                for i, (_, first, last) in enumerate(plan.settings)
-            ]
-        )
-    return in_bands(instrument, bands, weights @ wavelength)
+        bands = jnp.einsum("cbn,...cnrs->...cbrs", own, rows)
+        return bands.reshape(*rows.shape[:-4], -1, *rows.shape[-2:])
+    parts = [
+        jnp.einsum("bn,...nrs->...brs", weights[first:last], rows[..., i, :, :, :])
+        for i, (_, first, last) in enumerate(plan.settings)
+    ]
+    return jnp.concatenate(parts, axis=-3)
 
 
 def in_bands(

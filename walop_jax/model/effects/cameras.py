@@ -11,7 +11,7 @@ Symbols     a amplitude, f product of the factors; the place is a camera, or an 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -27,6 +27,7 @@ from walop_jax.model.effects.change import (
     Change,
     Grows,
     Kind,
+    Part,
     Scalar,
     Term,
     in_exposures,
@@ -136,7 +137,7 @@ def stage_of(change: Change) -> str:
     if change.kind == "light":
         return "opposite" if change.origin == OPPOSITE else "mixed" if change.origin else "median"
     if change.kind != "gain":
-        return {"reported gain": "reported", "afterglow": "afterglow", "shade": "throughput"}[change.kind]
+        return {"reported gain": "reported", "afterglow": "afterglow"}[change.kind]
     if "counts" in change.factors:
         return "square"
     still = all(one.depends_on in (FIELD, WAVELENGTH) for one in change.grows_with)
@@ -177,13 +178,27 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     return Grows(_WITH.get(stage_of(change), ()), None)
 
 
+def _slots(instrument: Instrument, change: Change) -> Iterator[Part]:
+    """A stage and the cameras; what acts on the analysis vectors: camera by camera, or target and origin."""
+    stage, cameras = stage_of(change), cameras_of(instrument, change.place)
+    if stage == "mixed":
+        origin = cameras_of(instrument, change.origin)
+        yield Part((stage, cameras.index(1.0), origin.index(1.0)), 1.0, change.factors)
+    elif stage == "throughput":
+        for camera in np.flatnonzero(cameras):
+            yield Part((stage, int(camera)), 1.0, change.factors)
+    else:
+        yield Part((stage, cameras), 1.0, change.factors)
+
+
 _OF_GAINS = "a lamp that does not change, seen by all cameras in turn"
-KINDS |= {
-    "gain": Kind("share", _patch, stage_of, _OF_GAINS, _grows),
-    "reported gain": Kind("share", _patch, stage_of, _OF_GAINS, _grows),
-    "afterglow": Kind("share", _patch, stage_of, "a dark exposure after a bright one", _grows),
-    "light": Kind("share", _patch, stage_of, "the same field points at another flux, and darks", _grows),
+_TESTS = {
+    "gain": _OF_GAINS,
+    "reported gain": _OF_GAINS,
+    "afterglow": "a dark exposure after a bright one",
+    "light": "the same field points at another flux, and darks",
 }
+KINDS |= {name: Kind("share", _patch, stage_of, test, _grows, _slots) for name, test in _TESTS.items()}
 
 
 def cameras_of(instrument: Instrument, place: str) -> Weights:

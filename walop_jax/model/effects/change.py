@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import operator
 import re
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any, NamedTuple, Self
@@ -33,6 +34,8 @@ from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays
 
 Term = tuple["Change", Scalar]
+Given = str | Callable[[Any], Any]
+"""A factor: a text, or a function of the quantities that factors may ask for."""
 OPPOSITE = "opposite"  # the field point, as an origin of light
 SKY, BAND = "sky", "band"  # places that are no element
 
@@ -68,12 +71,38 @@ class Grows(NamedTuple):
     angle: str | None = ""
 
 
+class NoSlotError(ValueError):
+    """A change that is no sum of slots to first order: its own derivative is needed."""
+
+
+class Part(NamedTuple):
+    """A part of a change to first order: a slot of the light path (`model.slots`), a coefficient, factors."""
+
+    slot: tuple[Any, ...]
+    size: float
+    factors: tuple[Given, ...]
+
+
+Parts = Callable[["Instrument", "Change"], Iterable[Part]]
+
+
+def no_slots(instrument: Instrument, change: Change) -> Iterable[Part]:
+    """Parts of changes that have none."""
+    raise NoSlotError(change.text)
+
+
+def itself(stage: str) -> Parts:
+    """Parts of changes that are slots themselves: without their factors, at a stage of the light path."""
+    return lambda _, change: [Part((stage, change.kind, change.where, change.place), 1.0, change.factors)]
+
+
 @dataclasses.dataclass(frozen=True)
 class Kind:
     """A kind of change: one of `AMPLITUDES`, what changes of some amplitudes make of an instrument, what would show it.
 
     Changes for which `patch` and `together` are equal are patched together. `patch` and `grows` raise
-    `NoSuchPlaceError` where an instrument has no such place, ValueError for a change that cannot be made.
+    `NoSuchPlaceError` where an instrument has no such place, ValueError for a change that cannot be made. `slots` are
+    its parts to first order; it raises `NoSlotError` for a change that has none.
     """
 
     parameter: str
@@ -81,6 +110,7 @@ class Kind:
     together: Callable[[Change], Hashable] = lambda change: change
     test: str = ""
     grows: Callable[[Instrument, Change], Grows] = lambda instrument, change: Grows()
+    slots: Parts = no_slots
 
 
 KINDS: dict[str, Kind] = {}
@@ -97,7 +127,7 @@ class Change:
     kind: str
     where: str
     place: str
-    factors: tuple[Any, ...] = ()  # texts; a column may be taken with a function of the exposures instead
+    factors: tuple[Given, ...] = ()
     origin: str = ""
     units: Units = OF_WALOP
 
@@ -124,8 +154,8 @@ class Change:
 
     @property
     def grows_with(self) -> tuple[Factor, ...]:
-        """Its factors."""
-        return tuple(map(factor, self.factors))
+        """Its factors that have a text."""
+        return tuple(factor(one) for one in self.factors if isinstance(one, str))
 
     def counted_in(self, units: Units) -> Change:
         """The change of an instrument with its scales."""
@@ -161,11 +191,8 @@ class Change:
         return found[0]
 
     def factor(self, at: Any) -> Any:
-        """Product of its factors (`Factor.value`), 1 without any."""
-        product: Any = 1.0
-        for each in self.grows_with:
-            product = product * each.value(at, self.units)
-        return product
+        """Product of its factors, 1 without any."""
+        return product(self.factors, at, self.units)
 
     def in_train(self, ray: Ray, angle: Any) -> Any:
         """Product of its factors for a ray, in an element that stands at `angle` (deg)."""
@@ -244,6 +271,12 @@ def patched(instrument: Instrument, terms: Iterable[Term]) -> Instrument:
     for (patch, _), some in together.items():
         instrument = patch(instrument, some)
     return instrument
+
+
+def product(factors: Iterable[Given], at: Any, units: Units) -> Any:
+    """Product of factors, 1 without any."""
+    each = (factor(one).value(at, units) if isinstance(one, str) else one(at) for one in factors)
+    return functools.reduce(operator.mul, each, 1.0)
 
 
 def add(size: Scalar) -> Any:

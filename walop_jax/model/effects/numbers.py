@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 
 import jax.numpy as jnp
 
-from walop_jax.model.effects.change import BAND, KINDS, SKY, Change, Grows, Kind, Term, add
+from walop_jax.model.effects.change import (
+    BAND,
+    KINDS,
+    SKY,
+    Change,
+    Grows,
+    Kind,
+    NoSlotError,
+    Part,
+    Term,
+    add,
+    itself,
+)
 from walop_jax.model.effects.factors import EXPOSURE, FIELD, WAVELENGTH
 from walop_jax.model.elements import WavePlate
 from walop_jax.model.elements.wave_plate import Grown
@@ -40,6 +52,12 @@ def _of_plate(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
         grown = Grown(size, jnp.zeros(()), change)
         instrument = instrument.changed(change.place, grown=lambda there, one=grown: (*there, one))
     return instrument
+
+
+def _slots_of_plate(instrument: Instrument, change: Change) -> Iterator[Part]:
+    if "colour" in change.factors:  # a slot is the same at all wavelengths
+        raise NoSlotError(change.text)
+    yield from itself("number")(instrument, change)
 
 
 def _of_instrument(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -93,13 +111,27 @@ def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return instrument
 
 
+def _slots_of_source(instrument: Instrument, change: Change) -> Iterator[Part]:
+    """Of the light: q or u of a star has its number in the list."""
+    names = [name.replace(" ", "_") for name in instrument.standard.names]
+    star = (names.index(change.place),) if change.place in names else ()
+    place = "standard" if star else change.place
+    yield Part(("light", change.kind, change.where, place, *star), 1.0, change.factors)
+
+
 NUMBERS = {"axis": "angle", "cut": "angle", "thickness": "length", "thermal": "number"}
 """Kinds that are numbers of wave plates, of layers of them (µm, deg), and their amplitudes."""
-KINDS |= {name: Kind(amplitude, _of_plate, grows=_with_ray) for name, amplitude in NUMBERS.items()}
-KINDS |= {name: Kind("share", _number) for name in ("extinction", "ellipticity")}
+KINDS |= {
+    name: Kind(amplitude, _of_plate, grows=_with_ray, slots=_slots_of_plate)
+    for name, amplitude in NUMBERS.items()
+}
+OF_POLARISER = ("extinction", "ellipticity")
+KINDS |= {name: Kind("share", _number, slots=itself("light")) for name in OF_POLARISER}
 _OF_BAND = "narrow bands beside the broad one"  # filters wider than `light.BROAD` are displaced
-KINDS["shift"] = Kind("wavelength", _of_instrument, test=_OF_BAND)
+KINDS["shift"] = Kind("wavelength", _of_instrument, test=_OF_BAND, slots=itself("whole"))
 _OF_ROTATOR = "a polariser aligned in the laboratory: an independent zero of the angle"
-KINDS["rotator"] = Kind("angle", _of_instrument, test=_OF_ROTATOR)
+KINDS["rotator"] = Kind("angle", _of_instrument, test=_OF_ROTATOR, slots=itself("light"))
 _OF_SOURCE = "the same patch or star again at another ROTATOR angle"
-KINDS |= {name: Kind("share", _polarised, _patches, _OF_SOURCE, _of_patch) for name in OF_SOURCES}
+KINDS |= {
+    name: Kind("share", _polarised, _patches, _OF_SOURCE, _of_patch, _slots_of_source) for name in OF_SOURCES
+}
