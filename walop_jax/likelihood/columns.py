@@ -123,7 +123,7 @@ class _AtPoint(NamedTuple):
     opposite: Float[Array, "e k"]  # of extended sources
     flux: Float[Array, "e f"]
     electrons: Float[Array, "e k"]
-    reported: Float[Array, "e k"]
+    added: dict[str, Float[Array, "e k"]]  # `ADDED` to the counts as they are reported
     along: Float[Array, "e k"]
 
 
@@ -158,7 +158,8 @@ def _at_point(instrument: Instrument, plan: Plan, point: PointData) -> _AtPoint:
     )
     share, ghost = jnp.stack([one, seen])[:sites], Ghost(jnp.ones(unit.shape[1]))
     opposite = ghost.seen(point.source < 0, opposite)
-    return _AtPoint(vectors, lights, share, counts, opposite, flux, flux * unit, reported, along)
+    added = {stage: add(reported, plan.exposures) for stage, add in ADDED.items() if stage != "median"}
+    return _AtPoint(vectors, lights, share, counts, opposite, flux, flux * unit, added, along)
 
 
 def _fringes(
@@ -460,11 +461,12 @@ class ResponseBlock:
             return self._pairs(found.counts * cameras) * self.share * self.flux
         if stage == "opposite":
             return self._alone(found.opposite * cameras) * self.flux
-        exposures = self.of.plan.exposures
-        if stage == "median":
-            exposures = dataclasses.replace(exposures, median_counts=self.of.median)
-        added = jax.vmap(lambda counts: ADDED[stage](counts, exposures))(found.reported)
-        return self._alone(np.asarray(added) * cameras) * (self.weight if self.linear else 1.0)
+        added = (
+            np.broadcast_to(self.of.median, found.electrons.shape)
+            if stage == "median"
+            else found.added[stage]
+        )
+        return self._alone(added * cameras) * (self.weight if self.linear else 1.0)
 
     def _alone(self, values: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "m k n"]:
         """Values that come in once, whatever sites there are."""

@@ -8,6 +8,7 @@ elements of one class over together: the half-wave plates are one computation, c
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import jax.numpy as jnp
@@ -109,10 +110,57 @@ def _branched(
     return (rows if order == list(range(len(keys))) else rows[np.array(order)]), list(parents)
 
 
+def around(
+    common: Sequence[Station],
+    arms: Sequence[Sequence[Station]],
+    analysers: Sequence[Analyser],
+    matrices: Solved,
+    moving: Sequence[str],
+    states: Sequence[State],
+    nodes: int,
+) -> list[tuple[Float[Array, "c n r 4"], Float[Array, "c n 4 4"]]]:
+    """For every station, in every state: rows that the analysers see of light behind it, and the matrix ahead of it.
+
+    A change of the matrix of a station changes the rows by (rows behind it) × change × (matrix ahead of it).
+    """
+    every = [*common, *(station for arm in arms for station in arm)]
+    own = [stacked(matrices, i, element, moving, states) for i, (element, _) in enumerate(every)]
+    eye, shape = jnp.eye(4), (len(states), nodes)
+    seen = [analyser.seen(eye) for analyser in analysers]
+    blank = jnp.zeros((*shape, sum(map(len, seen)), 4))
+    found: dict[int, tuple[Array, Array]] = {}
+    row, first = 0, len(common)
+    for arm, analysed in zip(arms, seen, strict=True):
+        path = [*range(len(common)), *range(first, first + len(arm))]
+        rows, start = (
+            blank.at[:, :, row : row + len(analysed)].set(analysed),
+            jnp.broadcast_to(eye, (*shape, 4, 4)),
+        )
+        row, first = row + len(analysed), first + len(arm)
+        ahead = itertools.accumulate((own[i] for i in path), _behind, initial=start)
+        behind = [*itertools.accumulate((own[i] for i in reversed(path)), _ahead, initial=rows)][-2::-1]
+        for i, here, there in zip(path, behind, ahead, strict=False):
+            found[i] = (found[i][0] + here if i in found else here), there
+    return [found[i] for i in range(len(every))]
+
+
+def _behind(matrix: Array, own: Mueller | None) -> Array:
+    return matrix if own is None else own @ matrix
+
+
+def _ahead(rows: Array, own: Mueller | None) -> Array:
+    return rows if own is None else rows @ own
+
+
 def stacked(
-    matrices: Solved, number: int, element: Element, moving: Sequence[str], keys: Sequence[State]
+    matrices: Solved,
+    number: int,
+    element: Element,
+    moving: Sequence[str],
+    keys: Sequence[State],
+    out: Mueller | None = None,
 ) -> Mueller | None:
-    """Matrices of a station in every state, None where it is the identity in all."""
+    """Matrices of a station in every state, `out` (the identity) where it is out; None where it never acts."""
     if element.moves is None:
         return matrices[number, None]
     angles = positions(element, moving, keys)
@@ -122,8 +170,8 @@ def stacked(
     if not inside:
         return None
     whole = np.broadcast_shapes(*(matrix.shape for matrix in inside))
-    eye = jnp.broadcast_to(jnp.eye(4), whole)
-    stack = jnp.stack([eye if m is None else jnp.broadcast_to(m, whole) for m in own])
+    gone = jnp.broadcast_to(jnp.eye(4) if out is None else out, whole)
+    stack = jnp.stack([gone if m is None else jnp.broadcast_to(m, whole) for m in own])
     if len(distinct) < len(angles):
         stack = stack[np.array([distinct.index(at) for at in angles])]
     return stack if len(whole) == 3 else stack[:, None]

@@ -38,6 +38,7 @@ from walop_jax.model.effects.numbers import OF_POLARISER, OF_SOURCES
 from walop_jax.model.effects.optics import ADDED, DISPLACEMENTS, GENERATORS, matrix_of, with_air_gap
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
 from walop_jax.model.elements.base import Mueller
+from walop_jax.model.elements.wave_plate import fringe
 from walop_jax.model.instrument import Instrument, Scalar
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
 from walop_jax.model.parameters import shapes_of
@@ -180,11 +181,11 @@ class VectorSlopes(NamedTuple):
 
 
 class _Banded(NamedTuple):
-    """Band sums of the rows that the analysers see, and their slopes: generators at places, plates, all together."""
+    """Band sums of the rows that the analysers see, and slopes: of generators at places, of plates, all together."""
 
     rows: Float[Array, "b r 4"]
     inserted: Float[Array, "m g h b r 4"]
-    plates: Float[Array, "w t b r 4"]
+    plates: Float[Array, "w g t b r 4"]
     whole: Float[Array, "u b r 4"]
 
 
@@ -199,27 +200,26 @@ def vector_slopes(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> V
         terms += [(Change(*slot[1:]), size) for slot, size in zip(whole, sizes[most:], strict=True)]
         return patched(instrument, terms)
 
-    def mean(sizes: Float[Array, " t"]) -> Float[Array, " b"]:
-        own = moved(sizes)
+    def mean(shift: Scalar) -> Float[Array, " b"]:
+        own = patched(instrument, [(Change(*whole[-1][1:]), shift)])
         return light.band_weights(own, plan) @ light.node_wavelengths(own, plan)
 
-    nothing = jnp.zeros(most + len(whole))
-    found = _banded(instrument, plan, x, y, moved, (most, len(whole)))
+    found = _banded(plan, (x, y), moved, (most, len(whole)), jnp.zeros(1))
     rows = [part.reshape(-1, *found.rows.shape) for part in found[1:]]
-    means = jax.jacfwd(mean)(nothing).T
-    throughput, pairs = instrument.throughput.at(x, y), list(np.ndindex(cameras, cameras))
+    throughput, pairs = instrument.throughput.at(x, y), tuple(np.ndindex(cameras, cameras))
+    wavelength, shifted = jax.jvp(mean, (jnp.zeros(()),), (jnp.ones(()),))
+    means = jnp.zeros((sum(map(len, rows)), len(wavelength))).at[-1].set(shifted)
 
     def vectors(rows: Array, mean: Array, throughput: Array, shares: Array) -> Float[Array, "b k 4"]:
         beams = light.beams(instrument, light.in_bands(instrument, rows, mean))
         own = light.behind_throughput(instrument, beams, throughput, x, y)
-        return CrossTalk(tuple(shares), tuple(pairs)).vectors(own, x, y)
+        return CrossTalk(tuple(shares), pairs).vectors(own, x, y)
 
-    neutral = found.rows, mean(nothing), throughput, jnp.zeros(len(pairs))
+    neutral = found.rows, wavelength, throughput, jnp.zeros(len(pairs))
     value, push = jax.linearize(vectors, *neutral)
     none = [jnp.zeros_like(one) for one in neutral]
     slopes = (
-        jax.vmap(lambda one: push(one, *none[1:]))(jnp.concatenate(rows[:2])),
-        jax.vmap(lambda one, mean: push(one, mean, *none[2:]))(rows[2], means[most:]),
+        jax.vmap(lambda one, mean: push(one, mean, *none[2:]))(jnp.concatenate(rows), means),
         jax.vmap(lambda one: push(*none[:2], one, none[3]))(jnp.diag(throughput)),
         jax.vmap(lambda one: push(*none[:3], one))(jnp.eye(len(pairs))),
     )
@@ -231,23 +231,20 @@ def fringe_slopes(
 ) -> Float[Array, "w g b k 4"]:
     """Slopes in the contrast of fringes of air ahead of every plate of `fringe_places`, by its thickness (µm)."""
     instrument = instrument.patched()
-    places, throughput = fringe_places(instrument), instrument.throughput.at(x, y)
+
+    def moved(sizes: Float[Array, " t"]) -> Instrument:
+        def with_air(own: Instrument, place: str) -> Instrument:
+            return with_air_gap(own, place, sizes[0], jnp.zeros(()))
+
+        return functools.reduce(with_air, fringe_places(instrument), instrument)
+
+    def vectors(rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
+        beams = light.beams(instrument, light.in_bands(instrument, rows, mean))
+        return light.behind_throughput(instrument, beams, instrument.throughput.at(x, y), x, y)
+
     mean = light.band_weights(instrument, plan) @ light.node_wavelengths(instrument, plan)
-
-    def of_gap(gap: Scalar) -> Float[Array, "w b k 4"]:
-        def moved(sizes: Float[Array, " t"]) -> Instrument:
-            return functools.reduce(
-                lambda own, place: with_air_gap(own, place, sizes[0], gap), places, instrument
-            )
-
-        def vectors(rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
-            beams = light.beams(instrument, light.in_bands(instrument, rows, mean))
-            return light.behind_throughput(instrument, beams, throughput, x, y)
-
-        found = _banded(instrument, plan, x, y, moved, (1, 0))
-        return jax.vmap(jax.linearize(vectors, found.rows)[1])(found.plates[:, 0])
-
-    return jax.vmap(of_gap, out_axes=1)(gaps)
+    found = _banded(plan, (x, y), moved, (1, 0), gaps)
+    return jax.vmap(jax.vmap(jax.linearize(vectors, found.rows)[1]))(found.plates[:, :, 0])
 
 
 def fringe_places(instrument: Instrument) -> tuple[str, ...]:
@@ -256,89 +253,88 @@ def fringe_places(instrument: Instrument) -> tuple[str, ...]:
 
 
 def _banded(
-    instrument: Instrument,
     plan: Plan,
-    x: Scalar,
-    y: Scalar,
+    at: tuple[Scalar, Scalar],
     moved: Callable[[Float[Array, " t"]], Instrument],
     sizes: tuple[int, int],
+    gaps: Float[Array, " g"],
 ) -> _Banded:
-    """Slopes in the sizes of `moved`: those of single plates first, then those of the train as a whole."""
+    """Band sums at a field point, and their slopes in the sizes of `moved`: of single plates, then of the whole train.
 
-    def at(stretch: Scalar) -> _Banded:
-        return _at_stretch(instrument, plan, (x, y, stretch), moved, sizes)
+    Those of plates are multiplied by fringes of air of some thicknesses (µm).
+    """
+
+    def stretched(stretch: Scalar) -> _Banded:
+        return _summed(plan, (*at, stretch), moved, sizes, gaps)
 
     one = jnp.ones(())
-    if not light.is_dispersed(instrument):
-        return at(one)
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-2), *jax.jvp(at, (one,), (one,)))
+    if not light.is_dispersed(moved(jnp.zeros(sum(sizes)))):
+        return stretched(one)
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-2), *jax.jvp(stretched, (one,), (one,)))
 
 
-def _at_stretch(
-    instrument: Instrument,
+def _summed(
     plan: Plan,
     at: tuple[Scalar, Scalar, Scalar],
     moved: Callable[[Float[Array, " t"]], Instrument],
     sizes: tuple[int, int],
+    gaps: Float[Array, " g"],
 ) -> _Banded:
-    """The same at a field point and at wavelengths times a factor."""
+    """The same at wavelengths times a factor, the last of `at`."""
     x, y, stretch = at
     states, conditions = [state for state, _, _ in plan.settings], plan.conditions
     if "temperature" not in conditions.planned:  # the thermal change of one kelvin
         warm = jnp.full_like(plan.wavelength, REFERENCE_TEMPERATURE + 1.0)
         conditions = Conditions(conditions.band_width, {**conditions.planned, "temperature": warm})
 
-    def stations(own: Instrument) -> tuple[list[fold.Station], list[list[fold.Station]], Array]:
-        wavelength, (common, arms) = stretch * light.node_wavelengths(own, plan), _with_places(own)
-        first, ray = fold.stations(common, Ray.entering(x, y, (wavelength, conditions)))
-        return first, [fold.stations(arm, ray)[0] for arm in arms], wavelength
+    def stations(own: Instrument) -> tuple[list[fold.Station], list[list[fold.Station]]]:
+        common, arms = _with_places(own)
+        spectrum = stretch * light.node_wavelengths(own, plan), conditions
+        first, ray = fold.stations(common, Ray.entering(x, y, spectrum))
+        return first, [fold.stations(arm, ray)[0] for arm in arms]
 
-    def solved(sizes: Float[Array, " t"]) -> tuple[fold.Solved, Array]:
-        common, arms, _ = stations(own := moved(sizes))
+    def solved(sizes: Float[Array, " t"]) -> tuple[fold.Solved, Float[Array, "b n"]]:
+        common, arms = stations(own := moved(sizes))
         every = [*common, *itertools.chain(*arms)]
         return fold.solved(every, plan.moving, states), light.band_weights(own, plan)
 
-    nothing = jnp.zeros(sum(sizes))
-    (matrices, weights), push = jax.linearize(solved, nothing)
+    single, together = sizes
+    nothing = jnp.zeros(single + together)
+    neutral, ((matrices, weights), push) = moved(nothing), jax.linearize(solved, nothing)
     slopes, weight_slopes = jax.vmap(push)(jnp.eye(len(nothing)))
-    common, arms, wavelength = stations(moved(nothing))
-    elements = [element for element, _ in (*common, *itertools.chain(*arms))]
+    (common, arms), analysers = stations(neutral), [arm.analyser for arm in neutral.arms]
+    around = fold.around(common, arms, analysers, matrices, plan.moving, states, len(plan.wavelength))
+    rows, generators, sums = around[0][0], _generators(), functools.partial(light.integrated, plan)
+    wavelength = stretch * light.node_wavelengths(neutral, plan)
+    moments = weights, weights * (wavelength / neutral.units.wavelength - 1.0)
+    inserted, plates, whole = [], [], jnp.zeros((together, *rows.shape))
+    for number, (element, ray) in enumerate([*common, *itertools.chain(*arms)]):
+        behind, ahead = around[number]
+        if isinstance(element, _Place):
+            pairs = jnp.einsum("cnri,cnjk->ijcnrk", behind, ahead)
+            both = jnp.stack([sums(own, pairs) for own in moments])
+            inserted.append(jnp.einsum("gij,mijbrk->mgbrk", generators, both))
+            continue
+        first = 0 if _is_plate(element) else single
+        own = {key: some[first:] for key, some in slopes.items() if key[0] == number and some is not None}
 
-    def rows(changed: fold.Solved) -> Float[Array, "c n r 4"]:
-        analysers, own = [arm.analyser for arm in instrument.arms], {**matrices, **changed}
-        return fold.backward(common, arms, analysers, own, plan.moving, states, len(wavelength))
+        def pushed(some: fold.Solved, at: Any = (number, element), around: Any = (behind, ahead)) -> Array:
+            matrix = fold.stacked(some, *at, plan.moving, states, out=jnp.zeros((4, 4)))
+            return around[0] @ matrix @ around[1]
 
-    def pushed(change: fold.Solved, count: int) -> Float[Array, "t c n r 4"]:
-        """Rows for changes of some matrices."""
-        if not count or not change:
-            return jnp.zeros((count, *neutral.shape))
-        there = {key: jnp.eye(4) if matrices[key] is None else matrices[key] for key in change}
-        return jax.vmap(lambda one: jax.jvp(rows, (there,), (one,))[1])(change)
-
-    neutral, (single, together) = rows({}), sizes
-    alive = {key: slope for key, slope in slopes.items() if slope is not None}
-    inserted = [
-        pushed({(i, None): _generators()}, len(GENERATORS))
-        for i, one in enumerate(elements)
-        if isinstance(one, _Place)
-    ]
-    plates = [
-        pushed({key: slope[:single] for key, slope in alive.items() if key[0] == i}, single)
-        for i, one in enumerate(elements)
-        if _is_plate(one)
-    ]
-    whole = pushed({key: slope[single:] for key, slope in alive.items()}, together)
-    colour = wavelength / instrument.units.wavelength - 1.0
-    moments = [light.integrated(plan, own, jnp.stack(inserted, 1)) for own in (weights, colour * weights)]
-    blank = jnp.zeros((0, single, *neutral.shape))
-    of_whole = light.integrated(plan, weights, whole)
-    if together:
-        of_whole += jax.vmap(lambda own: light.integrated(plan, own, neutral))(weight_slopes[single:])
+        count = len(nothing) - first
+        change = jax.vmap(pushed)(own) if own and count else jnp.zeros((count, *rows.shape))
+        whole = whole + change[single - first :]
+        if _is_plate(element):
+            fringes = jax.vmap(lambda gap, ray=ray: fringe(gap, ray))(gaps)
+            plates.append(jax.vmap(lambda wave, some=change[:single]: sums(wave * weights, some))(fringes))
+    none = jnp.zeros((0, len(gaps), single, *sums(weights, rows).shape))
+    shifted = jax.vmap(lambda own: sums(own, rows))(weight_slopes[single:])
     return _Banded(
-        light.integrated(plan, weights, neutral),
-        jnp.stack(moments),
-        light.integrated(plan, weights, jnp.stack(plates) if plates else blank),
-        of_whole,
+        sums(weights, rows),
+        jnp.stack(inserted, 2),
+        jnp.stack(plates) if plates else none,
+        sums(weights, whole) + shifted,
     )
 
 
