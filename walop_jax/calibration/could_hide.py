@@ -158,8 +158,8 @@ def acting_effects(calibration: Calibration) -> Mapping[int, Effect]:
 def moves_with(effect: Effect, instrument: Instrument) -> frozenset[str]:
     """Column prefixes of the moving elements that an effect is all about: it does nothing where these are out."""
     bare = dataclasses.replace(instrument, effects=())
-    common, arms = slots.trains(bare.patched())
-    moving = {one.name: one.moves for train in (common, *arms) for one in train if one.moves is not None}
+    every = itertools.chain(*slots.trains(bare.patched()).values())
+    moving = {one.name: one.moves for one in every if one.moves is not None}
     found: set[str] = set()
     for _, change in itertools.chain.from_iterable(effect.first_order(bare)):
         own = {moving[name] for name in change.place.split(".") if name in moving}

@@ -118,30 +118,29 @@ def around(
     moving: Sequence[str],
     states: Sequence[State],
     nodes: int,
-) -> list[tuple[Float[Array, "c n r 4"], Float[Array, "c n 4 4"]]]:
-    """For every station, in every state: rows that the analysers see of light behind it, and the matrix ahead of it.
+) -> list[list[tuple[Float[Array, "c n r 4"], Float[Array, "c n 4 4"]]]]:
+    """For every place of the common train and of the arms: rows that the analysers see of light there, in every state,
+    and the matrix of what is ahead of it.
 
     A change of the matrix of a station changes the rows by (rows behind it) × change × (matrix ahead of it).
     """
     every = [*common, *(station for arm in arms for station in arm)]
     own = [stacked(matrices, i, element, moving, states) for i, (element, _) in enumerate(every)]
-    eye, shape = jnp.eye(4), (len(states), nodes)
-    seen = [analyser.seen(eye) for analyser in analysers]
-    blank = jnp.zeros((*shape, sum(map(len, seen)), 4))
-    found: dict[int, tuple[Array, Array]] = {}
-    row, first = 0, len(common)
+    start = jnp.broadcast_to(jnp.eye(4), (len(states), nodes, 4, 4))
+    seen = [analyser.seen(jnp.eye(4)) for analyser in analysers]
+    blank = jnp.zeros((len(states), nodes, sum(map(len, seen)), 4))
+    found, row, first, count = [], 0, len(common), len(common)
     for arm, analysed in zip(arms, seen, strict=True):
-        path = [*range(len(common)), *range(first, first + len(arm))]
-        rows, start = (
-            blank.at[:, :, row : row + len(analysed)].set(analysed),
-            jnp.broadcast_to(eye, (*shape, 4, 4)),
-        )
+        path = [*own[:count], *own[first : first + len(arm)]]
+        last = blank.at[:, :, row : row + len(analysed)].set(analysed)
         row, first = row + len(analysed), first + len(arm)
-        ahead = itertools.accumulate((own[i] for i in path), _behind, initial=start)
-        behind = [*itertools.accumulate((own[i] for i in reversed(path)), _ahead, initial=rows)][-2::-1]
-        for i, here, there in zip(path, behind, ahead, strict=False):
-            found[i] = (found[i][0] + here if i in found else here), there
-    return [found[i] for i in range(len(every))]
+        rows = [*itertools.accumulate(reversed(path), _ahead, initial=last)][::-1]
+        places = [*zip(rows, itertools.accumulate(path, _behind, initial=start), strict=True)]
+        found.append((places[: count + 1], places[count:]))
+    whole = [
+        (sum(rows for rows, _ in same), same[0][1]) for same in zip(*(one for one, _ in found), strict=True)
+    ]
+    return [whole, *(arm for _, arm in found)]
 
 
 def _behind(matrix: Array, own: Mueller | None) -> Array:

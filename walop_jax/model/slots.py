@@ -1,9 +1,8 @@
 """Slots: places of the light path at which it may be otherwise, and what a little of it there does to the light.
 
 A slot is a change without factors (`effects.change`), or a part of one; what a change is in slots, its kind says
-(`Kind.slots`). What multiplies a change, over the field or from exposure to exposure, multiplies its slot. At the point
-at which nothing is changed the light path is differentiated in all slots at once: elements, fold, band integral and
-patches are those that light takes.
+(`Kind.slots`). What multiplies a change, over the field or from exposure to exposure, multiplies its slot. Elements,
+fold, band integral and patches are those that light takes, differentiated where nothing is changed.
 
     inserted    generators (`optics.GENERATORS`) at every place between two elements, by themselves and × (λ/λ₀ − 1)
     number      axis and thermal change of every wave plate; thickness, axis and cut of each of its layers
@@ -12,9 +11,9 @@ patches are those that light takes.
     fringes     of air ahead of a wave plate, which take more wavelength nodes than all others
     light       of sources, ahead of the polariser and of it: Stokes vectors behind it
 
-Method      The rows that the analysers see are linear in the matrix of every station, so a change of that one is pushed
-            through the fold alone; slots of different stations share the derivatives of their matrices.
-Symbols     s slots, g generators, t changes of matrices, b bands, k cameras, r rows, c states, n nodes
+Method      The rows that the analysers see are linear in the matrix M of every element: δrows = (rows behind it) δM
+            (matrix ahead of it), and δM of all elements in the same numbers come from one derivative.
+Symbols     s slots, g generators, t changes of numbers, b bands, k cameras, r rows, c states, n nodes
 Limits      first order.
 """
 
@@ -22,7 +21,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -37,7 +36,6 @@ from walop_jax.model.effects.change import BAND, SKY, Change, patched
 from walop_jax.model.effects.numbers import OF_POLARISER, OF_SOURCES
 from walop_jax.model.effects.optics import ADDED, DISPLACEMENTS, GENERATORS, matrix_of, with_air_gap
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
-from walop_jax.model.elements.base import Mueller
 from walop_jax.model.elements.wave_plate import fringe
 from walop_jax.model.instrument import Instrument, Scalar
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
@@ -47,35 +45,19 @@ from walop_jax.model.ray import CONDITIONS, Conditions, Ray
 from walop_jax.model.sources import MoonPatches, MoonSky, Sight, Standards
 
 Slot = tuple[Any, ...]
+Moved = Callable[[Float[Array, " t"]], Instrument]
 OF_PLATE, OF_LAYER = ("axis", "thermal"), ("thickness", "axis", "cut")
 
 
-class _Place(Element):
-    """A place of a train at which there is nothing."""
-
-    @classmethod
-    def solved(cls, cases: Sequence[tuple[Any, Ray]]) -> list[Mueller | None]:
-        return [None] * len(cases)
+# --------------------------------------------------------------------------------------------- names of the slots
 
 
-# ------------------------------------------------------------------------------------------------- places and names
-
-
-def trains(instrument: Instrument) -> tuple[tuple[Element, ...], tuple[tuple[Element, ...], ...]]:
-    """The elements behind the polariser, and those of the arms, of an instrument without effects (`patched`)."""
-    return instrument.behind_polariser(), tuple(tuple(arm.train()) for arm in instrument.arms)
-
-
-def _with_places(instrument: Instrument) -> tuple[tuple[Element, ...], tuple[tuple[Element, ...], ...]]:
-    """The same with every place that differs in what acts behind it: of an only arm the first does not."""
-
-    def each(elements: Iterable[Element], first: bool) -> Iterator[Element]:
-        yield from [_Place()] * first
-        for element in elements:
-            yield from (element, _Place()) if acts(element) else (element,)
-
-    common, arms = trains(instrument)
-    return tuple(each(common, True)), tuple(tuple(each(arm, len(arms) > 1)) for arm in arms)
+def trains(instrument: Instrument) -> dict[str, tuple[Element, ...]]:
+    """The elements behind the polariser (of an instrument `patched`) and those of the arms, by the beginnings of names."""
+    return {
+        "": instrument.behind_polariser(),
+        **{f"{arm.name}.": tuple(arm.train()) for arm in instrument.arms},
+    }
 
 
 def acts(element: Element) -> bool:
@@ -95,28 +77,12 @@ def _acts(structure: Any, shapes: Any) -> bool:
     return jax.eval_shape(run, *(jax.ShapeDtypeStruct(s, d) for s, d in shapes)) is not None
 
 
-def _places(instrument: Instrument) -> dict[tuple[str, str], int]:
-    """Number of the place ahead of, behind and at every element."""
-    polariser, (common, arms) = instrument.polariser, _with_places(instrument)
-    found = {} if polariser is None else {("behind", polariser.name): 0}
-    numbers = itertools.count()
-
-    def follow(elements: Iterable[Element], prefix: str, at: int) -> int:
-        name = ""
-        for element in elements:
-            if isinstance(element, _Place):
-                at = next(numbers)
-            else:
-                name = prefix + element.name
-                found["ahead of", name] = at
-            if name:
-                found["behind", name] = found["of", name] = at
-        return at
-
-    behind = follow(common, "", 0)
-    for arm, elements in zip(instrument.arms, arms, strict=True):
-        last = follow(elements, f"{arm.name}.", behind)
-        found["ahead of", f"{arm.name}.{arm.analyser.name}"] = last
+def _places(instrument: Instrument) -> list[list[int]]:
+    """Number of the place behind so many elements of each train: the same where nothing acts in between."""
+    number, found = -1, []
+    for train, elements in enumerate(trains(instrument).values()):
+        number += train == 0 or len(instrument.arms) > 1
+        found.append([number, *(number := number + acts(element) for element in elements)])
     return found
 
 
@@ -124,49 +90,54 @@ def _is_plate(element: Element) -> bool:
     return isinstance(element, WavePlate) and bool(element.layers)
 
 
-def _plates(instrument: Instrument) -> dict[str, WavePlate]:
-    """The wave plates behind the polariser by their places, in the order in which light meets them, arm by arm."""
-    common, arms = trains(instrument)
-    every = [("", common), *((f"{arm.name}.", one) for arm, one in zip(instrument.arms, arms, strict=True))]
-    return {f"{prefix}{e.name}": e for prefix, elements in every for e in elements if _is_plate(e)}  # pyright: ignore
+def _numbers(instrument: Instrument) -> list[list[Slot]]:
+    """The numbers of every wave plate behind the polariser."""
+    return [
+        [("number", kind, "of", f"{train}{plate.name}") for kind in OF_PLATE]
+        + [
+            ("number", kind, "of", f"{train}{plate.name}.{layer.name}")
+            for layer in plate.layers  # pyright: ignore[reportAttributeAccessIssue]
+            for kind in OF_LAYER
+        ]
+        for train, elements in trains(instrument).items()
+        for plate in elements
+        if _is_plate(plate)
+    ]
 
 
-def _numbers(instrument: Instrument) -> dict[Slot, tuple[int, int]]:
-    """The numbers of wave plates: of which plate, and which one."""
-    found: dict[Slot, tuple[int, int]] = {}
-    for w, (place, plate) in enumerate(_plates(instrument).items()):
-        each = [(kind, place) for kind in OF_PLATE]
-        each += [(kind, f"{place}.{layer.name}") for layer in plate.layers for kind in OF_LAYER]
-        found |= {("number", kind, "of", at): (w, t) for t, (kind, at) in enumerate(each)}
-    return found
+def _whole(instrument: Instrument) -> list[Slot]:
+    pupils = [element.name for element in trains(instrument)[""] if isinstance(element, PupilMapping)]
+    shift = ("whole", "shift", "of", BAND)
+    return [*(("whole", kind, "ahead of", name) for name in pupils for kind in DISPLACEMENTS), shift]
 
 
-def _most(numbers: dict[Slot, tuple[int, int]]) -> int:
-    """The largest count of numbers of a plate."""
-    return 1 + max((t for _, t in numbers.values()), default=-1)
-
-
-def _whole(instrument: Instrument) -> tuple[Slot, ...]:
-    pupils = [element.name for element in trains(instrument)[0] if isinstance(element, PupilMapping)]
-    return (
-        *(("whole", kind, "ahead of", name) for name in pupils for kind in DISPLACEMENTS),
-        ("whole", "shift", "of", BAND),
-    )
+def fringe_places(instrument: Instrument) -> tuple[str, ...]:
+    """Places of the plates of an instrument (`patched`) ahead of which there may be air."""
+    return tuple(numbers[0][-1] for numbers in _numbers(instrument))
 
 
 def vector_slots(instrument: Instrument) -> dict[Slot, int]:
     """Positions of the slots of the analysis vectors of an instrument (`patched`) in `VectorSlopes.slopes`."""
-    places, numbers, cameras = _places(instrument), _numbers(instrument), range(len(instrument.cameras))
-    most, first = _most(numbers), 0
+    polariser, places = instrument.polariser, _places(instrument)
+    names = {} if polariser is None else {("behind", polariser.name): 0}
+    for (train, elements), numbers in zip(trains(instrument).items(), places, strict=True):
+        for element, (ahead, behind) in zip(elements, itertools.pairwise(numbers), strict=True):
+            where = {"ahead of": ahead, "behind": behind, "of": behind}
+            names |= {(one, f"{train}{element.name}"): number for one, number in where.items()}
+    for arm, numbers in zip(instrument.arms, places[1:], strict=True):
+        names["ahead of", f"{arm.name}.{arm.analyser.name}"] = numbers[-1]
     found: dict[Slot, int] = {}
-    for colour in (0, 1):
-        for kind in GENERATORS:
-            found |= {("inserted", kind, *where, colour): first + h for where, h in places.items()}
-            first += 1 + max(places.values())
-    found |= {slot: first + w * most + t for slot, (w, t) in numbers.items()}
-    first += most * len(_plates(instrument))
-    pairs = [(one, other) for one in cameras for other in cameras]
-    rest = [*_whole(instrument), *(("throughput", k) for k in cameras), *(("mixed", *pair) for pair in pairs)]
+    kinds = list(itertools.product((0, 1), GENERATORS))
+    count = 1 + places[-1][-1]
+    for i, (colour, kind) in enumerate(kinds):
+        found |= {("inserted", kind, *name, colour): i * count + number for name, number in names.items()}
+    first, numbers = len(kinds) * count, _numbers(instrument)
+    for plate in numbers:
+        found |= {slot: first + t for t, slot in enumerate(plate)}
+        first += max(map(len, numbers))
+    cameras = range(len(instrument.cameras))
+    mixed = [("mixed", *pair) for pair in itertools.product(cameras, cameras)]
+    rest = [*_whole(instrument), *(("throughput", camera) for camera in cameras), *mixed]
     return found | {slot: first + i for i, slot in enumerate(rest)}
 
 
@@ -193,35 +164,26 @@ def vector_slopes(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> V
     """Slopes of the analysis vectors at a field point (deg)."""
     instrument = instrument.patched()
     numbers, whole, cameras = _numbers(instrument), _whole(instrument), len(instrument.cameras)
-    most = _most(numbers)
+    most = max(map(len, numbers), default=0)
 
     def moved(sizes: Float[Array, " t"]) -> Instrument:
-        terms = [(Change(*slot[1:]), sizes[t]) for slot, (_, t) in numbers.items()]
-        terms += [(Change(*slot[1:]), size) for slot, size in zip(whole, sizes[most:], strict=True)]
-        return patched(instrument, terms)
+        each = [*(pair for plate in numbers for pair in enumerate(plate)), *enumerate(whole, most)]
+        return patched(instrument, [(Change(*slot[1:]), sizes[t]) for t, slot in each])
 
     def mean(shift: Scalar) -> Float[Array, " b"]:
-        own = patched(instrument, [(Change(*whole[-1][1:]), shift)])
-        return light.band_weights(own, plan) @ light.node_wavelengths(own, plan)
+        return _mean(patched(instrument, [(Change(*whole[-1][1:]), shift)]), plan)
 
     found = _banded(plan, (x, y), moved, (most, len(whole)), jnp.zeros(1))
-    rows = [part.reshape(-1, *found.rows.shape) for part in found[1:]]
-    throughput, pairs = instrument.throughput.at(x, y), tuple(np.ndindex(cameras, cameras))
-    wavelength, shifted = jax.jvp(mean, (jnp.zeros(()),), (jnp.ones(()),))
-    means = jnp.zeros((sum(map(len, rows)), len(wavelength))).at[-1].set(shifted)
-
-    def vectors(rows: Array, mean: Array, throughput: Array, shares: Array) -> Float[Array, "b k 4"]:
-        beams = light.beams(instrument, light.in_bands(instrument, rows, mean))
-        own = light.behind_throughput(instrument, beams, throughput, x, y)
-        return CrossTalk(tuple(shares), pairs).vectors(own, x, y)
-
-    neutral = found.rows, wavelength, throughput, jnp.zeros(len(pairs))
-    value, push = jax.linearize(vectors, *neutral)
+    rows = jnp.concatenate([part.reshape(-1, *found.rows.shape) for part in found[1:]])
+    shifted = jax.jacfwd(mean)(jnp.zeros(()))
+    means = jnp.zeros((len(rows), len(shifted))).at[-1].set(shifted)
+    neutral = found.rows, _mean(instrument, plan), instrument.throughput.at(x, y), jnp.zeros(cameras**2)
+    value, push = jax.linearize(functools.partial(_vectors, instrument, (x, y)), *neutral)
     none = [jnp.zeros_like(one) for one in neutral]
     slopes = (
-        jax.vmap(lambda one, mean: push(one, mean, *none[2:]))(jnp.concatenate(rows), means),
-        jax.vmap(lambda one: push(*none[:2], one, none[3]))(jnp.diag(throughput)),
-        jax.vmap(lambda one: push(*none[:3], one))(jnp.eye(len(pairs))),
+        jax.vmap(lambda one, mean: push(one, mean, *none[2:]))(rows, means),
+        jax.vmap(lambda one: push(*none[:2], one, none[3]))(jnp.diag(neutral[2])),
+        jax.vmap(lambda one: push(*none[:3], one))(jnp.eye(cameras**2)),
     )
     return VectorSlopes(value, jnp.concatenate(slopes))
 
@@ -233,108 +195,121 @@ def fringe_slopes(
     instrument = instrument.patched()
 
     def moved(sizes: Float[Array, " t"]) -> Instrument:
-        def with_air(own: Instrument, place: str) -> Instrument:
-            return with_air_gap(own, place, sizes[0], jnp.zeros(()))
-
-        return functools.reduce(with_air, fringe_places(instrument), instrument)
+        """Air without thickness: no fringes, and all else of it."""
+        own = instrument
+        for place in fringe_places(instrument):
+            own = with_air_gap(own, place, sizes[0], jnp.zeros(()))
+        return own
 
     def vectors(rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
-        beams = light.beams(instrument, light.in_bands(instrument, rows, mean))
-        return light.behind_throughput(instrument, beams, instrument.throughput.at(x, y), x, y)
+        none = jnp.zeros(len(instrument.cameras) ** 2)
+        return _vectors(
+            instrument, (x, y), rows, _mean(instrument, plan), instrument.throughput.at(x, y), none
+        )
 
-    mean = light.band_weights(instrument, plan) @ light.node_wavelengths(instrument, plan)
     found = _banded(plan, (x, y), moved, (1, 0), gaps)
     return jax.vmap(jax.vmap(jax.linearize(vectors, found.rows)[1]))(found.plates[:, :, 0])
 
 
-def fringe_places(instrument: Instrument) -> tuple[str, ...]:
-    """Places of the plates of an instrument (`patched`) ahead of which there may be air."""
-    return tuple(_plates(instrument))
+def _mean(instrument: Instrument, plan: Plan) -> Float[Array, " b"]:
+    return light.band_weights(instrument, plan) @ light.node_wavelengths(instrument, plan)
+
+
+def _vectors(
+    instrument: Instrument,
+    at: tuple[Scalar, Scalar],
+    rows: Array,
+    mean: Array,
+    throughput: Array,
+    shares: Array,
+) -> Float[Array, "b k 4"]:
+    """Analysis vectors with shares of every camera in every other."""
+    beams = light.beams(instrument, light.in_bands(instrument, rows, mean))
+    pairs = tuple(np.ndindex(len(throughput), len(throughput)))
+    vectors = light.behind_throughput(instrument, beams, throughput, *at)
+    return CrossTalk(tuple(shares), pairs).vectors(vectors, *at)
 
 
 def _banded(
-    plan: Plan,
-    at: tuple[Scalar, Scalar],
-    moved: Callable[[Float[Array, " t"]], Instrument],
-    sizes: tuple[int, int],
-    gaps: Float[Array, " g"],
+    plan: Plan, at: tuple[Scalar, Scalar], moved: Moved, sizes: tuple[int, int], gaps: Float[Array, " g"]
 ) -> _Banded:
-    """Band sums at a field point, and their slopes in the sizes of `moved`: of single plates, then of the whole train.
+    """Band sums at a field point, and slopes in the sizes of `moved`: of single plates, then of all together.
 
     Those of plates are multiplied by fringes of air of some thicknesses (µm).
     """
-
-    def stretched(stretch: Scalar) -> _Banded:
-        return _summed(plan, (*at, stretch), moved, sizes, gaps)
-
-    one = jnp.ones(())
-    if not light.is_dispersed(moved(jnp.zeros(sum(sizes)))):
-        return stretched(one)
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-2), *jax.jvp(stretched, (one,), (one,)))
+    neutral = moved(jnp.zeros(sum(sizes)))
+    summed = functools.partial(_summed, plan, at, moved, sizes, gaps)
+    return light.with_dispersion(neutral, summed, jnp.ones(()))
 
 
 def _summed(
     plan: Plan,
-    at: tuple[Scalar, Scalar, Scalar],
-    moved: Callable[[Float[Array, " t"]], Instrument],
+    at: tuple[Scalar, Scalar],
+    moved: Moved,
     sizes: tuple[int, int],
     gaps: Float[Array, " g"],
+    stretch: Scalar,
 ) -> _Banded:
-    """The same at wavelengths times a factor, the last of `at`."""
-    x, y, stretch = at
+    """The same at wavelengths times a factor, without what differs between beams."""
     states, conditions = [state for state, _, _ in plan.settings], plan.conditions
     if "temperature" not in conditions.planned:  # the thermal change of one kelvin
         warm = jnp.full_like(plan.wavelength, REFERENCE_TEMPERATURE + 1.0)
         conditions = Conditions(conditions.band_width, {**conditions.planned, "temperature": warm})
 
-    def stations(own: Instrument) -> tuple[list[fold.Station], list[list[fold.Station]]]:
-        common, arms = _with_places(own)
+    def stations(own: Instrument) -> list[list[fold.Station]]:
+        common, *arms = trains(own).values()
         spectrum = stretch * light.node_wavelengths(own, plan), conditions
-        first, ray = fold.stations(common, Ray.entering(x, y, spectrum))
-        return first, [fold.stations(arm, ray)[0] for arm in arms]
+        first, ray = fold.stations(common, Ray.entering(*at, spectrum))
+        return [first, *(fold.stations(arm, ray)[0] for arm in arms)]
 
     def solved(sizes: Float[Array, " t"]) -> tuple[fold.Solved, Float[Array, "b n"]]:
-        common, arms = stations(own := moved(sizes))
-        every = [*common, *itertools.chain(*arms)]
+        own = moved(sizes)
+        every = list(itertools.chain(*stations(own)))
         return fold.solved(every, plan.moving, states), light.band_weights(own, plan)
 
     single, together = sizes
     nothing = jnp.zeros(single + together)
-    neutral, ((matrices, weights), push) = moved(nothing), jax.linearize(solved, nothing)
+    (matrices, weights), push = jax.linearize(solved, nothing)
     slopes, weight_slopes = jax.vmap(push)(jnp.eye(len(nothing)))
-    (common, arms), analysers = stations(neutral), [arm.analyser for arm in neutral.arms]
-    around = fold.around(common, arms, analysers, matrices, plan.moving, states, len(plan.wavelength))
-    rows, generators, sums = around[0][0], _generators(), functools.partial(light.integrated, plan)
-    wavelength = stretch * light.node_wavelengths(neutral, plan)
+    common, *arms = stations(neutral := moved(nothing))
+    analysers, every = [arm.analyser for arm in neutral.arms], list(itertools.chain(common, *arms))
+    folded = fold.around(common, arms, analysers, matrices, plan.moving, states, len(plan.wavelength))
+    sides = [(behind, ahead) for one in folded for (_, ahead), (behind, _) in itertools.pairwise(one)]
+    rows, sums = folded[0][0][0], functools.partial(light.integrated, plan)
+
+    def pushed(number: int, some: slice) -> Float[Array, "t c n r 4"]:
+        """Rows for some changes of the matrix of a station."""
+        own = {key: each[some] for key, each in slopes.items() if key[0] == number and each is not None}
+        if not own:
+            return jnp.zeros((len(nothing[some]), *rows.shape))
+        behind, ahead = sides[number]
+
+        def change(own: fold.Solved) -> Float[Array, "c n r 4"]:
+            out = jnp.zeros((4, 4))
+            return behind @ fold.stacked(own, number, every[number][0], plan.moving, states, out) @ ahead
+
+        return jax.vmap(change)(own)
+
+    generators, wavelength = _generators(), stretch * light.node_wavelengths(neutral, plan)
     moments = weights, weights * (wavelength / neutral.units.wavelength - 1.0)
-    inserted, plates, whole = [], [], jnp.zeros((together, *rows.shape))
-    for number, (element, ray) in enumerate([*common, *itertools.chain(*arms)]):
-        behind, ahead = around[number]
-        if isinstance(element, _Place):
+    inserted: list[Array] = []
+    for place, (behind, ahead) in zip(
+        itertools.chain(*_places(neutral)), itertools.chain(*folded), strict=True
+    ):
+        if place == len(inserted):
             pairs = jnp.einsum("cnri,cnjk->ijcnrk", behind, ahead)
             both = jnp.stack([sums(own, pairs) for own in moments])
             inserted.append(jnp.einsum("gij,mijbrk->mgbrk", generators, both))
-            continue
-        first = 0 if _is_plate(element) else single
-        own = {key: some[first:] for key, some in slopes.items() if key[0] == number and some is not None}
-
-        def pushed(some: fold.Solved, at: Any = (number, element), around: Any = (behind, ahead)) -> Array:
-            matrix = fold.stacked(some, *at, plan.moving, states, out=jnp.zeros((4, 4)))
-            return around[0] @ matrix @ around[1]
-
-        count = len(nothing) - first
-        change = jax.vmap(pushed)(own) if own and count else jnp.zeros((count, *rows.shape))
-        whole = whole + change[single - first :]
+    plates = [jnp.zeros((0, len(gaps), single, *sums(weights, rows).shape))]
+    for number, (element, ray) in enumerate(every):
         if _is_plate(element):
-            fringes = jax.vmap(lambda gap, ray=ray: fringe(gap, ray))(gaps)
-            plates.append(jax.vmap(lambda wave, some=change[:single]: sums(wave * weights, some))(fringes))
-    none = jnp.zeros((0, len(gaps), single, *sums(weights, rows).shape))
+            change = pushed(number, slice(single))
+            waves = jax.vmap(fringe, (0, None))(gaps, ray)
+            plates.append(jax.vmap(lambda wave, change=change: sums(wave * weights, change))(waves)[None])
+    whole = functools.reduce(jnp.add, [pushed(number, slice(single, None)) for number in range(len(every))])
     shifted = jax.vmap(lambda own: sums(own, rows))(weight_slopes[single:])
     return _Banded(
-        sums(weights, rows),
-        jnp.stack(inserted, 2),
-        jnp.stack(plates) if plates else none,
-        sums(weights, whole) + shifted,
+        sums(weights, rows), jnp.stack(inserted, 2), jnp.concatenate(plates), sums(weights, whole) + shifted
     )
 
 
