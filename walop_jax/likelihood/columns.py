@@ -14,7 +14,6 @@ Limits      first order. Where detectors are not linear their derivative stands 
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -34,7 +33,7 @@ from walop_jax.model import light, slots
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
 from walop_jax.model.effects.cameras import ADDED, Ghost
-from walop_jax.model.effects.change import KINDS, NoSlotError, Part, product
+from walop_jax.model.effects.change import KINDS, InExposures, NoSlotError, Part, product
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.optics import LARGEST_GAP
 from walop_jax.model.elements import WavePlate
@@ -43,10 +42,10 @@ from walop_jax.model.instrument import Instrument, NoSuchPlaceError
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for
 from walop_jax.model.slots import LightSlopes, Slot, VectorSlopes
-from walop_jax.model.sources import Sight
+from walop_jax.model.sources import ExposureArrays, Sight
 
 Change = Sequence[tuple[float, Sentence]]
-"""A sum of sentences with their coefficients; a factor of a sentence may be a function of what `Laid` has."""
+"""A sum of sentences with their coefficients."""
 
 LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
 CAMERAS = ("counts", "opposite", *ADDED)
@@ -201,35 +200,6 @@ _visible = compiled(_visibilities, kept_as="visibilities")
 _detectors = compiled(_pushed, kept_as="detector_slopes")
 
 
-# --------------------------------------------------------------------------------------------------- factors
-
-
-@dataclasses.dataclass(frozen=True)
-class Laid:
-    """Quantities that factors may ask for: points along the first axis, exposures along the second.
-
-    Of angles those in the list of exposures: NaN where an element is out.
-    """
-
-    likelihood: Likelihood
-    x: Float[np.ndarray, "p 1"]
-    y: Float[np.ndarray, "p 1"]
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "number":
-            return np.arange(len(self.likelihood.flux_known))[None]
-        return np.asarray(getattr(self.likelihood.plan.exposures, name))[None]
-
-    def of_kind(self, name: str) -> Any:
-        """True in exposures of a KIND."""
-        return np.asarray(self.likelihood.plan.exposures.of_kind(name))[None]
-
-    def angle(self, prefix: str) -> Any:
-        """Angle of a moving element, NaN where it is out."""
-        position = self.likelihood.calset.exposures.position(prefix)
-        return np.deg2rad(np.where(position.inside, position.angle, np.nan))[None]
-
-
 # ----------------------------------------------------------------------------------------------------- columns
 
 
@@ -246,6 +216,7 @@ class Columns:
         self.plan = likelihood.plan
         self.patched = self.instrument.patched()
         self.of_vectors, self.of_light = slots.vector_slots(self.patched), slots.light_slots(self.patched)
+        self.exposures: ExposureArrays = jax.tree.map(np.asarray, self.plan.exposures)
         self.fringed = slots.fringe_places(self.patched)
         self._known: dict[Sentence, list[Part]] = {}
         floor = likelihood.model.template.cameras.floor
@@ -275,7 +246,7 @@ class Columns:
             parts = list(KINDS[sentence.kind].slots(self.patched, sentence))
         except NoSuchPlaceError as error:
             raise NoSlotError(str(error)) from None
-        if not all(self._holds(part.slot) for part in parts):
+        if not all(self._holds(part.slot) and "colour" not in part.factors for part in parts):
             raise NoSlotError(sentence.text)
         if sentence.kind != "thermal" or "temperature" in self.plan.conditions.planned:
             return parts
@@ -387,7 +358,7 @@ class ResponseBlock:
         if factors not in self._patterns:
             each = []
             for sign in (1.0, -1.0)[: self.sites]:
-                at = Laid(self.of.likelihood, sign * self.x[:, None], sign * self.y[:, None])
+                at = InExposures(self.of.exposures, sign * self.x[:, None], sign * self.y[:, None])
                 value = product(factors, at, self.of.patched.units)
                 whole = np.broadcast_to(np.nan_to_num(np.asarray(value)), self.used.shape)
                 each.append(whole.reshape(-1)[self.chosen])

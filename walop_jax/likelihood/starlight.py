@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.columns import Change, Columns, Laid, ResponseBlock
-from walop_jax.model.effects.change import Part
+from walop_jax.likelihood.columns import Change, Columns, ResponseBlock
+from walop_jax.model.effects.change import InExposures, Part
 from walop_jax.model.effects.factors import FIELD, Units, factor
 from walop_jax.model.slots import Slot, generator_ahead
 
@@ -43,7 +43,7 @@ def _at_points(
     every, band = np.arange(len(block.x)), block.band[:, exposure]
     vectors = np.asarray(block.found.vectors.vectors)[every, 0, band]  # p k 4
     added = np.zeros((*vectors.shape[:-1], 3, len(changes)))
-    at = Laid(block.of.likelihood, block.x[:, None], block.y[:, None])
+    at = InExposures(block.of.exposures, block.x[:, None], block.y[:, None])
     for a, parts in enumerate(changes):
         for slot, coefficient, factors in parts:
             if slot in block.of.of_vectors:
@@ -59,12 +59,14 @@ def _at_points(
     return vectors[..., :3], added
 
 
-def _for_stars(factors: Sequence[Any], at: Laid, exposure: int, units: Units) -> Float[np.ndarray, " p"]:
+def _for_stars(
+    factors: Sequence[Any], at: InExposures, exposure: int, units: Units
+) -> Float[np.ndarray, " p"]:
     """Product of factors for stars in the setting of an exposure: at its time, temperature and angles nothing grows."""
     points, product = len(at.x), np.ones(len(at.x))
     for one in factors:
         if not isinstance(one, str):
-            shape = (points, len(at.likelihood.flux_known))
+            shape = (points, len(at.number))
             product = product * np.broadcast_to(one(at), shape)[:, exposure]
         elif (known := factor(one)).depends_on == FIELD:
             product = product * np.broadcast_to(known.value(at, units), (points, 1))[:, 0]

@@ -53,7 +53,7 @@ OF_PLATE, OF_LAYER = ("axis", "thermal"), ("thickness", "axis", "cut")
 
 
 def trains(instrument: Instrument) -> dict[str, tuple[Element, ...]]:
-    """The elements behind the polariser (of an instrument `patched`) and those of the arms, by the beginnings of names."""
+    """The elements behind the polariser and those of the arms, by the beginnings of names (without effects: `patched`)."""
     return {
         "": instrument.behind_polariser(),
         **{f"{arm.name}.": tuple(arm.train()) for arm in instrument.arms},

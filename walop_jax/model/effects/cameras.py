@@ -11,7 +11,7 @@ Symbols     a amplitude, f product of the factors; the place is a camera, or an 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -178,17 +178,15 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     return Grows(_WITH.get(stage_of(change), ()), None)
 
 
-def _slots(instrument: Instrument, change: Change) -> Iterator[Part]:
-    """A stage and the cameras; what acts on the analysis vectors: camera by camera, or target and origin."""
+def _slots(instrument: Instrument, change: Change) -> list[Part]:
+    """A stage and the cameras; of what acts on analysis vectors a part for each camera, or target and origin."""
     stage, cameras = stage_of(change), cameras_of(instrument, change.place)
+    slots: list[tuple[Any, ...]] = [(stage, cameras)]
     if stage == "mixed":
-        origin = cameras_of(instrument, change.origin)
-        yield Part((stage, cameras.index(1.0), origin.index(1.0)), 1.0, change.factors)
+        slots = [(stage, cameras.index(1.0), cameras_of(instrument, change.origin).index(1.0))]
     elif stage == "throughput":
-        for camera in np.flatnonzero(cameras):
-            yield Part((stage, int(camera)), 1.0, change.factors)
-    else:
-        yield Part((stage, cameras), 1.0, change.factors)
+        slots = [(stage, camera) for camera, share in enumerate(cameras) if share]
+    return [Part(slot, 1.0, change.factors) for slot in slots]
 
 
 _OF_GAINS = "a lamp that does not change, seen by all cameras in turn"
@@ -198,7 +196,7 @@ _TESTS = {
     "afterglow": "a dark exposure after a bright one",
     "light": "the same field points at another flux, and darks",
 }
-KINDS |= {name: Kind("share", _patch, stage_of, test, _grows, _slots) for name, test in _TESTS.items()}
+KINDS |= {name: Kind("share", _patch, stage_of, test, _grows, slots=_slots) for name, test in _TESTS.items()}
 
 
 def cameras_of(instrument: Instrument, place: str) -> Weights:

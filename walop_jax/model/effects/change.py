@@ -23,6 +23,7 @@ from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any, NamedTuple, Self
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.data.records import POLARISER
@@ -86,11 +87,6 @@ class Part(NamedTuple):
 Parts = Callable[["Instrument", "Change"], Iterable[Part]]
 
 
-def no_slots(instrument: Instrument, change: Change) -> Iterable[Part]:
-    """Parts of changes that have none."""
-    raise NoSlotError(change.text)
-
-
 def itself(stage: str) -> Parts:
     """Parts of changes that are slots themselves: without their factors, at a stage of the light path."""
     return lambda _, change: [Part((stage, change.kind, change.where, change.place), 1.0, change.factors)]
@@ -102,7 +98,7 @@ class Kind:
 
     Changes for which `patch` and `together` are equal are patched together. `patch` and `grows` raise
     `NoSuchPlaceError` where an instrument has no such place, ValueError for a change that cannot be made. `slots` are
-    its parts to first order; it raises `NoSlotError` for a change that has none.
+    its parts to first order; slots that an instrument does not have are no error here.
     """
 
     parameter: str
@@ -110,7 +106,7 @@ class Kind:
     together: Callable[[Change], Hashable] = lambda change: change
     test: str = ""
     grows: Callable[[Instrument, Change], Grows] = lambda instrument, change: Grows()
-    slots: Parts = no_slots
+    slots: Parts = dataclasses.field(kw_only=True)
 
 
 KINDS: dict[str, Kind] = {}
@@ -140,7 +136,7 @@ class Change:
     def text(self) -> str:
         """The change as it is typed."""
         origin = f" of {self.origin}" if self.origin else ""
-        return " * ".join((f"{self.kind}{origin} {self.where} {self.place}", *self.factors))
+        return " * ".join((f"{self.kind}{origin} {self.where} {self.place}", *map(str, self.factors)))
 
     @property
     def label(self) -> str:
@@ -166,7 +162,7 @@ class Change:
         """True if what it does to a star is known from the counts and the place of the star alone."""
         elsewhere = self.kind == "afterglow" or (self.kind == "light" and self.origin in ("", OPPOSITE))
         return not elsewhere and all(
-            factor.split()[0] not in ("hours", "exposure", "kind") for factor in self.factors
+            one.text.split()[0] not in ("hours", "exposure", "kind") for one in self.grows_with
         )
 
     def times(self, *factors: str) -> Change:
@@ -328,17 +324,19 @@ class InExposures:
     @property
     def number(self) -> Any:
         """Positions in the list."""
-        return jnp.arange(self.exposures.hours.shape[0])
+        return np.arange(len(self.exposures.hours))
 
     def of_kind(self, name: str) -> Any:
         """True in exposures of a KIND."""
         return self.exposures.of_kind(name)
 
     def angle(self, prefix: str) -> Any:
-        """That of the polariser or of another element that moves; NaN where it is out."""
+        """That of the polariser or of another element that moves (rad); NaN where it is out."""
+        angle = self.exposures.clp_angle
         if prefix == POLARISER:
-            return jnp.where(self.exposures.clp_in, self.exposures.clp_angle, jnp.nan)
-        return self.exposures.moving.get(prefix, jnp.full(self.exposures.clp_angle.shape, jnp.nan))
+            xp = np if isinstance(angle, np.ndarray) else jnp
+            return xp.where(self.exposures.clp_in, angle, np.nan)
+        return self.exposures.moving.get(prefix, np.full(angle.shape, np.nan))
 
 
 def in_exposures(change: Change, exposures: ExposureArrays, x: Any = 0.0, y: Any = 0.0) -> Float[Array, " e"]:

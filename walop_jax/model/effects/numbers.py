@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Sequence
 
 import jax.numpy as jnp
 
@@ -13,7 +13,6 @@ from walop_jax.model.effects.change import (
     Change,
     Grows,
     Kind,
-    NoSlotError,
     Part,
     Term,
     add,
@@ -52,12 +51,6 @@ def _of_plate(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
         grown = Grown(size, jnp.zeros(()), change)
         instrument = instrument.changed(change.place, grown=lambda there, one=grown: (*there, one))
     return instrument
-
-
-def _slots_of_plate(instrument: Instrument, change: Change) -> Iterator[Part]:
-    if "colour" in change.factors:  # a slot is the same at all wavelengths
-        raise NoSlotError(change.text)
-    yield from itself("number")(instrument, change)
 
 
 def _of_instrument(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -111,18 +104,18 @@ def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return instrument
 
 
-def _slots_of_source(instrument: Instrument, change: Change) -> Iterator[Part]:
+def _slots_of_source(instrument: Instrument, change: Change) -> list[Part]:
     """Of the light: q or u of a star has its number in the list."""
     names = [name.replace(" ", "_") for name in instrument.standard.names]
     star = (names.index(change.place),) if change.place in names else ()
-    place = "standard" if star else change.place
-    yield Part(("light", change.kind, change.where, place, *star), 1.0, change.factors)
+    place = instrument.standard.name if star else change.place
+    return [Part(("light", change.kind, change.where, place, *star), 1.0, change.factors)]
 
 
 NUMBERS = {"axis": "angle", "cut": "angle", "thickness": "length", "thermal": "number"}
 """Kinds that are numbers of wave plates, of layers of them (µm, deg), and their amplitudes."""
 KINDS |= {
-    name: Kind(amplitude, _of_plate, grows=_with_ray, slots=_slots_of_plate)
+    name: Kind(amplitude, _of_plate, grows=_with_ray, slots=itself("number"))
     for name, amplitude in NUMBERS.items()
 }
 OF_POLARISER = ("extinction", "ellipticity")
@@ -133,5 +126,6 @@ _OF_ROTATOR = "a polariser aligned in the laboratory: an independent zero of the
 KINDS["rotator"] = Kind("angle", _of_instrument, test=_OF_ROTATOR, slots=itself("light"))
 _OF_SOURCE = "the same patch or star again at another ROTATOR angle"
 KINDS |= {
-    name: Kind("share", _polarised, _patches, _OF_SOURCE, _of_patch, _slots_of_source) for name in OF_SOURCES
+    name: Kind("share", _polarised, _patches, _OF_SOURCE, _of_patch, slots=_slots_of_source)
+    for name in OF_SOURCES
 }

@@ -11,7 +11,7 @@ Limits      exact for one kind at a place; which of several acts first is a matt
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -26,7 +26,6 @@ from walop_jax.model.effects.change import (
     Change,
     Grows,
     Kind,
-    NoSlotError,
     Part,
     Scalar,
     Term,
@@ -190,18 +189,18 @@ def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return _beside(instrument, Terms(name="described", moves=moves, **_columns(terms)), change)
 
 
-def _slots(instrument: Instrument, change: Change) -> Iterator[Part]:
-    """Generators at a place of the train; ahead of the polariser and of it: of the light."""
-    colour, rest = change.factors.count("colour"), tuple(one for one in change.factors if one != "colour")
-    polariser = instrument.polariser
-    in_train = polariser is None or change.place != polariser.name or change.where == "behind"
-    if colour > in_train:
-        raise NoSlotError(change.text)
-    if in_train and change.where == "of" and (moves := instrument.element(change.place).moves) is not None:
-        rest = (*rest, Inside(moves))
-    for kind, size, factors in generators_of(change.kind):
-        slot = (kind, change.where, change.place)
-        yield Part(("inserted", *slot, colour) if in_train else ("light", *slot), size, (*rest, *factors))
+def _slots(instrument: Instrument, change: Change) -> list[Part]:
+    """Generators at a place of the train, also growing with the wavelength; at the polariser: of the light."""
+    polariser, factors, stage, colour = instrument.polariser, change.factors, "light", ()
+    if polariser is None or change.place != polariser.name or change.where == "behind":
+        stage, colour = "inserted", (factors.count("colour"),)
+        factors = tuple(one for one in factors if one != "colour")
+        moves = instrument.element(change.place).moves if change.where == "of" else None
+        factors = factors if moves is None else (*factors, Inside(moves))
+    return [
+        Part((stage, kind, change.where, change.place, *colour), size, (*factors, *more))
+        for kind, size, more in generators_of(change.kind)
+    ]
 
 
 def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -222,9 +221,9 @@ def _fringes(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return instrument
 
 
-def _slots_of_fringes(instrument: Instrument, change: Change) -> Iterator[Part]:
+def _slots_of_fringes(instrument: Instrument, change: Change) -> list[Part]:
     factors = tuple(one for one in change.factors if not str(one).startswith("gap "))
-    yield Part(("fringes", change.place, change.gap), 1.0, factors)
+    return [Part(("fringes", change.place, change.gap), 1.0, factors)]
 
 
 _OPTICAL = {f"retardance {axis}": "retardance" for axis in AXES} | {
@@ -244,7 +243,7 @@ KINDS |= {
         lambda change: change.place,
         _OF_FIELD,
         lambda *_: Grows((FIELD, EXPOSURE)),
-        itself("whole"),
+        slots=itself("whole"),
     )
     for name in DISPLACEMENTS
 }
