@@ -8,6 +8,7 @@ elements of one class over together: the half-wave plates are one computation, c
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 
@@ -137,9 +138,10 @@ def around(
         rows = [*itertools.accumulate(reversed(path), _ahead, initial=last)][::-1]
         places = [*zip(rows, itertools.accumulate(path, _behind, initial=start), strict=True)]
         found.append((places[: count + 1], places[count:]))
-    whole = [
-        (sum(rows for rows, _ in same), same[0][1]) for same in zip(*(one for one, _ in found), strict=True)
-    ]
+    same = zip(
+        *(shared for shared, _ in found), strict=True
+    )  # of the common train, as each of the arms sees it
+    whole = [(functools.reduce(jnp.add, [rows for rows, _ in each]), each[0][1]) for each in same]
     return [whole, *(arm for _, arm in found)]
 
 

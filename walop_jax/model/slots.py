@@ -33,7 +33,7 @@ from walop_jax.model import fold, light
 from walop_jax.model.compiled import array
 from walop_jax.model.effects.cameras import CrossTalk
 from walop_jax.model.effects.change import BAND, SKY, Change, patched
-from walop_jax.model.effects.numbers import OF_POLARISER, OF_SOURCES
+from walop_jax.model.effects.numbers import OF_POLARISER, OF_QU, OF_SOURCES
 from walop_jax.model.effects.optics import ADDED, DISPLACEMENTS, GENERATORS, matrix_of, with_air_gap
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
 from walop_jax.model.elements.wave_plate import fringe
@@ -53,7 +53,7 @@ OF_PLATE, OF_LAYER = ("axis", "thermal"), ("thickness", "axis", "cut")
 
 
 def trains(instrument: Instrument) -> dict[str, tuple[Element, ...]]:
-    """The elements behind the polariser and those of the arms, by the beginnings of names (without effects: `patched`)."""
+    """The elements behind the polariser and those of the arms of an instrument (`patched`), by beginnings of names."""
     return {
         "": instrument.behind_polariser(),
         **{f"{arm.name}.": tuple(arm.train()) for arm in instrument.arms},
@@ -285,8 +285,9 @@ def _summed(
         behind, ahead = sides[number]
 
         def change(own: fold.Solved) -> Float[Array, "c n r 4"]:
-            out = jnp.zeros((4, 4))
-            return behind @ fold.stacked(own, number, every[number][0], plan.moving, states, out) @ ahead
+            matrix = fold.stacked(own, number, every[number][0], plan.moving, states, jnp.zeros((4, 4)))
+            assert matrix is not None
+            return behind @ matrix @ ahead
 
         return jax.vmap(change)(own)
 
@@ -346,7 +347,7 @@ def light_slots(instrument: Instrument) -> dict[Slot, int]:
     if any(isinstance(source, MoonSky) for source in instrument.sources):
         found += [(kind, "of", SKY) for kind in OF_SOURCES]
     if instrument.standard.names:
-        found += [(kind, "of", Standards.name) for kind in OF_SOURCES[:2]]
+        found += [(kind, "of", Standards.name) for kind in OF_QU]
     if polariser is not None:
         found += [(kind, "of", polariser.name) for kind in (*OF_POLARISER, *GENERATORS)]
         found += [(kind, "ahead of", polariser.name) for kind in (*GENERATORS, *ADDED)]
@@ -372,19 +373,22 @@ def light_slopes(instrument: Instrument, sight: Sight) -> LightSlopes:
 
 
 def _lit(instrument: Instrument, sizes: dict[Slot, Scalar], count: int) -> Instrument:
-    """The instrument with changes of the light; q and u of the sky in all exposures, of all stars."""
-    of_sky, of_stars = (
-        [sizes.pop(("light", kind, "of", place), None) for kind in OF_SOURCES[:2]]
-        for place in (SKY, Standards.name)
-    )
-    instrument = patched(instrument, [(Change(*slot[1:]), size) for slot, size in sizes.items()])
-    if of_sky[0] is not None:
-        every = MoonPatches(*(jnp.full(count, one) for one in of_sky), positions=tuple(range(count)))
+    """The instrument with changes of the light; q and u of the sky are those of all exposures, of stars of all."""
+    sources: dict[str, list[Scalar]] = {SKY: [], Standards.name: []}
+    terms = []
+    for (_, *slot), size in sizes.items():
+        if slot[0] in OF_QU:
+            sources[slot[-1]].append(size)
+        else:
+            terms.append((Change(*slot), size))
+    instrument = patched(instrument, terms)
+    if sources[SKY]:
+        every = MoonPatches(*(jnp.full(count, one) for one in sources[SKY]), positions=tuple(range(count)))
         instrument = instrument.changed(
             SKY, patches=lambda there: every if there is None else there.joined(every)
         )
-    if of_stars[0] is not None:
-        q, u = of_stars
+    if sources[Standards.name]:
+        q, u = sources[Standards.name]
         instrument = instrument.changed(Standards.name, q=lambda there: there + q, u=lambda there: there + u)
     return instrument
 

@@ -25,7 +25,8 @@ from walop_jax.model.instrument import Instrument, NoSuchPlaceError
 from walop_jax.model.parameters import unknown_name
 from walop_jax.model.sources import MoonPatches
 
-OF_SOURCES = ("polarisation q", "polarisation u", "polarisation")
+OF_QU = ("polarisation q", "polarisation u")
+OF_SOURCES = (*OF_QU, "polarisation")
 
 
 def _number(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
