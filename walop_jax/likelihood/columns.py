@@ -33,7 +33,7 @@ from walop_jax.model import light, slots
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
 from walop_jax.model.effects.cameras import ADDED, Ghost
-from walop_jax.model.effects.change import KINDS, InExposures, NoSlotError, Part, product
+from walop_jax.model.effects.change import KINDS, InExposures, NoSlotError, SlotTerm, product
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.optics import LARGEST_GAP
 from walop_jax.model.elements import WavePlate
@@ -218,7 +218,7 @@ class Columns:
         self.of_vectors, self.of_light = slots.vector_slots(self.patched), slots.light_slots(self.patched)
         self.exposures: ExposureArrays = jax.tree.map(np.asarray, self.plan.exposures)
         self.fringed = slots.fringe_places(self.patched)
-        self._known: dict[Sentence, list[Part]] = {}
+        self._known: dict[Sentence, list[SlotTerm]] = {}
         floor = likelihood.model.template.cameras.floor
         self.reader = PointReader(likelihood.calset, self.plan, mirrored=True, floor=floor)
         groups = self.plan.exposures.shared
@@ -227,21 +227,21 @@ class Columns:
     def has(self, change: Change) -> bool:
         """True if a change is a sum of slots to first order."""
         try:
-            self.parts_of(change)
+            self.terms_of(change)
         except NoSlotError:
             return False
         return True
 
-    def parts_of(self, change: Change) -> list[Part]:
-        """The parts of a change. Raises `NoSlotError` for a sentence that has no slots."""
+    def terms_of(self, change: Change) -> list[SlotTerm]:
+        """The slots of a change, with coefficients and factors. Raises `NoSlotError` for a sentence that has no slots."""
         found = []
         for size, sentence in change:
             if sentence not in self._known:
-                self._known[sentence] = self._parts(sentence)
+                self._known[sentence] = self._terms(sentence)
             found += [part._replace(size=size * part.size) for part in self._known[sentence]]
         return found
 
-    def _parts(self, sentence: Sentence) -> list[Part]:
+    def _terms(self, sentence: Sentence) -> list[SlotTerm]:
         try:
             parts = list(KINDS[sentence.kind].slots(self.patched, sentence))
         except NoSuchPlaceError as error:
@@ -299,7 +299,7 @@ class Columns:
         self, changes: Sequence[Change], exact: int
     ) -> tuple[Float[np.ndarray, "d a"], Float[np.ndarray, "d b"]]:
         """The columns of the first, `exact` changes, and those of the others in single precision."""
-        each = [self.parts_of(change) for change in changes]
+        each = [self.terms_of(change) for change in changes]
         likelihood, size = self.likelihood, limits.RESPONSES_TOGETHER
         used, cameras = likelihood.used, len(self.patched.cameras)
         length = cameras * int(used.sum())
@@ -446,7 +446,7 @@ class ResponseBlock:
 
     # --------------------------------------------------------------------------------------------------- columns
 
-    def fill(self, changes: Sequence[Sequence[Part]], found: Float[np.ndarray, "a d"]) -> None:
+    def fill(self, changes: Sequence[Sequence[SlotTerm]], found: Float[np.ndarray, "a d"]) -> None:
         """Write the columns of changes, for these points."""
         size = limits.COLUMNS_TOGETHER // 4
         for first in range(0, len(changes), size):

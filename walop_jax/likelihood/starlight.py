@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.columns import Change, Columns, ResponseBlock
-from walop_jax.model.effects.change import InExposures, Part
+from walop_jax.model.effects.change import InExposures, SlotTerm
 from walop_jax.model.effects.factors import FIELD, Units, factor
 from walop_jax.model.slots import Slot, generator_ahead
 
@@ -26,7 +26,7 @@ def added_to_starlight(
     columns: Columns, changes: Sequence[Change], exposure: int
 ) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
     """Analysis vectors at the field points in the setting of an exposure, and what one unit of each change adds."""
-    each = [columns.parts_of(change) for change in changes]
+    each = [columns.terms_of(change) for change in changes]
     slots = {part.slot for parts in each for part in parts}
     ahead = {s: generator_ahead(columns.patched, s) for s in slots if s[0] == "light" and s[2] == "ahead of"}
     points, size, found = len(columns.likelihood.used), limits.RESPONSES_TOGETHER, []
@@ -38,7 +38,10 @@ def added_to_starlight(
 
 
 def _at_points(
-    block: ResponseBlock, changes: Sequence[Sequence[Part]], exposure: int, ahead: Mapping[Slot, np.ndarray]
+    block: ResponseBlock,
+    changes: Sequence[Sequence[SlotTerm]],
+    exposure: int,
+    ahead: Mapping[Slot, np.ndarray],
 ) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
     every, band = np.arange(len(block.x)), block.band[:, exposure]
     vectors = np.asarray(block.found.vectors.vectors)[every, 0, band]  # p k 4

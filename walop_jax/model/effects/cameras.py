@@ -27,8 +27,8 @@ from walop_jax.model.effects.change import (
     Change,
     Grows,
     Kind,
-    Part,
     Scalar,
+    SlotTerm,
     Term,
     in_exposures,
 )
@@ -178,7 +178,7 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     return Grows(_WITH.get(stage_of(change), ()), None)
 
 
-def _slots(instrument: Instrument, change: Change) -> list[Part]:
+def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
     """A stage and the cameras; of what acts on analysis vectors a part for each camera, or target and origin."""
     stage, cameras = stage_of(change), cameras_of(instrument, change.place)
     slots: list[tuple[Any, ...]] = [(stage, cameras)]
@@ -186,7 +186,7 @@ def _slots(instrument: Instrument, change: Change) -> list[Part]:
         slots = [(stage, cameras.index(1.0), cameras_of(instrument, change.origin).index(1.0))]
     elif stage == "throughput":
         slots = [(stage, camera) for camera, share in enumerate(cameras) if share]
-    return [Part(slot, 1.0, change.factors) for slot in slots]
+    return [SlotTerm(slot, 1.0, change.factors) for slot in slots]
 
 
 _OF_GAINS = "a lamp that does not change, seen by all cameras in turn"

@@ -76,7 +76,7 @@ class NoSlotError(ValueError):
     """A change that is no sum of slots to first order: its own derivative is needed."""
 
 
-class Part(NamedTuple):
+class SlotTerm(NamedTuple):
     """A part of a change to first order: a slot of the light path (`model.slots`), a coefficient, factors."""
 
     slot: tuple[Any, ...]
@@ -84,12 +84,12 @@ class Part(NamedTuple):
     factors: tuple[Given, ...]
 
 
-Parts = Callable[["Instrument", "Change"], Iterable[Part]]
+SlotTerms = Callable[["Instrument", "Change"], Iterable[SlotTerm]]
 
 
-def itself(stage: str) -> Parts:
-    """Parts of changes that are slots themselves: without their factors, at a stage of the light path."""
-    return lambda _, change: [Part((stage, change.kind, change.where, change.place), 1.0, change.factors)]
+def itself(stage: str) -> SlotTerms:
+    """Slots of changes that are slots themselves: without their factors, at a stage of the light path."""
+    return lambda _, change: [SlotTerm((stage, change.kind, change.where, change.place), 1.0, change.factors)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Kind:
     together: Callable[[Change], Hashable] = lambda change: change
     test: str = ""
     grows: Callable[[Instrument, Change], Grows] = lambda instrument, change: Grows()
-    slots: Parts = dataclasses.field(kw_only=True)
+    slots: SlotTerms = dataclasses.field(kw_only=True)
 
 
 KINDS: dict[str, Kind] = {}

@@ -13,7 +13,7 @@ from walop_jax.model.effects.change import (
     Change,
     Grows,
     Kind,
-    Part,
+    SlotTerm,
     Term,
     add,
     itself,
@@ -105,12 +105,12 @@ def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return instrument
 
 
-def _slots_of_source(instrument: Instrument, change: Change) -> list[Part]:
+def _slots_of_source(instrument: Instrument, change: Change) -> list[SlotTerm]:
     """Of the light: q or u of a star has its number in the list."""
     names = [name.replace(" ", "_") for name in instrument.standard.names]
     star = (names.index(change.place),) if change.place in names else ()
     place = instrument.standard.name if star else change.place
-    return [Part(("light", change.kind, change.where, place, *star), 1.0, change.factors)]
+    return [SlotTerm(("light", change.kind, change.where, place, *star), 1.0, change.factors)]
 
 
 NUMBERS = {"axis": "angle", "cut": "angle", "thickness": "length", "thermal": "number"}

@@ -26,8 +26,8 @@ from walop_jax.model.effects.change import (
     Change,
     Grows,
     Kind,
-    Part,
     Scalar,
+    SlotTerm,
     Term,
     in_exposures,
     itself,
@@ -189,7 +189,7 @@ def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return _beside(instrument, Terms(name="described", moves=moves, **_columns(terms)), change)
 
 
-def _slots(instrument: Instrument, change: Change) -> list[Part]:
+def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
     """Generators at a place of the train, also growing with the wavelength; at the polariser: of the light."""
     polariser, factors, stage, colour = instrument.polariser, change.factors, "light", ()
     if polariser is None or change.place != polariser.name or change.where == "behind":
@@ -198,7 +198,7 @@ def _slots(instrument: Instrument, change: Change) -> list[Part]:
         moves = instrument.element(change.place).moves if change.where == "of" else None
         factors = factors if moves is None else (*factors, Inside(moves))
     return [
-        Part((stage, kind, change.where, change.place, *colour), size, (*factors, *more))
+        SlotTerm((stage, kind, change.where, change.place, *colour), size, (*factors, *more))
         for kind, size, more in generators_of(change.kind)
     ]
 
@@ -221,9 +221,9 @@ def _fringes(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return instrument
 
 
-def _slots_of_fringes(instrument: Instrument, change: Change) -> list[Part]:
+def _slots_of_fringes(instrument: Instrument, change: Change) -> list[SlotTerm]:
     factors = tuple(one for one in change.factors if not str(one).startswith("gap "))
-    return [Part(("fringes", change.place, change.gap), 1.0, factors)]
+    return [SlotTerm(("fringes", change.place, change.gap), 1.0, factors)]
 
 
 _OPTICAL = {f"retardance {axis}": "retardance" for axis in AXES} | {
