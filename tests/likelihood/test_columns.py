@@ -1,4 +1,4 @@
-"""Columns from responses: against derivatives of the whole light path, finite differences, and a hand's work."""
+"""Columns from slots: against derivatives of the whole light path, finite differences, and a hand's work."""
 
 import dataclasses
 

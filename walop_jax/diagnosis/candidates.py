@@ -1,6 +1,6 @@
 """All that could be missing, effects and sentences, and what each would do to the residuals.
 
-The columns of the score test come from the responses of the light path (`likelihood.columns`), but those of effects of
+The columns of the score test come from slots of the light path (`likelihood.columns`), but those of effects of
 a user's own, which are differentiated themselves. Structural effects have no amplitude: they can only be tried
 (`search.try_effect`).
 

@@ -2,7 +2,7 @@
 
 A change is a sum of sentences (`model.effects.change`), with a coefficient each. Its column is the derivative of the
 used residuals with respect to its amplitude, at neutral: what it does to the light or to the analysis vectors
-(`model.responses`) meets the exposures, is multiplied by what it grows with, and the flux takes up its part.
+(`model.slots`) meets the exposures, is multiplied by what it grows with, and the flux takes up its part.
 
 Equation    ∂r/∂a = −P w F f (∂a_k/∂a · s + a_k · ∂s/∂a)
 Symbols     w = 1/σ, F flux, f what the change grows with, P projection off the flux (`flux.project_flux`)
@@ -233,7 +233,7 @@ class Columns:
         return True
 
     def terms_of(self, change: Change) -> list[SlotTerm]:
-        """The slots of a change, with coefficients and factors. Raises `NoSlotError` for a sentence that has no slots."""
+        """Slots of a change, coefficients and factors. Raises `NoSlotError` for a sentence that has no slots."""
         found = []
         for size, sentence in change:
             if sentence not in self._known:

@@ -1,4 +1,4 @@
-"""Change of the light of a star by small changes of an instrument: to first order, from the responses of the columns.
+"""Change of the light of a star by small changes of an instrument: to first order, from the slots of the columns.
 
 Equation    δa = Σ f B G F + a G_t      of the optics behind the telescope, of the light ahead of the polariser
 Symbols     a analysis vectors (camera; 1, q, u) of one setting; B, G, F as in `model.slots`; G_t generator of what

@@ -92,17 +92,14 @@ def _is_plate(element: Element) -> bool:
 
 def _numbers(instrument: Instrument) -> list[list[Slot]]:
     """The numbers of every wave plate behind the polariser."""
-    return [
-        [("number", kind, "of", f"{train}{plate.name}") for kind in OF_PLATE]
-        + [
-            ("number", kind, "of", f"{train}{plate.name}.{layer.name}")
-            for layer in plate.layers  # pyright: ignore[reportAttributeAccessIssue]
-            for kind in OF_LAYER
-        ]
-        for train, elements in trains(instrument).items()
-        for plate in elements
-        if _is_plate(plate)
-    ]
+    found = []
+    for train, elements in trains(instrument).items():
+        for plate in filter(_is_plate, elements):
+            place, layers = f"{train}{plate.name}", plate.layers  # pyright: ignore[reportAttributeAccessIssue]
+            each = [(kind, place) for kind in OF_PLATE]
+            each += [(kind, f"{place}.{layer.name}") for layer in layers for kind in OF_LAYER]
+            found.append([("number", kind, "of", at) for kind, at in each])
+    return found
 
 
 def _whole(instrument: Instrument) -> list[Slot]:
@@ -291,27 +288,37 @@ def _summed(
 
         return jax.vmap(change)(own)
 
-    generators, wavelength = _generators(), stretch * light.node_wavelengths(neutral, plan)
+    wavelength = stretch * light.node_wavelengths(neutral, plan)
     moments = weights, weights * (wavelength / neutral.units.wavelength - 1.0)
-    inserted: list[Array] = []
-    for place, (behind, ahead) in zip(
-        itertools.chain(*_places(neutral)), itertools.chain(*folded), strict=True
-    ):
-        if place == len(inserted):
-            pairs = jnp.einsum("cnri,cnjk->ijcnrk", behind, ahead)
-            both = jnp.stack([sums(own, pairs) for own in moments])
-            inserted.append(jnp.einsum("gij,mijbrk->mgbrk", generators, both))
+    inserted = _inserted(plan, moments, _places(neutral), folded)
     plates = [jnp.zeros((0, len(gaps), single, *sums(weights, rows).shape))]
     for number, (element, ray) in enumerate(every):
         if _is_plate(element):
             change = pushed(number, slice(single))
             waves = jax.vmap(fringe, (0, None))(gaps, ray)
             plates.append(jax.vmap(lambda wave, change=change: sums(wave * weights, change))(waves)[None])
-    whole = functools.reduce(jnp.add, [pushed(number, slice(single, None)) for number in range(len(every))])
-    shifted = jax.vmap(lambda own: sums(own, rows))(weight_slopes[single:])
-    return _Banded(
-        sums(weights, rows), jnp.stack(inserted, 2), jnp.concatenate(plates), sums(weights, whole) + shifted
+    whole = sum(
+        (pushed(number, slice(single, None)) for number in range(len(every))),
+        jnp.zeros((together, *rows.shape)),
     )
+    shifted = jax.vmap(lambda own: sums(own, rows))(weight_slopes[single:])
+    return _Banded(sums(weights, rows), inserted, jnp.concatenate(plates), sums(weights, whole) + shifted)
+
+
+def _inserted(
+    plan: Plan,
+    moments: tuple[Float[Array, "b n"], ...],
+    places: list[list[int]],
+    folded: list[list[tuple[Float[Array, "c n r 4"], Float[Array, "c n 4 4"]]]],
+) -> Float[Array, "m g h b r 4"]:
+    """Slopes in generators at every place, for some weights of the nodes."""
+    generators, found = _generators(), []
+    for place, (behind, ahead) in zip(itertools.chain(*places), itertools.chain(*folded), strict=True):
+        if place == len(found):
+            pairs = jnp.einsum("cnri,cnjk->ijcnrk", behind, ahead)
+            each = jnp.stack([light.integrated(plan, weights, pairs) for weights in moments])
+            found.append(jnp.einsum("gij,mijbrk->mgbrk", generators, each))
+    return jnp.stack(found, 2)
 
 
 def _generators() -> Float[Array, "g 4 4"]:
