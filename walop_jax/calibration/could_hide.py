@@ -23,7 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.matrix import LARGEST_P, change_of_qu, matrix_slopes, planned_matrices
+from walop_jax.calibration.accuracy import LARGEST_P, change_of_qu
+from walop_jax.calibration.matrix import matrix_slopes, planned_matrices
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.io.text import rounded, two_digits
@@ -119,7 +120,7 @@ def hidden_errors(
     """Error of q and u at field positions (deg) by each mistake that could hide; NaN where u is hardly measured."""
     hidden, instrument = calibration.hidden, calibration.model.instrument(calibration.values)
     assert hidden is not None
-    filters = {str(settings.filter[0]): calibration.filter_curve(str(settings.filter[0]))}
+    filters = calibration.curves(settings)
     matrix, slopes = matrix_slopes(instrument, settings, filters, x, y)
     acting, found = acting_effects(calibration), np.empty((len(hidden), len(x)))
     for number, moved in enumerate(hidden.changes):

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.calibration.accuracy import measures_u, p_errors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import p_errors, sample_stars
 from walop_jax.calibration.thresholds import GOAL
 from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Displayed
@@ -37,7 +37,7 @@ from walop_jax.nights.algebra import Solution
 from walop_jax.nights.breaks import Break, part_of, shape_of
 from walop_jax.nights.changes import scan
 from walop_jax.nights.equations import Together, night_numbers
-from walop_jax.science.field_accuracy import NODES, SIZE, TOLERANCE, judged, measures_u, reached
+from walop_jax.science.field_accuracy import NODES, SIZE, TOLERANCE, judged, reached
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]
@@ -144,7 +144,7 @@ class Survey(Displayed):
         assert self._matrix is not None
         matrix, slopes, structure, _ = self._matrix
         covariance = slopes @ self._product(mjd).covariance @ slopes.swapaxes(1, 2) + structure
-        return reached(p_errors(matrix, covariance, sample_stars()))
+        return reached(p_errors(matrix, covariance))
 
     @functools.cached_property
     def _matrix(
@@ -166,7 +166,7 @@ class Survey(Displayed):
         x, y = product.raster(SIZE)
         matrix, covariance, slopes = product.over_field(x, y, settings, NODES, TOLERANCE)
         structure = covariance - slopes @ product.covariance @ slopes.swapaxes(1, 2)
-        seen = measures_u(matrix)
+        seen = measures_u(matrix.reshape(-1, 2, 3))
         return (matrix[seen], slopes[seen], structure[seen], float(np.mean(~seen))) if seen.any() else None
 
     @property
@@ -201,7 +201,7 @@ class Survey(Displayed):
             raise fail(what, advice="give one: --like RUN (like= in Python)")
         laws = {name: law.document() for name, law in self.changing.items()}
         like = dataclasses.replace(self.like, hidden=None, residuals=None, draws=None)
-        return dataclasses.replace(like, fitted=dataclasses.replace(like.model, laws=laws))
+        return dataclasses.replace(like, model=dataclasses.replace(like.model, laws=laws))
 
     def values_at(self, mjd: float) -> tuple[Vector, Matrix]:
         """All parameters and candidates (`data.names`) at a moment (MJD, UTC), and their covariance."""
@@ -282,7 +282,7 @@ class Survey(Displayed):
                 model = with_effects(model, [chosen], context)
         values, old = model.start, [model.index(name) for name in like.model.names]
         values[old] = like.values
-        return dataclasses.replace(like, fitted=model, values=values, covariance=np.zeros((len(values),) * 2))
+        return dataclasses.replace(like, model=model, values=values, covariance=np.zeros((len(values),) * 2))
 
     # --------------------------------------------------------------------------------------------------- tables
 
