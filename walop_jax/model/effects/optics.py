@@ -75,7 +75,7 @@ def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
             by = coefficient * product(factors, AtPoint(x, y), change.units)
             sums[name] = sums.get(name, 0.0) + by * size
     matrix = mueller.product(
-        make(*(jnp.asarray(sums.get(f"{what} {axis}", 0.0)) for axis in "quv"))
+        make(*(jnp.asarray(sums.get(f"{what} {axis}", jnp.zeros(()))) for axis in "quv"))
         for what, make in (("diattenuation", mueller.diattenuator), ("retardance", mueller.general_retarder))
         if any(name.startswith(what) for name in sums)
     )
