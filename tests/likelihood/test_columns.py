@@ -1,4 +1,4 @@
-"""Columns from responses: against derivatives of the whole light path, finite differences, and a hand's work."""
+"""Columns from slots: against derivatives of the whole light path, finite differences, and a hand's work."""
 
 import dataclasses
 
@@ -12,9 +12,9 @@ from walop_jax.diagnosis.hypotheses import applicable, probes, said_by, showable
 from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood.columns import Columns, columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.likelihood.pieces import NoColumnError
 from walop_jax.model.effects import EFFECTS, Described, effect_by_name
 from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.effects.change import NoSlotError
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.simulation.simulate import simulate
@@ -171,5 +171,5 @@ def test_every_sentence_of_the_grammar_has_a_column(laid):
 def test_what_has_no_response_is_said(laid):
     likelihood, values = laid
     for text in ("thickness of half1.plate.glass", "retardance q behind nothing", "axis of half1.wedge"):
-        with pytest.raises(NoColumnError):
+        with pytest.raises(NoSlotError):
             columns(likelihood, values, [_said(text)])

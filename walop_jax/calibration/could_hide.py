@@ -29,8 +29,9 @@ from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.io.text import rounded, two_digits
 from walop_jax.likelihood.field_table import Vector
-from walop_jax.model import light, responses
+from walop_jax.model import light, slots
 from walop_jax.model.effects import Effect, effect_by_name, in_order
+from walop_jax.model.effects.numbers import OF_POLARISER
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import effect_context
@@ -157,8 +158,8 @@ def acting_effects(calibration: Calibration) -> Mapping[int, Effect]:
 def moves_with(effect: Effect, instrument: Instrument) -> frozenset[str]:
     """Column prefixes of the moving elements that an effect is all about: it does nothing where these are out."""
     bare = dataclasses.replace(instrument, effects=())
-    common, arms = responses.trains(bare.patched())
-    moving = {one.name: one.moves for train in (common, *arms) for one in train if one.moves is not None}
+    every = itertools.chain(*slots.trains(bare.patched()).values())
+    moving = {one.name: one.moves for one in every if one.moves is not None}
     found: set[str] = set()
     for _, change in itertools.chain.from_iterable(effect.first_order(bare)):
         own = {moving[name] for name in change.place.split(".") if name in moving}
@@ -173,7 +174,9 @@ def acts_in(effect: Effect, instrument: Instrument, settings: Settings) -> bool:
     changes = [
         one for each in effect.first_order(dataclasses.replace(instrument, effects=())) for _, one in each
     ]
-    if changes and all(one.kind in responses.LIGHT for one in changes):  # of sources, of the angle of the sky
+    if changes and all(
+        one.kind in (*OF_POLARISER, "rotator") for one in changes
+    ):  # of sources, of the angle of the sky
         return False
     needed = moves_with(effect, instrument)
     return not needed or any(np.isfinite(settings.position(prefix)).any() for prefix in needed)

@@ -40,7 +40,7 @@ from walop_jax.model.effects.optics import DISPLACEMENTS
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import hours_of
-from walop_jax.model.responses import acts
+from walop_jax.model.slots import acts
 from walop_jax.sky.nights import first_of_nights
 
 # -------------------------------------------------------------------------------------------------------- all sentences

@@ -169,7 +169,7 @@ class _Starlight:
             if probe.name in self.added:
                 added = self.added[probe.name][..., number] * sizes[number]
                 change = _of_matrix(self.vectors, added, pairs)
-            else:  # of a user's own: the responses do not hold it
+            else:  # of a user's own: it has no slots
                 at = self.setting, fit.calset.filters, points.x, points.y
                 added = change = change_by_effect(self.instrument, effect, *at)
             size, unit = float(sizes[number]), declared[parameter].unit

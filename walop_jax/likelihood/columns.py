@@ -2,7 +2,7 @@
 
 A change is a sum of sentences (`model.effects.change`), with a coefficient each. Its column is the derivative of the
 used residuals with respect to its amplitude, at neutral: what it does to the light or to the analysis vectors
-(`model.responses`) meets the exposures, is multiplied by what it grows with, and the flux takes up its part.
+(`model.slots`) meets the exposures, is multiplied by what it grows with, and the flux takes up its part.
 
 Equation    ∂r/∂a = −P w F f (∂a_k/∂a · s + a_k · ∂s/∂a)
 Symbols     w = 1/σ, F flux, f what the change grows with, P projection off the flux (`flux.project_flux`)
@@ -14,9 +14,8 @@ Limits      first order. Where detectors are not linear their derivative stands 
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -30,34 +29,34 @@ from walop_jax.likelihood.engine import PointData, best_flux, point_prediction, 
 from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.layout import PointReader, median_over_field
 from walop_jax.likelihood.likelihood import Likelihood, Vector, used_rows
-from walop_jax.likelihood.pieces import NoColumnError, Piece, Resolver
-from walop_jax.model import light, responses
+from walop_jax.model import light, slots
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
-from walop_jax.model.effects.cameras import REFERENCE_COUNTS
+from walop_jax.model.effects.cameras import ADDED, Ghost
+from walop_jax.model.effects.change import KINDS, InExposures, NoSlotError, SlotTerm, product
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.optics import LARGEST_GAP
 from walop_jax.model.elements import WavePlate
 from walop_jax.model.elements.wave_plate import AirGap
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, NoSuchPlaceError
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for
-from walop_jax.model.responses import GENERATORS, LightResponses, Responses
-from walop_jax.model.sources import Sight
+from walop_jax.model.slots import LightSlopes, Slot, VectorSlopes
+from walop_jax.model.sources import ExposureArrays, Sight
 
 Change = Sequence[tuple[float, Sentence]]
-"""A sum of sentences with their coefficients; a factor of a sentence may be a function of what `Laid` has."""
+"""A sum of sentences with their coefficients."""
 
 LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
+CAMERAS = ("counts", "opposite", *ADDED)
+"""Stages of slots in some cameras: counts ahead of the detectors, of the opposite point, what detectors add to them."""
 GAPS_TOGETHER = 32  # thicknesses of air whose fringes are computed together, in one program for any number
-SLOTS = ("inserted", "numbers", "globally", "throughput", "mixed")  # of the analysis vectors
-_BEHIND = ("square", "median", "reported", "afterglow")  # what acts on counts as the detectors report them
 
 
 def columns(likelihood: Likelihood, values: Vector, changes: Sequence[Change]) -> Float[np.ndarray, "d a"]:
     """Derivatives of the used residuals (rows) with respect to the amplitudes of changes, at neutral.
 
-    `values` are all parameters of the model. Raises `NoColumnError` for a sentence that the responses do not hold.
+    `values` are all parameters of the model. Raises `NoSlotError` for a sentence that has no slots.
     """
     return Columns(likelihood, values).of(changes)
 
@@ -117,14 +116,14 @@ _own = compiled(
 class _AtPoint(NamedTuple):
     """Quantities of a field point; sites are the point itself and, where ghosts are active, the opposite one."""
 
-    vectors: Responses  # leading axis: sites
-    light: LightResponses
+    vectors: VectorSlopes  # leading axis: sites
+    light: LightSlopes
     share: Float[Array, "m e k"]  # of the counts at a site that a camera sees
     counts: Float[Array, "m e k"]  # for light of unit flux at the sites, ahead of ghosts
-    opposite: Float[Array, "e k"]
+    opposite: Float[Array, "e k"]  # of extended sources
     flux: Float[Array, "e f"]
     electrons: Float[Array, "e k"]
-    reported: Float[Array, "e k"]
+    added: dict[str, Float[Array, "e k"]]  # `ADDED` to the counts as they are reported
     along: Float[Array, "e k"]
 
 
@@ -133,8 +132,8 @@ def _at_point(instrument: Instrument, plan: Plan, point: PointData) -> _AtPoint:
     x, y = jnp.stack([point.x, -point.x]), jnp.stack([point.y, -point.y])
     sights = Sight(plan.exposures, jnp.stack([point.sky, point.opposite_sky]), point.source, x, y)
     sites = 2 if light.has_ghosts(instrument) else 1
-    vectors = jax.vmap(responses.vector_responses, (None, None, 0, 0))(instrument, plan, x[:sites], y[:sites])
-    lights = jax.vmap(responses.light_responses, (None, Sight(None, 0, None, 0, 0)))(
+    vectors = jax.vmap(slots.vector_slopes, (None, None, 0, 0))(instrument, plan, x[:sites], y[:sites])
+    lights = jax.vmap(slots.light_slopes, (None, Sight(None, 0, None, 0, 0)))(
         instrument, sights._replace(sky=sights.sky[:sites], x=x[:sites], y=y[:sites])
     )
     counts = jax.vmap(lambda v, taken: jnp.einsum("eks,eks->ek", v[point.band], taken))(
@@ -157,9 +156,10 @@ def _at_point(instrument: Instrument, plan: Plan, point: PointData) -> _AtPoint:
     reported, along = jax.jvp(
         lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
     )
-    return _AtPoint(
-        vectors, lights, jnp.stack([one, seen])[:sites], counts, opposite, flux, flux * unit, reported, along
-    )
+    share, ghost = jnp.stack([one, seen])[:sites], Ghost(jnp.ones(unit.shape[1]))
+    opposite = ghost.seen(point.source < 0, opposite)
+    added = {stage: add(reported, plan.exposures) for stage, add in ADDED.items() if stage != "median"}
+    return _AtPoint(vectors, lights, share, counts, opposite, flux, flux * unit, added, along)
 
 
 def _fringes(
@@ -169,7 +169,7 @@ def _fringes(
     x: Float[Array, "p m"],
     y: Float[Array, "p m"],
 ) -> Float[Array, "p m w g b k 4"]:
-    at = jax.vmap(responses.fringe_responses, (None, None, None, 0, 0))
+    at = jax.vmap(slots.fringe_slopes, (None, None, None, 0, 0))
     return jax.vmap(at, (None, None, None, 0, 0))(instrument, plan, gaps, x, y)
 
 
@@ -203,44 +203,6 @@ _visible = compiled(_visibilities, kept_as="visibilities")
 _detectors = compiled(_pushed, kept_as="detector_slopes")
 
 
-# --------------------------------------------------------------------------------------------------- factors
-
-
-@dataclasses.dataclass(frozen=True)
-class Laid:
-    """Quantities that factors may ask for: points along the first axis, exposures along the second.
-
-    Of angles those in the list of exposures: NaN where an element is out.
-    """
-
-    likelihood: Likelihood
-    x: Float[np.ndarray, "p 1"]
-    y: Float[np.ndarray, "p 1"]
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "number":
-            return np.arange(len(self.likelihood.flux_known))[None]
-        return np.asarray(getattr(self.likelihood.plan.exposures, name))[None]
-
-    def of_kind(self, name: str) -> Any:
-        """True in exposures of a KIND."""
-        return np.asarray(self.likelihood.plan.exposures.of_kind(name))[None]
-
-    def angle(self, prefix: str) -> Any:
-        """Angle of a moving element, NaN where it is out."""
-        position = self.likelihood.calset.exposures.position(prefix)
-        return np.deg2rad(np.where(position.inside, position.angle, np.nan))[None]
-
-
-def generator(name: str) -> Float[np.ndarray, "4 4"]:
-    """Generator of a change of the light ahead of the polariser; "q", "u" are added, whatever the light is."""
-    if name not in ("q", "u"):
-        return GENERATORS[name]
-    added = np.zeros((4, 4))
-    added["qu".index(name) + 1, 0] = 1.0
-    return added
-
-
 # ----------------------------------------------------------------------------------------------------- columns
 
 
@@ -252,30 +214,49 @@ class Columns:
         self.instrument = likelihood.model.instrument(values)
         self.plan = likelihood.plan
         self.patched = self.instrument.patched()
-        planned = "temperature" in self.plan.conditions.planned
-        self._resolver = Resolver(self.patched, () if planned else ("kelvin",))
-        self._known: dict[Sentence, list[Piece]] = {}
+        self.of_vectors, self.of_light = slots.vector_slots(self.patched), slots.light_slots(self.patched)
+        self.exposures: ExposureArrays = jax.tree.map(np.asarray, self.plan.exposures)
+        self.fringed = slots.fringe_places(self.patched)
+        self._known: dict[Sentence, list[SlotTerm]] = {}
         floor = likelihood.model.template.cameras.floor
         self.reader = PointReader(likelihood.calset, self.plan, mirrored=True, floor=floor)
         groups = self.plan.exposures.shared
         self.shared = Sharing(self.patched.cameras.together, None if groups is None else np.asarray(groups))
 
     def has(self, change: Change) -> bool:
-        """True if the responses hold a change."""
+        """True if a change is a sum of slots to first order."""
         try:
-            self.pieces_of(change)
-        except NoColumnError:
+            self.terms_of(change)
+        except NoSlotError:
             return False
         return True
 
-    def pieces_of(self, change: Change) -> list[Piece]:
-        """The pieces of a change. Raises `NoColumnError` for a sentence that the responses do not hold."""
+    def terms_of(self, change: Change) -> list[SlotTerm]:
+        """Slots of a change, coefficients and factors. Raises `NoSlotError` for a sentence that has no slots."""
         found = []
         for size, sentence in change:
             if sentence not in self._known:
-                self._known[sentence] = list(self._resolver.pieces(sentence))
-            found += [piece._replace(size=size * piece.size) for piece in self._known[sentence]]
+                self._known[sentence] = self._terms(sentence)
+            found += [part._replace(size=size * part.size) for part in self._known[sentence]]
         return found
+
+    def _terms(self, sentence: Sentence) -> list[SlotTerm]:
+        try:
+            parts = list(KINDS[sentence.kind].slots(self.patched, sentence))
+        except NoSuchPlaceError as error:
+            raise NoSlotError(str(error)) from None
+        if not all(self._holds(part.slot) and "colour" not in part.factors for part in parts):
+            raise NoSlotError(sentence.text)
+        if sentence.kind != "thermal" or "temperature" in self.plan.conditions.planned:
+            return parts
+        return [part._replace(factors=(*part.factors, "kelvin")) for part in parts]
+
+    def _holds(self, slot: Slot) -> bool:
+        if slot[0] == "light":
+            return slot[:4] in self.of_light
+        if slot[0] == "fringes":
+            return slot[1] in self.fringed
+        return slot[0] in CAMERAS or slot in self.of_vectors
 
     def survives(self, gaps: Sequence[float]) -> dict[float, bool]:
         """True where the bands leave anything of the fringes of air, by its thickness (µm)."""
@@ -294,14 +275,6 @@ class Columns:
         for place in patched.places(WavePlate):
             patched = patched.changed(place, air_gaps=lambda gaps: (*gaps, gap))
         return plan_for(patched, calset.exposures, calset.filters, calset.sources)
-
-    @functools.cached_property
-    def broad(self) -> Float[np.ndarray, " b"]:
-        """1 for bands that a shift of the band displaces (`light.BROAD`)."""
-        width = np.where(
-            np.asarray(self.plan.node_weight) != 0.0, np.asarray(self.plan.conditions.band_width), 0.0
-        )
-        return np.where(width.max(axis=1) > light.BROAD, 1.0, 0.0)
 
     @functools.cached_property
     def median(self) -> Float[np.ndarray, "e k"]:
@@ -325,15 +298,15 @@ class Columns:
         self, changes: Sequence[Change], exact: int
     ) -> tuple[Float[np.ndarray, "d a"], Float[np.ndarray, "d b"]]:
         """The columns of the first, `exact` changes, and those of the others in single precision."""
-        pieces = [self.pieces_of(change) for change in changes]
+        each = [self.terms_of(change) for change in changes]
         likelihood, size = self.likelihood, limits.RESPONSES_TOGETHER
         used, cameras = likelihood.used, len(self.patched.cameras)
         length = cameras * int(used.sum())
         parts = (
-            (pieces[:exact], np.empty((exact, length))),
-            (pieces[exact:], np.empty((len(changes) - exact, length), np.float32)),
+            (each[:exact], np.empty((exact, length))),
+            (each[exact:], np.empty((len(changes) - exact, length), np.float32)),
         )
-        every, first = [piece for each in pieces for piece in each], 0
+        every, first = list(dict.fromkeys(part.slot for some in each for part in some)), 0
         for start in range(0, len(used), size):
             rows = cameras * int(used[start : start + size].sum())
             block = ResponseBlock(self, start, every)
@@ -350,7 +323,7 @@ class ResponseBlock:
     where something else than the flux couples them.
     """
 
-    def __init__(self, of: Columns, start: int, pieces: Sequence[Piece]) -> None:
+    def __init__(self, of: Columns, start: int, every: Sequence[Slot]) -> None:
         self.of, size = of, limits.RESPONSES_TOGETHER
         (data,) = of.reader.batches(start, start + size, size)
         found = _at_points(of.instrument, of.plan, data)
@@ -369,7 +342,7 @@ class ResponseBlock:
         self.share = self._pairs(self.found.share)
         self._patterns: dict[tuple[Any, ...], np.ndarray] = {}
         self._cores: dict[tuple[Any, ...], np.ndarray] = {}
-        self._solve(pieces, np.asarray(data.x), np.asarray(data.y))
+        self._solve(every)
 
     def _pairs(self, values: Float[np.ndarray, "p ..."]) -> Float[np.ndarray, ...]:
         """(p e k) → (k n), (p m e k) → (m k n)."""
@@ -384,37 +357,33 @@ class ResponseBlock:
         if factors not in self._patterns:
             each = []
             for sign in (1.0, -1.0)[: self.sites]:
-                at = Laid(self.of.likelihood, sign * self.x[:, None], sign * self.y[:, None])
-                texts = tuple(f for f in factors if isinstance(f, str))
-                value = Sentence("", "", "", texts, units=self.of.patched.units).factor(at)
-                for other in (f for f in factors if not isinstance(f, str)):
-                    value = value * other(at)
+                at = InExposures(self.of.exposures, sign * self.x[:, None], sign * self.y[:, None])
+                value = product(factors, at, self.of.patched.units)
                 whole = np.broadcast_to(np.nan_to_num(np.asarray(value)), self.used.shape)
                 each.append(whole.reshape(-1)[self.chosen])
             self._patterns[factors] = np.stack(each)
         return self._patterns[factors]
 
-    def _solve(self, pieces: Sequence[Piece], x: Vector, y: Vector) -> None:
+    def _solve(self, every: Sequence[Slot]) -> None:
         """All cores: what slots do to the counts, or to weighted counts where detectors are linear."""
-        keys = list(dict.fromkeys((p.kind, *p.at) for p in pieces))
-        of_vectors = [key for key in keys if key[0] in (*SLOTS, "fringes")]
-        fringes = self._fringes([key[2] for key in of_vectors if key[0] == "fringes"], x, y)
+        of_vectors = [slot for slot in every if slot[0] == "fringes" or slot in self.of.of_vectors]
+        fringes = self._fringes([slot[2] for slot in of_vectors if slot[0] == "fringes"])
         # Points that no exposure measures are in no pair.
         some = max(1, int(limits.RESPONSE_NUMBERS // max(1, self.sites * self.cameras * len(self.chosen))))
         for first in range(0, len(of_vectors), some):
             part = of_vectors[first : first + some]
-            change = np.stack([self.change(key, fringes) for key in part])
+            change = np.stack([fringes[slot] if slot in fringes else self.change(slot) for slot in part])
             self._cores |= dict(zip(part, self._met(change), strict=True))
-        for key in keys:
-            if key not in self._cores:
-                self._cores[key] = self._core(key)
+        for slot in every:
+            if slot not in self._cores:
+                self._cores[slot] = self._core(slot)
 
-    def _fringes(self, gaps: Sequence[float], x: Vector, y: Vector) -> dict[tuple[int, float], np.ndarray]:
-        """Responses (p m b k 4) to fringes, by plate and thickness of the air."""
+    def _fringes(self, gaps: Sequence[float]) -> dict[Slot, np.ndarray]:
+        """Slopes (p m b k 4) in fringes."""
         every = list(dict.fromkeys(gaps))
         if not every:
             return {}
-        sites = [np.stack([one, -one], 1)[:, : self.sites] for one in (x, y)]
+        sites = [np.stack([one, -one], 1)[:, : self.sites] for one in (self.x, self.y)]
         padded = np.pad(np.array(every), (0, -len(every) % GAPS_TOGETHER), mode="edge")
         parts = [
             np.asarray(_fringes_at(self.of.instrument, self.of.fringe_plan, some, *sites))
@@ -422,26 +391,14 @@ class ResponseBlock:
         ]
         whole = np.concatenate(parts, axis=3)
         return {
-            (plate, gap): whole[:, :, plate, i]
+            ("fringes", place, gap): whole[:, :, plate, i]
             for i, gap in enumerate(every)
-            for plate in range(whole.shape[2])
+            for plate, place in enumerate(self.of.fringed)
         }
 
-    def change(self, key: tuple[Any, ...], fringes: Mapping[tuple[int, float], np.ndarray]) -> np.ndarray:
-        """Change (p m b k 4) of the analysis vectors."""
-        kind, *at = key
-        vectors = self.found.vectors
-        if kind == "fringes":
-            return fringes[at[0], at[1]]
-        if kind == "mixed":
-            target, origin = at
-            change = np.zeros_like(vectors.vectors)
-            change[:, :, :, target] = vectors.vectors[:, :, :, origin]
-            return change
-        if kind == "globally":
-            change = vectors.globally[:, :, at[0]]
-            return change * self.of.broad[:, None, None] if at[1] else change
-        return getattr(vectors, kind)[(slice(None), slice(None), *at)]
+    def change(self, slot: Slot) -> Float[np.ndarray, "p m b k 4"]:
+        """Slope of the analysis vectors."""
+        return self.found.vectors.slopes[:, :, self.of.of_vectors[slot]]
 
     def _met(self, change: Float[np.ndarray, "s p m b k 4"]) -> Float[np.ndarray, "s m k n"]:
         """Analysis vectors that change, with the light of the exposures."""
@@ -458,34 +415,27 @@ class ResponseBlock:
         flat = whole.reshape(*whole.shape[:3], -1)
         return (flat if self.whole else flat[..., self.chosen]) * (self.share * self.flux)
 
-    def _core(self, key: tuple[Any, ...]) -> Float[np.ndarray, "m k n"]:
-        kind, *at = key
+    def _core(self, slot: Slot) -> Float[np.ndarray, "m k n"]:
         found = self.found
-        if kind == "light":
+        if slot[0] == "light":
             vectors = np.take_along_axis(
                 found.vectors.vectors, self.band[:, None, :, None, None], axis=2
             )  # p m e k 4
-            raw = np.einsum("pmeks,pmes->pmek", vectors, self._light(at)) * found.light.factor
+            change = found.light.slopes[:, :, self.of.of_light[slot[:4]]]
+            for star in slot[4:]:
+                change = change * (self.source == star)[:, None, :, None]
+            raw = np.einsum("pmeks,pmes->pmek", vectors, change) * found.light.factor
             return self._pairs(raw) * self.share * self.flux
-        cameras = np.asarray(at)
-        if kind == "counts":
+        stage, cameras = slot
+        if stage == "counts":
             return self._pairs(found.counts * cameras) * self.share * self.flux
-        if kind == "opposite":
-            extended = np.where(self.source < 0, 1.0, 0.0)[..., None]
-            return self._alone(found.opposite * extended * cameras) * self.flux
-        # Behind the detectors: counts as they are reported.
-        reported = found.reported
-        if kind == "square":
-            added = reported**2 / REFERENCE_COUNTS
-        elif kind == "median":
-            added = np.broadcast_to(self.of.median, reported.shape)
-        elif kind == "reported":
-            added = reported
-        else:
-            assert kind == "afterglow"
-            order = np.argsort(np.asarray(self.of.plan.exposures.hours), kind="stable")
-            added = np.zeros_like(reported)
-            added[:, order[1:]] = reported[:, order[:-1]]
+        if stage == "opposite":
+            return self._alone(found.opposite * cameras) * self.flux
+        added = (
+            np.broadcast_to(self.of.median, found.electrons.shape)
+            if stage == "median"
+            else found.added[stage]
+        )
         return self._alone(added * cameras) * (self.weight if self.linear else 1.0)
 
     def _alone(self, values: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "m k n"]:
@@ -493,33 +443,21 @@ class ResponseBlock:
         own = self._pairs(values)[None]
         return np.concatenate([own, *([np.zeros_like(own)] * (self.sites - 1))])
 
-    def _light(self, at: Sequence[Any]) -> Float[np.ndarray, "p m e 4"]:
-        """Change of the Stokes vectors behind the polariser."""
-        stokes, name = self.found.light.stokes, at[0]
-        if not isinstance(name, str):
-            change = self.found.light.slopes[:, :, name]
-            return change if len(at) == 1 else change * (self.source == at[1])[:, None, :, None]
-        if name == "ahead":
-            there = self.found.light.from_sky
-        else:
-            there = np.broadcast_to(np.asarray(self.of.plan.exposures.clp_in) * 1.0, stokes.shape[:-1])
-        return stokes @ generator(at[1]).T * there[..., None]
-
     # --------------------------------------------------------------------------------------------------- columns
 
-    def fill(self, changes: Sequence[Sequence[Piece]], found: Float[np.ndarray, "a d"]) -> None:
+    def fill(self, changes: Sequence[Sequence[SlotTerm]], found: Float[np.ndarray, "a d"]) -> None:
         """Write the columns of changes, for these points."""
         size = limits.COLUMNS_TOGETHER // 4
         for first in range(0, len(changes), size):
             some = changes[first : first + size]
             change = np.zeros((len(some), self.cameras, len(self.chosen)))
             behind = None if self.linear else np.zeros_like(change)
-            for a, pieces in enumerate(some):
-                for piece in pieces:
-                    core, pattern = self._cores[(piece.kind, *piece.at)], self._pattern(piece.factors)
-                    into = change if behind is None or piece.kind not in _BEHIND else behind
+            for a, parts in enumerate(some):
+                for slot, coefficient, factors in parts:
+                    core, pattern = self._cores[slot], self._pattern(factors)
+                    into = change if behind is None or slot[0] not in ADDED else behind
                     for site in range(self.sites):
-                        into[a] += core[site] * (piece.size * pattern[site])
+                        into[a] += core[site] * (coefficient * pattern[site])
             if behind is not None:
                 change = (self._reported(change) + behind) * self.weight
             self._write(change, found[first : first + len(some)])

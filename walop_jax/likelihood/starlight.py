@@ -1,7 +1,7 @@
-"""Change of the light of a star by small changes of an instrument: to first order, from the responses of the columns.
+"""Change of the light of a star by small changes of an instrument: to first order, from the slots of the columns.
 
 Equation    δa = Σ f B G F + a G_t      of the optics behind the telescope, of the light ahead of the polariser
-Symbols     a analysis vectors (camera; 1, q, u) of one setting; B, G, F as in `model.responses`; G_t generator of what
+Symbols     a analysis vectors (camera; 1, q, u) of one setting; B, G, F as in `model.slots`; G_t generator of what
             acts on the light itself; f what the change grows with over the field
 Limits      First order. Changes of sources, of the polariser, of detectors and in single exposures do nothing to a
             star; what grows with time, temperature or an angle is 0 in the usual setting.
@@ -9,59 +9,67 @@ Limits      First order. Changes of sources, of the polariser, of detectors and 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.columns import SLOTS, Change, Columns, Laid, ResponseBlock, generator
-from walop_jax.likelihood.pieces import Piece
+from walop_jax.likelihood.columns import Change, Columns, ResponseBlock
+from walop_jax.model.effects.change import InExposures, SlotTerm
 from walop_jax.model.effects.factors import FIELD, Units, factor
+from walop_jax.model.slots import Slot, generator_ahead
 
 
 def added_to_starlight(
     columns: Columns, changes: Sequence[Change], exposure: int
 ) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
     """Analysis vectors at the field points in the setting of an exposure, and what one unit of each change adds."""
-    pieces = [columns.pieces_of(change) for change in changes]
+    each = [columns.terms_of(change) for change in changes]
+    slots = {part.slot for parts in each for part in parts}
+    ahead = {s: generator_ahead(columns.patched, s) for s in slots if s[0] == "light" and s[2] == "ahead of"}
     points, size, found = len(columns.likelihood.used), limits.RESPONSES_TOGETHER, []
     for start in range(0, points, size):
-        parts = _at_points(ResponseBlock(columns, start, ()), pieces, exposure)
+        parts = _at_points(ResponseBlock(columns, start, ()), each, exposure, ahead)
         found.append(tuple(part[: points - start] for part in parts))
     vectors, added = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return vectors, added
 
 
 def _at_points(
-    block: ResponseBlock, changes: Sequence[Sequence[Piece]], exposure: int
+    block: ResponseBlock,
+    changes: Sequence[Sequence[SlotTerm]],
+    exposure: int,
+    ahead: Mapping[Slot, np.ndarray],
 ) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
     every, band = np.arange(len(block.x)), block.band[:, exposure]
     vectors = np.asarray(block.found.vectors.vectors)[every, 0, band]  # p k 4
     added = np.zeros((*vectors.shape[:-1], 3, len(changes)))
-    at = Laid(block.of.likelihood, block.x[:, None], block.y[:, None])
-    for a, pieces in enumerate(changes):
-        for piece in pieces:
-            if piece.kind in SLOTS:
-                change = block.change((piece.kind, *piece.at), {})[every, 0, band]
-            elif piece.kind == "light" and piece.at[0] == "ahead":
-                change = vectors @ generator(piece.at[1])
-            elif piece.kind == "counts":
-                change = vectors * np.asarray(piece.at)[:, None]
+    at = InExposures(block.of.exposures, block.x[:, None], block.y[:, None])
+    for a, parts in enumerate(changes):
+        for slot, coefficient, factors in parts:
+            if slot in block.of.of_vectors:
+                change = block.change(slot)[every, 0, band]
+            elif slot in ahead:
+                change = vectors @ ahead[slot]
+            elif slot[0] == "counts":
+                change = vectors * np.asarray(slot[1])[:, None]
             else:
                 continue
-            size = _for_stars(piece.factors, at, exposure, block.of.patched.units) * piece.size
+            size = _for_stars(factors, at, exposure, block.of.patched.units) * coefficient
             added[..., a] += size[:, None, None] * change[..., :3]
     return vectors[..., :3], added
 
 
-def _for_stars(factors: Sequence[Any], at: Laid, exposure: int, units: Units) -> Float[np.ndarray, " p"]:
+def _for_stars(
+    factors: Sequence[Any], at: InExposures, exposure: int, units: Units
+) -> Float[np.ndarray, " p"]:
     """Product of factors for stars in the setting of an exposure: at its time, temperature and angles nothing grows."""
     points, product = len(at.x), np.ones(len(at.x))
     for one in factors:
         if not isinstance(one, str):
-            shape = (points, len(at.likelihood.flux_known))
+            shape = (points, len(at.number))
             product = product * np.broadcast_to(one(at), shape)[:, exposure]
         elif (known := factor(one)).depends_on == FIELD:
             product = product * np.broadcast_to(known.value(at, units), (points, 1))[:, 0]

@@ -8,6 +8,7 @@ elements of one class over together: the half-wave plates are one computation, c
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 
@@ -125,10 +126,57 @@ def _branched(
     return (rows if order == list(range(len(keys))) else rows[np.array(order)]), list(parents)
 
 
+def around(
+    common: Sequence[Station],
+    arms: Sequence[Sequence[Station]],
+    analysers: Sequence[Analyser],
+    matrices: Solved,
+    moving: Sequence[str],
+    states: Sequence[State],
+    nodes: int,
+) -> list[list[tuple[Float[Array, "c n r 4"], Float[Array, "c n 4 4"]]]]:
+    """For every place of the common train and of the arms: rows that the analysers see of light there, in every state,
+    and the matrix of what is ahead of it.
+
+    A change of the matrix of a station changes the rows by (rows behind it) × change × (matrix ahead of it).
+    """
+    every = [*common, *(station for arm in arms for station in arm)]
+    own = [stacked(matrices, i, element, moving, states) for i, (element, _) in enumerate(every)]
+    start = jnp.broadcast_to(jnp.eye(4), (len(states), nodes, 4, 4))
+    seen = [analyser.seen(jnp.eye(4)) for analyser in analysers]
+    blank = jnp.zeros((len(states), nodes, sum(map(len, seen)), 4))
+    found, row, first, count = [], 0, len(common), len(common)
+    for arm, analysed in zip(arms, seen, strict=True):
+        path = [*own[:count], *own[first : first + len(arm)]]
+        last = blank.at[:, :, row : row + len(analysed)].set(analysed)
+        row, first = row + len(analysed), first + len(arm)
+        rows = [*itertools.accumulate(reversed(path), _ahead, initial=last)][::-1]
+        places = [*zip(rows, itertools.accumulate(path, _behind, initial=start), strict=True)]
+        found.append((places[: count + 1], places[count:]))
+    same = zip(
+        *(shared for shared, _ in found), strict=True
+    )  # of the common train, as each of the arms sees it
+    whole = [(functools.reduce(jnp.add, [rows for rows, _ in each]), each[0][1]) for each in same]
+    return [whole, *(arm for _, arm in found)]
+
+
+def _behind(matrix: Array, own: Mueller | None) -> Array:
+    return matrix if own is None else own @ matrix
+
+
+def _ahead(rows: Array, own: Mueller | None) -> Array:
+    return rows if own is None else rows @ own
+
+
 def stacked(
-    matrices: Solved, number: int, element: Element, moving: Sequence[str], keys: Sequence[State]
+    matrices: Solved,
+    number: int,
+    element: Element,
+    moving: Sequence[str],
+    keys: Sequence[State],
+    out: Mueller | None = None,
 ) -> Mueller | None:
-    """Matrices of a station in every state, None where it is the identity in all."""
+    """Matrices of a station in every state, `out` (the identity) where it is out; None where it never acts."""
     if element.moves is None:
         return matrices[number, None]
     angles = positions(element, moving, keys)
@@ -138,8 +186,8 @@ def stacked(
     if not inside:
         return None
     whole = np.broadcast_shapes(*(matrix.shape for matrix in inside))
-    eye = jnp.broadcast_to(jnp.eye(4), whole)
-    stack = jnp.stack([eye if m is None else jnp.broadcast_to(m, whole) for m in own])
+    gone = jnp.broadcast_to(jnp.eye(4) if out is None else out, whole)
+    stack = jnp.stack([gone if m is None else jnp.broadcast_to(m, whole) for m in own])
     if len(distinct) < len(angles):
         stack = stack[np.array([distinct.index(at) for at in angles])]
     return stack if len(whole) == 3 else stack[:, None]

@@ -15,6 +15,7 @@ Units       counts per unit of unpolarised light at unit throughput; angles rad;
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -138,23 +139,25 @@ def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float
     def at(wavelength: Float[Array, " n"]) -> Float[Array, "c n r 4"]:
         return _node_rows(instrument, plan, Ray.entering(x, y, (wavelength, plan.conditions)))
 
-    if is_dispersed(instrument):
-        rows = jnp.concatenate(jax.jvp(at, (wavelength,), (wavelength,)), axis=2)
-    else:
-        rows = at(wavelength)
+    rows = with_dispersion(instrument, at, wavelength)
     weights = band_weights(instrument, plan)
+    return in_bands(instrument, integrated(plan, weights, rows), weights @ wavelength)
+
+
+def integrated(
+    plan: Plan, weights: Float[Array, "b n"], rows: Float[Array, "*s c n r 4"]
+) -> Float[Array, "*s b r 4"]:
+    """Sums over the nodes of every band, each in its own state."""
     sizes = {last - first for _, first, last in plan.settings}
     if len(sizes) == 1 and len(plan.settings) > FEW_SETTINGS:
         own = weights.reshape(len(plan.settings), *sizes, -1)
-        bands = jnp.einsum("cbn,cnrs->cbrs", own, rows).reshape(-1, *rows.shape[2:])
-    else:
-        bands = jnp.concatenate(
-            [
-                jnp.einsum("bn,nrs->brs", weights[first:last], rows[i])
-                for i, (_, first, last) in enumerate(plan.settings)
-            ]
-        )
-    return in_bands(instrument, bands, weights @ wavelength)
+        bands = jnp.einsum("cbn,...cnrs->...cbrs", own, rows)
+        return bands.reshape(*rows.shape[:-4], len(weights), *rows.shape[-2:])
+    parts = [
+        jnp.einsum("bn,...nrs->...brs", weights[first:last], rows[..., i, :, :, :])
+        for i, (_, first, last) in enumerate(plan.settings)
+    ]
+    return jnp.concatenate(parts, axis=-3)
 
 
 def in_bands(
@@ -168,6 +171,14 @@ def in_bands(
     return jnp.concatenate(
         [analysers[i % len(analysers)].in_band(part, mean) for i, part in enumerate(parts)], axis=1
     )
+
+
+def with_dispersion(instrument: Instrument, rows: Callable[[Array], Any], wavelength: Array) -> Any:
+    """Rows at wavelengths, or trees of them, with λ ∂/∂λ behind where the beams of an analyser differ in wavelength."""
+    if not is_dispersed(instrument):
+        return rows(wavelength)
+    both = jax.jvp(rows, (wavelength,), (wavelength,))
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-2), *both)
 
 
 def is_dispersed(instrument: Instrument) -> bool:

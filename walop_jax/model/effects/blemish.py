@@ -104,7 +104,7 @@ class Blemish(Effect):
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
         """A gain of the camera that goes as the spot."""
         pattern = _Pattern(float(self.x), float(self.y), float(self.size))
-        return (((-1.0, Change("shade", "of", instrument.cameras.names[self.camera], (pattern,))),),)
+        return (((-1.0, Change("gain", "of", instrument.cameras.names[self.camera], (pattern,))),),)
 
     def patch(self, instrument: Instrument) -> Instrument:
         """Darken the camera around the spot."""

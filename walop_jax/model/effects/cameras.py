@@ -28,6 +28,7 @@ from walop_jax.model.effects.change import (
     Grows,
     Kind,
     Scalar,
+    SlotTerm,
     Term,
     in_exposures,
 )
@@ -136,7 +137,7 @@ def stage_of(change: Change) -> str:
     if change.kind == "light":
         return "opposite" if change.origin == OPPOSITE else "mixed" if change.origin else "median"
     if change.kind != "gain":
-        return {"reported gain": "reported", "afterglow": "afterglow", "shade": "throughput"}[change.kind]
+        return {"reported gain": "reported", "afterglow": "afterglow"}[change.kind]
     if "counts" in change.factors:
         return "square"
     still = all(one.depends_on in (FIELD, WAVELENGTH) for one in change.grows_with)
@@ -177,13 +178,25 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     return Grows(_WITH.get(stage_of(change), ()), None)
 
 
+def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
+    """A stage and the cameras; of what acts on analysis vectors a part for each camera, or target and origin."""
+    stage, cameras = stage_of(change), cameras_of(instrument, change.place)
+    slots: list[tuple[Any, ...]] = [(stage, cameras)]
+    if stage == "mixed":
+        slots = [(stage, cameras.index(1.0), cameras_of(instrument, change.origin).index(1.0))]
+    elif stage == "throughput":
+        slots = [(stage, camera) for camera, share in enumerate(cameras) if share]
+    return [SlotTerm(slot, 1.0, change.factors) for slot in slots]
+
+
 _OF_GAINS = "a lamp that does not change, seen by all cameras in turn"
-KINDS |= {
-    "gain": Kind("share", _patch, stage_of, _OF_GAINS, _grows),
-    "reported gain": Kind("share", _patch, stage_of, _OF_GAINS, _grows),
-    "afterglow": Kind("share", _patch, stage_of, "a dark exposure after a bright one", _grows),
-    "light": Kind("share", _patch, stage_of, "the same field points at another flux, and darks", _grows),
+_TESTS = {
+    "gain": _OF_GAINS,
+    "reported gain": _OF_GAINS,
+    "afterglow": "a dark exposure after a bright one",
+    "light": "the same field points at another flux, and darks",
 }
+KINDS |= {name: Kind("share", _patch, stage_of, test, _grows, slots=_slots) for name, test in _TESTS.items()}
 
 
 def cameras_of(instrument: Instrument, place: str) -> Weights:

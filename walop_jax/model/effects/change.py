@@ -17,11 +17,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import operator
 import re
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any, NamedTuple, Self
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.data.records import POLARISER
@@ -33,6 +35,8 @@ from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays
 
 Term = tuple["Change", Scalar]
+Given = str | Callable[[Any], Any]
+"""A factor: a text, or a function of the quantities that factors may ask for."""
 OPPOSITE = "opposite"  # the field point, as an origin of light
 SKY, BAND = "sky", "band"  # places that are no element
 
@@ -68,12 +72,33 @@ class Grows(NamedTuple):
     angle: str | None = ""
 
 
+class NoSlotError(ValueError):
+    """A change that is no sum of slots to first order: its own derivative is needed."""
+
+
+class SlotTerm(NamedTuple):
+    """A part of a change to first order: a slot of the light path (`model.slots`), a coefficient, factors."""
+
+    slot: tuple[Any, ...]
+    size: float
+    factors: tuple[Given, ...]
+
+
+SlotTerms = Callable[["Instrument", "Change"], Iterable[SlotTerm]]
+
+
+def itself(stage: str) -> SlotTerms:
+    """Slots of changes that are slots themselves: without their factors, at a stage of the light path."""
+    return lambda _, change: [SlotTerm((stage, change.kind, change.where, change.place), 1.0, change.factors)]
+
+
 @dataclasses.dataclass(frozen=True)
 class Kind:
     """A kind of change: one of `AMPLITUDES`, what changes of some amplitudes make of an instrument, what would show it.
 
     Changes for which `patch` and `together` are equal are patched together. `patch` and `grows` raise
-    `NoSuchPlaceError` where an instrument has no such place, ValueError for a change that cannot be made.
+    `NoSuchPlaceError` where an instrument has no such place, ValueError for a change that cannot be made. `slots` are
+    its parts to first order; slots that an instrument does not have are no error here.
     """
 
     parameter: str
@@ -81,6 +106,7 @@ class Kind:
     together: Callable[[Change], Hashable] = lambda change: change
     test: str = ""
     grows: Callable[[Instrument, Change], Grows] = lambda instrument, change: Grows()
+    slots: SlotTerms = dataclasses.field(kw_only=True)
 
 
 KINDS: dict[str, Kind] = {}
@@ -97,7 +123,7 @@ class Change:
     kind: str
     where: str
     place: str
-    factors: tuple[Any, ...] = ()  # texts; a column may be taken with a function of the exposures instead
+    factors: tuple[Given, ...] = ()
     origin: str = ""
     units: Units = OF_WALOP
 
@@ -110,7 +136,7 @@ class Change:
     def text(self) -> str:
         """The change as it is typed."""
         origin = f" of {self.origin}" if self.origin else ""
-        return " * ".join((f"{self.kind}{origin} {self.where} {self.place}", *self.factors))
+        return " * ".join((f"{self.kind}{origin} {self.where} {self.place}", *map(str, self.factors)))
 
     @property
     def label(self) -> str:
@@ -124,8 +150,8 @@ class Change:
 
     @property
     def grows_with(self) -> tuple[Factor, ...]:
-        """Its factors."""
-        return tuple(map(factor, self.factors))
+        """Its factors that have a text."""
+        return tuple(factor(one) for one in self.factors if isinstance(one, str))
 
     def counted_in(self, units: Units) -> Change:
         """The change of an instrument with its scales."""
@@ -136,7 +162,7 @@ class Change:
         """True if what it does to a star is known from the counts and the place of the star alone."""
         elsewhere = self.kind == "afterglow" or (self.kind == "light" and self.origin in ("", OPPOSITE))
         return not elsewhere and all(
-            factor.split()[0] not in ("hours", "exposure", "kind") for factor in self.factors
+            one.text.split()[0] not in ("hours", "exposure", "kind") for one in self.grows_with
         )
 
     def times(self, *factors: str) -> Change:
@@ -161,11 +187,8 @@ class Change:
         return found[0]
 
     def factor(self, at: Any) -> Any:
-        """Product of its factors (`Factor.value`), 1 without any."""
-        product: Any = 1.0
-        for each in self.grows_with:
-            product = product * each.value(at, self.units)
-        return product
+        """Product of its factors, 1 without any."""
+        return product(self.factors, at, self.units)
 
     def in_train(self, ray: Ray, angle: Any) -> Any:
         """Product of its factors for a ray, in an element that stands at `angle` (deg)."""
@@ -246,6 +269,12 @@ def patched(instrument: Instrument, terms: Iterable[Term]) -> Instrument:
     return instrument
 
 
+def product(factors: Iterable[Given], at: Any, units: Units) -> Any:
+    """Product of factors, 1 without any."""
+    each = (factor(one).value(at, units) if isinstance(one, str) else one(at) for one in factors)
+    return functools.reduce(operator.mul, each, 1.0)
+
+
 def add(size: Scalar) -> Any:
     """Function that adds an amplitude to a number of an instrument that may not have it."""
     return lambda value: size if value is None else value + size
@@ -295,17 +324,19 @@ class InExposures:
     @property
     def number(self) -> Any:
         """Positions in the list."""
-        return jnp.arange(self.exposures.hours.shape[0])
+        return np.arange(len(self.exposures.hours))
 
     def of_kind(self, name: str) -> Any:
         """True in exposures of a KIND."""
         return self.exposures.of_kind(name)
 
     def angle(self, prefix: str) -> Any:
-        """That of the polariser or of another element that moves; NaN where it is out."""
+        """That of the polariser or of another element that moves (rad); NaN where it is out."""
+        angle = self.exposures.clp_angle
         if prefix == POLARISER:
-            return jnp.where(self.exposures.clp_in, self.exposures.clp_angle, jnp.nan)
-        return self.exposures.moving.get(prefix, jnp.full(self.exposures.clp_angle.shape, jnp.nan))
+            xp = np if isinstance(angle, np.ndarray) else jnp
+            return xp.where(self.exposures.clp_in, angle, np.nan)
+        return self.exposures.moving.get(prefix, np.full(angle.shape, np.nan))
 
 
 def in_exposures(change: Change, exposures: ExposureArrays, x: Any = 0.0, y: Any = 0.0) -> Float[Array, " e"]:

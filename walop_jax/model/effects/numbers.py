@@ -6,7 +6,18 @@ from collections.abc import Hashable, Sequence
 
 import jax.numpy as jnp
 
-from walop_jax.model.effects.change import BAND, KINDS, SKY, Change, Grows, Kind, Term, add
+from walop_jax.model.effects.change import (
+    BAND,
+    KINDS,
+    SKY,
+    Change,
+    Grows,
+    Kind,
+    SlotTerm,
+    Term,
+    add,
+    itself,
+)
 from walop_jax.model.effects.factors import EXPOSURE, FIELD, WAVELENGTH
 from walop_jax.model.elements import WavePlate
 from walop_jax.model.elements.wave_plate import Grown
@@ -14,7 +25,8 @@ from walop_jax.model.instrument import Instrument, NoSuchPlaceError
 from walop_jax.model.parameters import unknown_name
 from walop_jax.model.sources import MoonPatches
 
-OF_SOURCES = ("polarisation q", "polarisation u", "polarisation")
+OF_QU = ("polarisation q", "polarisation u")
+OF_SOURCES = (*OF_QU, "polarisation")
 
 
 def _number(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -93,13 +105,28 @@ def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return instrument
 
 
+def _slots_of_source(instrument: Instrument, change: Change) -> list[SlotTerm]:
+    """Of the light: q or u of a star has its number in the list."""
+    names = [name.replace(" ", "_") for name in instrument.standard.names]
+    star = (names.index(change.place),) if change.place in names else ()
+    place = instrument.standard.name if star else change.place
+    return [SlotTerm(("light", change.kind, change.where, place, *star), 1.0, change.factors)]
+
+
 NUMBERS = {"axis": "angle", "cut": "angle", "thickness": "length", "thermal": "number"}
 """Kinds that are numbers of wave plates, of layers of them (µm, deg), and their amplitudes."""
-KINDS |= {name: Kind(amplitude, _of_plate, grows=_with_ray) for name, amplitude in NUMBERS.items()}
-KINDS |= {name: Kind("share", _number) for name in ("extinction", "ellipticity")}
+KINDS |= {
+    name: Kind(amplitude, _of_plate, grows=_with_ray, slots=itself("number"))
+    for name, amplitude in NUMBERS.items()
+}
+OF_POLARISER = ("extinction", "ellipticity")
+KINDS |= {name: Kind("share", _number, slots=itself("light")) for name in OF_POLARISER}
 _OF_BAND = "narrow bands beside the broad one"  # filters wider than `light.BROAD` are displaced
-KINDS["shift"] = Kind("wavelength", _of_instrument, test=_OF_BAND)
+KINDS["shift"] = Kind("wavelength", _of_instrument, test=_OF_BAND, slots=itself("whole"))
 _OF_ROTATOR = "a polariser aligned in the laboratory: an independent zero of the angle"
-KINDS["rotator"] = Kind("angle", _of_instrument, test=_OF_ROTATOR)
+KINDS["rotator"] = Kind("angle", _of_instrument, test=_OF_ROTATOR, slots=itself("light"))
 _OF_SOURCE = "the same patch or star again at another ROTATOR angle"
-KINDS |= {name: Kind("share", _polarised, _patches, _OF_SOURCE, _of_patch) for name in OF_SOURCES}
+KINDS |= {
+    name: Kind("share", _polarised, _patches, _OF_SOURCE, _of_patch, slots=_slots_of_source)
+    for name in OF_SOURCES
+}

@@ -10,18 +10,30 @@ Limits      exact for one kind at a place; which of several acts first is a matt
 
 from __future__ import annotations
 
-import operator
+import dataclasses
 from collections.abc import Hashable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model import mueller
-from walop_jax.model.conventions import Units
-from walop_jax.model.effects.change import KINDS, AtPoint, Change, Grows, Kind, Scalar, Term, in_exposures
-from walop_jax.model.effects.factors import EXPOSURE, FIELD, PLAIN, SHAPE, WAVELENGTH
+from walop_jax.model.effects.change import (
+    KINDS,
+    AtPoint,
+    Change,
+    Grows,
+    Kind,
+    Scalar,
+    SlotTerm,
+    Term,
+    in_exposures,
+    itself,
+    product,
+)
+from walop_jax.model.effects.factors import EXPOSURE, FIELD, SHAPE, WAVELENGTH
 from walop_jax.model.elements import AddedPolarisation, AirGap
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.instrument import Instrument
@@ -34,36 +46,41 @@ LARGEST_GAP = 60.0  # µm of air
 
 
 AXES = ("q", "u", "v", "radial", "diagonal")
+GENERATORS = (
+    *(f"{what} {axis}" for what in ("diattenuation", "retardance") for axis in "quv"),
+    "depolarisation",
+)
+"""Kinds of which all others are sums."""
+ADDED = ("added polarisation q", "added polarisation u")
 DISPLACEMENTS = ("displacement x", "displacement y")
 
 
-def _along(axis: str, size: Any, x: Any, y: Any, units: Units) -> tuple[Any, ...]:
-    """The components along q, u and v of something with one of the `AXES`."""
-    if axis in ("q", "u", "v"):
-        return tuple(size if axis == one else 0.0 for one in "quv")
-    point = AtPoint(x, y)
-    straight, across = (PLAIN[name].value(point, units) for name in ("x2-y2", "xy"))
+def generators_of(kind: str) -> tuple[tuple[str, float, tuple[str, ...]], ...]:
+    """The `GENERATORS` that a kind is, with coefficients and factors."""
+    what, _, axis = kind.partition(" ")
+    if what == "turn":  # a circular retarder
+        return (("retardance v", -2.0 * np.pi / 180.0, ()),)
+    if axis == "radial":
+        return (f"{what} q", 1.0, ("x2-y2",)), (f"{what} u", 1.0, ("xy",))
     if axis == "diagonal":
-        straight, across = -across, straight
-    return size * straight, size * across, 0.0
+        return (f"{what} q", -1.0, ("xy",)), (f"{what} u", 1.0, ("x2-y2",))
+    return ((kind, 1.0, ()),)
 
 
 def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
     """Mueller matrix of changes of given sizes (amplitude × factor; arrays) at a field point (deg)."""
-    sums: dict[
-        str, tuple[Any, ...]
-    ] = {}  # along q, u, v: retardance (rad), diattenuation; the share that is lost
+    sums: dict[str, Any] = {}  # retardance (rad), diattenuation; the share that is lost
     for change, size in terms:
-        what, _, axis = change.kind.partition(" ")
-        if what == "turn":  # a circular retarder
-            what, own = "retardance", (0.0, 0.0, -2.0 * jnp.deg2rad(size))
-        else:
-            own = (size,) if what == "depolarisation" else _along(axis, size, x, y, change.units)
-        sums[what] = tuple(map(operator.add, sums.get(what, (0.0,) * len(own)), own))
-    acting = (("diattenuation", mueller.diattenuator), ("retardance", mueller.general_retarder))
-    matrix = mueller.product(make(*map(jnp.asarray, sums[what])) for what, make in acting if what in sums)
+        for name, coefficient, factors in generators_of(change.kind):
+            by = coefficient * product(factors, AtPoint(x, y), change.units)
+            sums[name] = sums.get(name, 0.0) + by * size
+    matrix = mueller.product(
+        make(*(jnp.asarray(sums.get(f"{what} {axis}", jnp.zeros(()))) for axis in "quv"))
+        for what, make in (("diattenuation", mueller.diattenuator), ("retardance", mueller.general_retarder))
+        if any(name.startswith(what) for name in sums)
+    )
     if "depolarisation" in sums:
-        lost = jnp.asarray(*sums["depolarisation"])[..., None, None]
+        lost = jnp.asarray(sums["depolarisation"])[..., None, None]
         kept = 1.0 - lost * jnp.array([[0.0], [1.0], [1.0], [1.0]])
         matrix = kept * (jnp.eye(4) if matrix is None else matrix)
     assert matrix is not None
@@ -99,6 +116,17 @@ class PolariserFilm(Component):
         terms = zip(self.changes, self.amplitudes, strict=True)
         sizes = [(change, size * in_exposures(change, exposures, x, y)) for change, size in terms]
         return jnp.einsum("est,et->es", matrix_of(sizes, x, y), light)
+
+
+@dataclasses.dataclass(frozen=True)
+class Inside:
+    """The factor that is 1 where a moving element is in the beam."""
+
+    prefix: str
+
+    def __call__(self, at: Any) -> Any:
+        """Its value in every exposure."""
+        return np.isfinite(at.angle(self.prefix)) * 1.0
 
 
 class Displaced(Element):
@@ -161,6 +189,20 @@ def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return _beside(instrument, Terms(name="described", moves=moves, **_columns(terms)), change)
 
 
+def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
+    """Generators at a place of the train, also growing with the wavelength; at the polariser: of the light."""
+    polariser, factors, stage, colour = instrument.polariser, change.factors, "light", ()
+    if polariser is None or change.place != polariser.name or change.where == "behind":
+        stage, colour = "inserted", (factors.count("colour"),)
+        factors = tuple(one for one in factors if one != "colour")
+        moves = instrument.element(change.place).moves if change.where == "of" else None
+        factors = factors if moves is None else (*factors, Inside(moves))
+    return [
+        SlotTerm((stage, kind, change.where, change.place, *colour), size, (*factors, *more))
+        for kind, size, more in generators_of(change.kind)
+    ]
+
+
 def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """(0, q, u, 0) per unit of light added, as mirrors of a telescope do to weakly polarised light."""
     own: dict[str, Any] = {"q": jnp.zeros(()), "u": jnp.zeros(())}
@@ -179,13 +221,20 @@ def _fringes(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return instrument
 
 
+def _slots_of_fringes(instrument: Instrument, change: Change) -> list[SlotTerm]:
+    factors = tuple(one for one in change.factors if not str(one).startswith("gap "))
+    return [SlotTerm(("fringes", change.place, change.gap), 1.0, factors)]
+
+
 _OPTICAL = {f"retardance {axis}": "retardance" for axis in AXES} | {
     "depolarisation": "share",
     "turn": "angle",
 }
 _OPTICAL |= {f"diattenuation {axis}": "share" for axis in AXES}
-KINDS |= {name: Kind(amplitude, _optics, _at, grows=_grows) for name, amplitude in _OPTICAL.items()}
-KINDS |= {f"added polarisation {axis}": Kind("share", _added, _at) for axis in "qu"}
+KINDS |= {
+    name: Kind(amplitude, _optics, _at, grows=_grows, slots=_slots) for name, amplitude in _OPTICAL.items()
+}
+KINDS |= {name: Kind("share", _added, _at, slots=itself("light")) for name in ADDED}
 _OF_FIELD = "the same angles at several hour angles, and a star at known pixels in each"
 KINDS |= {
     name: Kind(
@@ -194,8 +243,11 @@ KINDS |= {
         lambda change: change.place,
         _OF_FIELD,
         lambda *_: Grows((FIELD, EXPOSURE)),
+        slots=itself("whole"),
     )
     for name in DISPLACEMENTS
 }
 _OF_FRINGES = "narrow bands a nanometre apart, or the same band at another temperature"
-KINDS["fringes"] = Kind("share", _fringes, test=_OF_FRINGES, grows=lambda *_: Grows((SHAPE,)))
+KINDS["fringes"] = Kind(
+    "share", _fringes, test=_OF_FRINGES, grows=lambda *_: Grows((SHAPE,)), slots=_slots_of_fringes
+)

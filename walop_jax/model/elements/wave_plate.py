@@ -250,9 +250,14 @@ def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Floa
     return MODELS[model](kx, ky, jax.tree.map(together, *stacks), wavelength)
 
 
+def fringe(gap: Real, ray: Ray) -> Real:
+    """Fringes of air of some thickness (µm), 1 at a maximum."""
+    return jnp.cos(4.0 * jnp.pi * gap * ray.kz / ray.wavelength)
+
+
 def _behind_gap(plate: WavePlate, ray: Ray, matrix: Mueller) -> Mueller:
     for gap in plate.air_gaps:
         axis = jnp.deg2rad(_number(plate, "axis", ray) + _number(plate.layers[0], "axis", ray))
-        d = gap.contrast * jnp.cos(4.0 * jnp.pi * gap.gap * ray.kz / ray.wavelength)
+        d = gap.contrast * fringe(gap.gap, ray)
         matrix = matrix @ mueller.diattenuator(d * jnp.cos(2.0 * axis), d * jnp.sin(2.0 * axis))
     return matrix

@@ -1,0 +1,412 @@
+"""Slots: places of the light path at which it may be otherwise, and what a little of it there does to the light.
+
+A slot is a change without factors (`effects.change`), or a part of one; what a change is in slots, its kind says
+(`Kind.slots`). What multiplies a change, over the field or from exposure to exposure, multiplies its slot. Elements,
+fold, band integral and patches are those that light takes, differentiated where nothing is changed.
+
+    inserted    generators (`optics.GENERATORS`) at every place between two elements, by themselves and × (λ/λ₀ − 1)
+    number      axis and thermal change of every wave plate; thickness, axis and cut of each of its layers
+    whole       displacement of what the optics behind a mapping to the pupil see; shift of the bands
+    throughput  of a camera, relative to itself; mixed: light of one camera in another
+    fringes     of air ahead of a wave plate, which take more wavelength nodes than all others
+    light       of sources, ahead of the polariser and of it: Stokes vectors behind it
+
+Method      The rows that the analysers see are linear in the matrix M of every element: δrows = (rows behind it) δM
+            (matrix ahead of it), and δM of all elements in the same numbers come from one derivative.
+Symbols     s slots, g generators, t changes of numbers, b bands, k cameras, r rows, c states, n nodes
+Limits      first order.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from walop_jax.model import fold, light
+from walop_jax.model.compiled import array
+from walop_jax.model.effects.cameras import CrossTalk
+from walop_jax.model.effects.change import BAND, SKY, Change, patched
+from walop_jax.model.effects.numbers import OF_POLARISER, OF_QU, OF_SOURCES
+from walop_jax.model.effects.optics import ADDED, DISPLACEMENTS, GENERATORS, matrix_of, with_air_gap
+from walop_jax.model.elements import Element, PupilMapping, WavePlate
+from walop_jax.model.elements.wave_plate import fringe
+from walop_jax.model.instrument import Instrument, Scalar
+from walop_jax.model.materials import REFERENCE_TEMPERATURE
+from walop_jax.model.parameters import shapes_of
+from walop_jax.model.plan import Plan
+from walop_jax.model.ray import CONDITIONS, Conditions, Ray
+from walop_jax.model.sources import MoonPatches, MoonSky, Sight, Standards
+
+Slot = tuple[Any, ...]
+Moved = Callable[[Float[Array, " t"]], Instrument]
+OF_PLATE, OF_LAYER = ("axis", "thermal"), ("thickness", "axis", "cut")
+
+
+# --------------------------------------------------------------------------------------------- names of the slots
+
+
+def trains(instrument: Instrument) -> dict[str, tuple[Element, ...]]:
+    """The elements behind the polariser and those of the arms of an instrument (`patched`), by beginnings of names."""
+    return {
+        "": instrument.behind_polariser(),
+        **{f"{arm.name}.": tuple(arm.train()) for arm in instrument.arms},
+    }
+
+
+def acts(element: Element) -> bool:
+    """True if an element does anything to polarisation."""
+    return _acts(*shapes_of(element))
+
+
+@functools.lru_cache(maxsize=1024)
+def _acts(structure: Any, shapes: Any) -> bool:
+    one, zero = array(np.ones(1)), array(np.zeros(()))
+
+    def run(*arrays: Array) -> Any:
+        element = jax.tree_util.tree_unflatten(structure, arrays)
+        conditions = Conditions(band_width=0.1 * one, planned=dict.fromkeys(CONDITIONS, one))
+        return element.mueller(Ray.entering(zero, zero, (0.62 * one, conditions)))
+
+    return jax.eval_shape(run, *(jax.ShapeDtypeStruct(s, d) for s, d in shapes)) is not None
+
+
+def _places(instrument: Instrument) -> list[list[int]]:
+    """Number of the place behind so many elements of each train: the same where nothing acts in between."""
+    number, found = -1, []
+    for train, elements in enumerate(trains(instrument).values()):
+        number += train == 0 or len(instrument.arms) > 1
+        found.append([number, *(number := number + acts(element) for element in elements)])
+    return found
+
+
+def _is_plate(element: Element) -> bool:
+    return isinstance(element, WavePlate) and bool(element.layers)
+
+
+def _numbers(instrument: Instrument) -> list[list[Slot]]:
+    """The numbers of every wave plate behind the polariser."""
+    found = []
+    for train, elements in trains(instrument).items():
+        for plate in filter(_is_plate, elements):
+            place, layers = f"{train}{plate.name}", plate.layers  # pyright: ignore[reportAttributeAccessIssue]
+            each = [(kind, place) for kind in OF_PLATE]
+            each += [(kind, f"{place}.{layer.name}") for layer in layers for kind in OF_LAYER]
+            found.append([("number", kind, "of", at) for kind, at in each])
+    return found
+
+
+def _whole(instrument: Instrument) -> list[Slot]:
+    pupils = [element.name for element in trains(instrument)[""] if isinstance(element, PupilMapping)]
+    shift = ("whole", "shift", "of", BAND)
+    return [*(("whole", kind, "ahead of", name) for name in pupils for kind in DISPLACEMENTS), shift]
+
+
+def fringe_places(instrument: Instrument) -> tuple[str, ...]:
+    """Places of the plates of an instrument (`patched`) ahead of which there may be air."""
+    return tuple(numbers[0][-1] for numbers in _numbers(instrument))
+
+
+def vector_slots(instrument: Instrument) -> dict[Slot, int]:
+    """Positions of the slots of the analysis vectors of an instrument (`patched`) in `VectorSlopes.slopes`."""
+    polariser, places = instrument.polariser, _places(instrument)
+    names = {} if polariser is None else {("behind", polariser.name): 0}
+    for (train, elements), numbers in zip(trains(instrument).items(), places, strict=True):
+        for element, (ahead, behind) in zip(elements, itertools.pairwise(numbers), strict=True):
+            where = {"ahead of": ahead, "behind": behind, "of": behind}
+            names |= {(one, f"{train}{element.name}"): number for one, number in where.items()}
+    for arm, numbers in zip(instrument.arms, places[1:], strict=True):
+        names["ahead of", f"{arm.name}.{arm.analyser.name}"] = numbers[-1]
+    found: dict[Slot, int] = {}
+    kinds = list(itertools.product((0, 1), GENERATORS))
+    count = 1 + places[-1][-1]
+    for i, (colour, kind) in enumerate(kinds):
+        found |= {("inserted", kind, *name, colour): i * count + number for name, number in names.items()}
+    first, numbers = len(kinds) * count, _numbers(instrument)
+    for plate in numbers:
+        found |= {slot: first + t for t, slot in enumerate(plate)}
+        first += max(map(len, numbers))
+    cameras = range(len(instrument.cameras))
+    mixed = [("mixed", *pair) for pair in itertools.product(cameras, cameras)]
+    rest = [*_whole(instrument), *(("throughput", camera) for camera in cameras), *mixed]
+    return found | {slot: first + i for i, slot in enumerate(rest)}
+
+
+# ------------------------------------------------------------------------------------------------ analysis vectors
+
+
+class VectorSlopes(NamedTuple):
+    """Analysis vectors of light behind the polariser at a field point, and their slopes in `vector_slots`."""
+
+    vectors: Float[Array, "b k 4"]
+    slopes: Float[Array, "s b k 4"]
+
+
+class _Banded(NamedTuple):
+    """Band sums of the rows that the analysers see, and slopes: of generators at places, of plates, all together."""
+
+    rows: Float[Array, "b r 4"]
+    inserted: Float[Array, "m g h b r 4"]
+    plates: Float[Array, "w g t b r 4"]
+    whole: Float[Array, "u b r 4"]
+
+
+def vector_slopes(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> VectorSlopes:
+    """Slopes of the analysis vectors at a field point (deg)."""
+    instrument = instrument.patched()
+    numbers, whole, cameras = _numbers(instrument), _whole(instrument), len(instrument.cameras)
+    most = max(map(len, numbers), default=0)
+
+    def moved(sizes: Float[Array, " t"]) -> Instrument:
+        each = [*(pair for plate in numbers for pair in enumerate(plate)), *enumerate(whole, most)]
+        return patched(instrument, [(Change(*slot[1:]), sizes[t]) for t, slot in each])
+
+    def mean(shift: Scalar) -> Float[Array, " b"]:
+        return _mean(patched(instrument, [(Change(*whole[-1][1:]), shift)]), plan)
+
+    found = _banded(plan, (x, y), moved, (most, len(whole)), jnp.zeros(1))
+    rows = jnp.concatenate([part.reshape(-1, *found.rows.shape) for part in found[1:]])
+    shifted = jax.jacfwd(mean)(jnp.zeros(()))
+    means = jnp.zeros((len(rows), len(shifted))).at[-1].set(shifted)
+    neutral = found.rows, _mean(instrument, plan), instrument.throughput.at(x, y), jnp.zeros(cameras**2)
+    value, push = jax.linearize(functools.partial(_vectors, instrument, (x, y)), *neutral)
+    none = [jnp.zeros_like(one) for one in neutral]
+    slopes = (
+        jax.vmap(lambda one, mean: push(one, mean, *none[2:]))(rows, means),
+        jax.vmap(lambda one: push(*none[:2], one, none[3]))(jnp.diag(neutral[2])),
+        jax.vmap(lambda one: push(*none[:3], one))(jnp.eye(cameras**2)),
+    )
+    return VectorSlopes(value, jnp.concatenate(slopes))
+
+
+def fringe_slopes(
+    instrument: Instrument, plan: Plan, gaps: Float[Array, " g"], x: Scalar, y: Scalar
+) -> Float[Array, "w g b k 4"]:
+    """Slopes in the contrast of fringes of air ahead of every plate of `fringe_places`, by its thickness (µm)."""
+    instrument = instrument.patched()
+
+    def moved(sizes: Float[Array, " t"]) -> Instrument:
+        """Air without thickness: no fringes, and all else of it."""
+        own = instrument
+        for place in fringe_places(instrument):
+            own = with_air_gap(own, place, sizes[0], jnp.zeros(()))
+        return own
+
+    def vectors(rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
+        none = jnp.zeros(len(instrument.cameras) ** 2)
+        return _vectors(
+            instrument, (x, y), rows, _mean(instrument, plan), instrument.throughput.at(x, y), none
+        )
+
+    found = _banded(plan, (x, y), moved, (1, 0), gaps)
+    return jax.vmap(jax.vmap(jax.linearize(vectors, found.rows)[1]))(found.plates[:, :, 0])
+
+
+def _mean(instrument: Instrument, plan: Plan) -> Float[Array, " b"]:
+    return light.band_weights(instrument, plan) @ light.node_wavelengths(instrument, plan)
+
+
+def _vectors(
+    instrument: Instrument,
+    at: tuple[Scalar, Scalar],
+    rows: Array,
+    mean: Array,
+    throughput: Array,
+    shares: Array,
+) -> Float[Array, "b k 4"]:
+    """Analysis vectors with shares of every camera in every other."""
+    beams = light.beams(instrument, light.in_bands(instrument, rows, mean))
+    pairs = tuple(np.ndindex(len(throughput), len(throughput)))
+    vectors = light.behind_throughput(instrument, beams, throughput, *at)
+    return CrossTalk(tuple(shares), pairs).vectors(vectors, *at)
+
+
+def _banded(
+    plan: Plan, at: tuple[Scalar, Scalar], moved: Moved, sizes: tuple[int, int], gaps: Float[Array, " g"]
+) -> _Banded:
+    """Band sums at a field point, and slopes in the sizes of `moved`: of single plates, then of all together.
+
+    Those of plates are multiplied by fringes of air of some thicknesses (µm).
+    """
+    neutral = moved(jnp.zeros(sum(sizes)))
+    summed = functools.partial(_summed, plan, at, moved, sizes, gaps)
+    return light.with_dispersion(neutral, summed, jnp.ones(()))
+
+
+def _summed(
+    plan: Plan,
+    at: tuple[Scalar, Scalar],
+    moved: Moved,
+    sizes: tuple[int, int],
+    gaps: Float[Array, " g"],
+    stretch: Scalar,
+) -> _Banded:
+    """The same at wavelengths times a factor, without what differs between beams."""
+    states, conditions = [state for state, _, _ in plan.settings], plan.conditions
+    if "temperature" not in conditions.planned:  # the thermal change of one kelvin
+        warm = jnp.full_like(plan.wavelength, REFERENCE_TEMPERATURE + 1.0)
+        conditions = Conditions(conditions.band_width, {**conditions.planned, "temperature": warm})
+
+    def stations(own: Instrument) -> list[list[fold.Station]]:
+        common, *arms = trains(own).values()
+        spectrum = stretch * light.node_wavelengths(own, plan), conditions
+        first, ray = fold.stations(common, Ray.entering(*at, spectrum))
+        return [first, *(fold.stations(arm, ray)[0] for arm in arms)]
+
+    def solved(sizes: Float[Array, " t"]) -> tuple[fold.Solved, Float[Array, "b n"]]:
+        own = moved(sizes)
+        every = list(itertools.chain(*stations(own)))
+        return fold.solved(every, plan.moving, states), light.band_weights(own, plan)
+
+    single, together = sizes
+    nothing = jnp.zeros(single + together)
+    (matrices, weights), push = jax.linearize(solved, nothing)
+    slopes, weight_slopes = jax.vmap(push)(jnp.eye(len(nothing)))
+    common, *arms = stations(neutral := moved(nothing))
+    analysers, every = [arm.analyser for arm in neutral.arms], list(itertools.chain(common, *arms))
+    folded = fold.around(common, arms, analysers, matrices, plan.moving, states, len(plan.wavelength))
+    sides = [(behind, ahead) for one in folded for (_, ahead), (behind, _) in itertools.pairwise(one)]
+    rows, sums = folded[0][0][0], functools.partial(light.integrated, plan)
+
+    def pushed(number: int, some: slice) -> Float[Array, "t c n r 4"]:
+        """Rows for some changes of the matrix of a station."""
+        own = {key: each[some] for key, each in slopes.items() if key[0] == number and each is not None}
+        if not own:
+            return jnp.zeros((len(nothing[some]), *rows.shape))
+        behind, ahead = sides[number]
+
+        def change(own: fold.Solved) -> Float[Array, "c n r 4"]:
+            matrix = fold.stacked(own, number, every[number][0], plan.moving, states, jnp.zeros((4, 4)))
+            assert matrix is not None
+            return behind @ matrix @ ahead
+
+        return jax.vmap(change)(own)
+
+    wavelength = stretch * light.node_wavelengths(neutral, plan)
+    moments = weights, weights * (wavelength / neutral.units.wavelength - 1.0)
+    inserted = _inserted(plan, moments, _places(neutral), folded)
+    plates = [jnp.zeros((0, len(gaps), single, *sums(weights, rows).shape))]
+    for number, (element, ray) in enumerate(every):
+        if _is_plate(element):
+            change = pushed(number, slice(single))
+            waves = jax.vmap(fringe, (0, None))(gaps, ray)
+            plates.append(jax.vmap(lambda wave, change=change: sums(wave * weights, change))(waves)[None])
+    whole = sum(
+        (pushed(number, slice(single, None)) for number in range(len(every))),
+        jnp.zeros((together, *rows.shape)),
+    )
+    shifted = jax.vmap(lambda own: sums(own, rows))(weight_slopes[single:])
+    return _Banded(sums(weights, rows), inserted, jnp.concatenate(plates), sums(weights, whole) + shifted)
+
+
+def _inserted(
+    plan: Plan,
+    moments: tuple[Float[Array, "b n"], ...],
+    places: list[list[int]],
+    folded: list[list[tuple[Float[Array, "c n r 4"], Float[Array, "c n 4 4"]]]],
+) -> Float[Array, "m g h b r 4"]:
+    """Slopes in generators at every place, for some weights of the nodes."""
+    generators, found = _generators(), []
+    for place, (behind, ahead) in zip(itertools.chain(*places), itertools.chain(*folded), strict=True):
+        if place == len(found):
+            pairs = jnp.einsum("cnri,cnjk->ijcnrk", behind, ahead)
+            each = jnp.stack([light.integrated(plan, weights, pairs) for weights in moments])
+            found.append(jnp.einsum("gij,mijbrk->mgbrk", generators, each))
+    return jnp.stack(found, 2)
+
+
+def _generators() -> Float[Array, "g 4 4"]:
+    """Slopes of the Mueller matrix in each of `GENERATORS`, at neutral."""
+    changes, zero = [Change(kind, "of", "") for kind in GENERATORS], jnp.zeros(())
+
+    def matrix(sizes: Float[Array, " g"]) -> Float[Array, "4 4"]:
+        return matrix_of(list(zip(changes, sizes, strict=True)), zero, zero)
+
+    return jnp.moveaxis(jax.jacfwd(matrix)(jnp.zeros(len(changes))), -1, 0)
+
+
+# ----------------------------------------------------------------------------------------------------- light
+
+
+class LightSlopes(NamedTuple):
+    """Stokes vectors behind the place of the polariser, per exposure, and their slopes in `light_slots`.
+
+    Counts are the product of the analysis vectors with `taken`, what a camera takes of the light with everything that
+    the cameras do in single exposures; `factor` is that for a change of the light.
+    """
+
+    stokes: Float[Array, "e 4"]
+    slopes: Float[Array, "l e 4"]
+    taken: Float[Array, "e k 4"]
+    factor: Float[Array, "e k"]
+
+
+def light_slots(instrument: Instrument) -> dict[Slot, int]:
+    """Positions of the slots of the light of an instrument (`patched`); of a single star it is that of all."""
+    polariser = instrument.polariser
+    found: list[Slot] = [("rotator", "of", SKY)]
+    if any(isinstance(source, MoonSky) for source in instrument.sources):
+        found += [(kind, "of", SKY) for kind in OF_SOURCES]
+    if instrument.standard.names:
+        found += [(kind, "of", Standards.name) for kind in OF_QU]
+    if polariser is not None:
+        found += [(kind, "of", polariser.name) for kind in (*OF_POLARISER, *GENERATORS)]
+        found += [(kind, "ahead of", polariser.name) for kind in (*GENERATORS, *ADDED)]
+    return {("light", *slot): i for i, slot in enumerate(found)}
+
+
+def light_slopes(instrument: Instrument, sight: Sight) -> LightSlopes:
+    """Slopes of the light at a field point."""
+    instrument = instrument.patched()
+    exposures, x, y, slots = sight.exposures, sight.x, sight.y, light_slots(instrument)
+    count = exposures.kind.shape[0]
+
+    def stokes(sizes: Float[Array, " l"]) -> Float[Array, "e 4"]:
+        return light.stokes(_lit(instrument, dict(zip(slots, sizes, strict=True)), count), sight)
+
+    value, push = jax.linearize(stokes, jnp.zeros(len(slots)))
+    factor, share = jnp.ones((count, len(instrument.cameras))), jnp.zeros((count, len(instrument.cameras)))
+    for part in instrument.cameras.exposures:
+        own = part.factors(exposures, x, y)
+        factor, share = factor * own, share * own + part.share(exposures, x, y)
+    taken = (factor[..., None] * value[:, None]).at[..., 0].add(share)
+    return LightSlopes(value, jax.vmap(push)(jnp.eye(len(slots))), taken, factor)
+
+
+def _lit(instrument: Instrument, sizes: dict[Slot, Scalar], count: int) -> Instrument:
+    """The instrument with changes of the light; q and u of the sky are those of all exposures, of stars of all."""
+    sources: dict[str, list[Scalar]] = {SKY: [], Standards.name: []}
+    terms = []
+    for (_, *slot), size in sizes.items():
+        if slot[0] in OF_QU:
+            sources[slot[-1]].append(size)
+        else:
+            terms.append((Change(*slot), size))
+    instrument = patched(instrument, terms)
+    if sources[SKY]:
+        every = MoonPatches(*(jnp.full(count, one) for one in sources[SKY]), positions=tuple(range(count)))
+        instrument = instrument.changed(
+            SKY, patches=lambda there: every if there is None else there.joined(every)
+        )
+    if sources[Standards.name]:
+        q, u = sources[Standards.name]
+        instrument = instrument.changed(Standards.name, q=lambda there: there + q, u=lambda there: there + u)
+    return instrument
+
+
+def generator_ahead(instrument: Instrument, slot: Slot) -> Float[np.ndarray, "4 4"]:
+    """Slope of the Mueller matrix of a slot of the light ahead of the polariser of an instrument (`patched`)."""
+    zero = jnp.zeros(())
+
+    def matrix(size: Scalar) -> Array | None:
+        return (
+            patched(instrument, [(Change(*slot[1:]), size)]).telescope()[-1].mueller(Ray.entering(zero, zero))
+        )
+
+    return np.asarray(jax.jacfwd(matrix)(zero))
