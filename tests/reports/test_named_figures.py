@@ -235,5 +235,5 @@ def test_figures_have_the_style_of_the_package(source, dark):
         assert pixels(figure) == expected
         assert matplotlib.rcParams["axes.facecolor"] == "black"
         theirs = matplotlib.figure.Figure()
-        plot(source, "accuracy", ax=theirs.subplots())
+        plot(source.run, "accuracy", ax=theirs.subplots())
         assert theirs.subfigs[0].axes[0].get_facecolor()[:3] == (0.0, 0.0, 0.0)
