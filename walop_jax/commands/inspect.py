@@ -145,8 +145,7 @@ def inspect(
     found = InspectedSets(tuple(sets), joint, tuple(faults))
     return Outcome(
         found,
-        found.document,
-        lambda: "\n".join(one.text() for one in found.displays()),
+        text="\n".join(one.text() for one in found.displays()),
         failure="; ".join(faults),
         next=("walop-jax refit CALSET --instrument FILE.toml -o RUN",) if strange else (),
     )

@@ -107,12 +107,12 @@ def instrument(
         width = max(map(len, names))
         return Outcome(
             names,
-            lambda: names,
-            lambda: "\n".join(f"{name:<{width}}  {about}" for name, about in names.items()),
+            names,
+            "\n".join(f"{name:<{width}}  {about}" for name, about in names.items()),
         )
     if text:
-        own = read_description(source).text
-        return Outcome(own, lambda: {"name": str(source), "text": own}, lambda: own)
+        written = read_description(source).text
+        return Outcome(written, {"name": str(source), "text": written}, written)
     job.use_jax()
     with errors_naming(source):
         found = checked(source)

@@ -46,7 +46,6 @@ EXIT_CODES = (
 NEXT = {
     "inspect": ("walop-jax refit {data} -o RUN",),
     "simulate": ("walop-jax refit {output} -o RUN",),
-    "compress": ("walop-jax refit {output} -o RUN",),
     "clip": ("walop-jax refit {output} -o RUN",),
     "import_zemax": ("walop-jax refit {output} -o RUN",),
     "model": ("walop-jax refit {calsets} --instrument {instrument} --model {output} -o RUN",),
@@ -244,7 +243,7 @@ def _show(found: Outcome[Any], quiet: bool, json: bool) -> None:
         from walop_jax.io.text import json_text
 
         typer.echo(json_text(found.content), nl=False)
-    elif not quiet and (text := found.shown()):
+    elif not quiet and (text := found.printed()):
         _print(text, found.markdown)
         if found.next and not found.failure:
             # On stderr: what is on stdout may be redirected into a file.

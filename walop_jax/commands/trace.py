@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import numbers
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
 from walop_jax.commands.inputs import (
@@ -38,14 +37,7 @@ class Traced(tuple["LightStage", ...]):
         return "\n".join(table(self))
 
 
-def _numbers_first(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Numbers by their position are x, y, q and u; other keywords are elements, by the prefix of their columns."""
-    if args and isinstance(args[0], numbers.Real):
-        args, kwargs = (), dict(zip(("x", "y", "q", "u"), args, strict=False)) | kwargs
-    return args, kwargs
-
-
-@command(given=_numbers_first)
+@command()
 def trace(
     job: Job,
     calibration: Annotated[Calibration | FitResult | Run | Instrument | PathLike | None, PRODUCT] = None,
@@ -60,15 +52,14 @@ def trace(
     at: Angles = None,
     teff: Annotated[float | None, TEFF] = None,
     filter: Annotated[str, FILTER] = "SDSS-r",
-    **positions: float,
 ) -> Outcome[Traced]:
     """Follow the light of one source through the instrument.
 
     Every line is the light at one place: Stokes vectors averaged over the band, then the cameras. The
     last line is what a fit works with.
 
-    In Python: the stages. Angles of moving elements are keywords, chwp=45, or `at`. Raises ValueError, with the nearest
-    names, for an unknown instrument, filter or moving element.
+    In Python: the stages; `at` is a dict, {"CHWP": 45}. Raises ValueError, with the nearest names, for an unknown
+    instrument, filter or moving element.
 
     >>> print(walop.trace(result, x=0.1, y=0.0, q=0.05))  # doctest: +SKIP
     """
@@ -80,9 +71,8 @@ def trace(
 
     if isinstance(calibration, Instrument):
         calibration, instrument = None, calibration
-    there = {name.upper(): value for name, value in positions.items()} | angles_of(at)
     try:
-        setting = Settings.default(1, filter).at(**there)
+        setting = Settings.default(1, filter).at(**angles_of(at))
         setting.teff[0] = math.nan if teff is None else teff
         polariser = math.nan if angle is None else angle
         line = Sightline(x=x, y=y, q=q, u=u, clp_angle=polariser, setting=setting)
@@ -99,7 +89,7 @@ def trace(
         warnings = (*held.warnings, *left_out_sentences(lost, held.path))
     return Outcome(
         Traced(stages),
-        lambda: {
+        {
             "stages": [
                 {
                     "stage": stage.name,
@@ -112,7 +102,7 @@ def trace(
             ],
             NOT_CARRIED_OVER: list(lost),
         },
-        lambda: "\n".join(table(stages)),
+        "\n".join(table(stages)),
         warnings=warnings,
     )
 

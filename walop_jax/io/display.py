@@ -8,7 +8,7 @@ import html
 import importlib
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 from walop_jax.io.code import blank
@@ -49,6 +49,21 @@ class Display:
                 )
                 yield ("  " + "  ".join(cells)).rstrip()
         yield from (f"  {note}" for note in self.notes)
+
+    def document(self) -> dict[str, Any]:
+        """The same as plain data."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Display:
+        """What such a document was made of. Raises KeyError or TypeError for one that is none."""
+        return cls(
+            str(document["title"]),
+            tuple((str(name), str(words)) for name, words in document["facts"]),
+            tuple(map(str, document["head"])),
+            tuple(tuple(map(str, row)) for row in document["rows"]),
+            tuple(map(str, document["notes"])),
+        )
 
     def shortened(self, most: int) -> Display:
         """The same in at most `most` lines: rows of the table go, and it is said how many."""

@@ -257,6 +257,18 @@ def float64() -> contextlib.AbstractContextManager[Any]:
     return here.enable_x64(True)
 
 
+def in_float64(function: Callable[..., Any], name: str) -> Callable[..., Any]:
+    """The function as the public one of a name, which computes in float64."""
+
+    @functools.wraps(function)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        with float64():
+            return function(*args, **kwargs)
+
+    run.__module__, run.__qualname__ = "walop_jax", name  # where it is found again, by pickle as well
+    return run
+
+
 def need_float64(what: str) -> None:
     """Raise RuntimeError, with the remedy, where float64 is switched off for what the session itself compiles."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
