@@ -233,7 +233,7 @@ def _annotation(function: Callable[..., Any], parameter: inspect.Parameter) -> t
     kind, *notes = typing.get_args(noted) if typing.get_origin(noted) is Annotated else (noted,)
     if isinstance(kind, typing.ForwardRef):
         kind = eval(kind.__forward_arg__, {}, names)
-    return kind, next((note for note in notes if isinstance(note, Option)), None)
+    return kind, next((note for note in reversed(notes) if isinstance(note, Option)), None)
 
 
 @dataclasses.dataclass

@@ -160,9 +160,11 @@ def paths_of(data: Sets) -> tuple[PathLike, ...]:
         if not paths:
             raise ValueError("a run is made from files: write the set first, walop_jax.write_calibration_set")
         return paths
-    given: Sequence[Any] = data if isinstance(data, list | tuple) else (data,)
+    given: Any = data if isinstance(data, list | tuple) else (data,)
     advice = "a set, the path of one (FITS), or several paths in a list"
-    return tuple(one for one in given if path_of(one, "a calibration set", advice))
+    for one in given:
+        path_of(one, "a calibration set", advice)
+    return tuple(given)
 
 
 def set_of(data: Sets, instrument: Instrument | None = None) -> CalibrationSet:
@@ -257,7 +259,7 @@ def save(
     with output_folder(folder, names, overwrite=overwrite) as out, out.filled() as there:
         write_calibration(there / PRODUCT, product)
         if isinstance(held, FitResult):
-            content = summary(held, seconds=held.seconds)
+            content = summary(held, seconds=held.seconds) | {"shown": held.display().document()}
             (there / SUMMARY).write_text(json_text(content), encoding="utf-8")
 
 
