@@ -38,13 +38,13 @@ class Display:
         yield self.title
         width = max((len(name) for name, _ in self.facts), default=0)
         for name, value in self.facts:
-            yield f"  {name:<{width}}  {_signed(value)}"
+            yield f"  {name:<{width}}  {signed(value)}"
         if self.rows:
             table = [tuple(name.removeprefix(">") for name in self.head), *self.rows]
             widths = [max(len(row[k]) for row in table) for k in range(len(self.head))]
             for row in table:
                 cells = (
-                    f"{_signed(cell):>{w}}" if name.startswith(">") else f"{_signed(cell):<{w}}"
+                    f"{signed(cell):>{w}}" if name.startswith(">") else f"{signed(cell):<{w}}"
                     for cell, w, name in zip(row, widths, self.head, strict=True)
                 )
                 yield ("  " + "  ".join(cells)).rstrip()
@@ -82,7 +82,7 @@ class Display:
         yield f"<div><p><strong>{html.escape(self.title)}</strong></p>"
         if self.facts:
             rows = (
-                f"<tr><th {_LEFT}>{html.escape(name)}</th><td {_LEFT}>{html.escape(_signed(value))}</td></tr>"
+                f"<tr><th {_LEFT}>{html.escape(name)}</th><td {_LEFT}>{html.escape(signed(value))}</td></tr>"
                 for name, value in self.facts
             )
             yield f"<table>{''.join(rows)}</table>"
@@ -95,7 +95,7 @@ class Display:
             body = "".join(
                 "<tr>"
                 + "".join(
-                    f"<td {side}>{html.escape(_signed(cell))}</td>"
+                    f"<td {side}>{html.escape(signed(cell))}</td>"
                     for cell, side in zip(row, sides, strict=True)
                 )
                 + "</tr>"
@@ -106,7 +106,7 @@ class Display:
         yield "</div>"
 
 
-def _signed(text: str) -> str:
+def signed(text: str) -> str:
     """A fact or a cell with true minus signs; hyphens of names, dates and options stay."""
     return re.sub(r"(?<![^\s(])-(?=\.?\d)", "−", text)
 
