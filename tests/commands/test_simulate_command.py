@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from walop_jax.data import read_calibration_set
+from walop_jax.data.calset import read_calibration_set
 
 PLAN = "grid = 3\nstandard_grid = 1\npolariser_angles = 4\nmoon_patches = 2\nstandards = 3\n"
 EFFECTS = ("--effect", "clp_wobble=amplitude:0.06,phase:1.1", "--effect", "chwp_in_beam")

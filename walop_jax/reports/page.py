@@ -16,14 +16,13 @@ from typing import Any, NamedTuple
 import jinja2
 from matplotlib.figure import Figure
 
-from walop_jax.calibration import SUMMARY, read_calibration
+from walop_jax.calibration.product import read_calibration
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.display import Display, signed
 from walop_jax.io.errors import DataError, fail
+from walop_jax.io.names import COMPARISON, EPOCH, LIMITS, PLANNED, SUMMARY, SURVEY, TRACKS, WATCHED
 from walop_jax.io.text import probability, read_json, rounded, value_and_error, with_error, with_minus_sign
-from walop_jax.nights.stacking import TRACKS
-from walop_jax.posterior.files import COMPARISON, EPOCH, LIMITS, PLANNED, SURVEY, WATCHED
 from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import draw
 from walop_jax.reports.posterior_figures import unit_in_words

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration import Calibration
-from walop_jax.diagnosis.figure_data import UNNAMED
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.text import rounded, some, with_minus_sign
 from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects.free_form import FreeForm
 from walop_jax.reports.posterior_figures import LABELS
 from walop_jax.sky.nights import night_of
 
@@ -23,7 +23,7 @@ _PROPER = ("Wollaston", "Moon", "Stokes")
 
 def effect_in_words(name: str, catalogue: Iterable[type[Effect]] = EFFECTS) -> str:
     """A few words on an effect that may stand inside a sentence; empty for a name that is not in the catalogue."""
-    if name == UNNAMED:
+    if name == FreeForm.name:
         return "unidentified patterns"
     known = next((entry for entry in catalogue if entry.name == name), None)
     if known is None:
@@ -112,7 +112,6 @@ def _range(values: Float[np.ndarray, " e"], unit: str) -> str:
     return with_minus_sign(f"{low} {unit}" if low == high else f"{low} to {high} {unit}")
 
 
-PLATES = {"half1.plate": "HWP1", "half2.plate": "HWP2"}
 PLACES = {
     "half1": "half1 for the half of the pupil with HWP1",
     "half2": "half2 for that with HWP2",

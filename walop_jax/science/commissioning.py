@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 
 from walop_jax.calibration.could_hide import off_by, unmeasured
+from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.inspection import inspect
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.verdict import Verdict
 from walop_jax.io.text import two_digits
 from walop_jax.science.field_accuracy import SHARE, FieldAccuracy
-from walop_jax.science.star_errors import GOAL
 
 MOST = GOAL / 2  # error of p that the calibration may make
 
