@@ -37,7 +37,13 @@ DOCUMENTS: dict[str, dict[str, Any]] = {
     "comparison": {"trusted": True},
     "epoch": {"fits": True, "new_trusted": True},
     "plan": {},
-    "survey": {"trusted": True, "by_night": [{"night": 1, "mjd": 1.9, "chi2": 9.0, "dof": 9, "excess": 0.0}]},
+    "survey": {
+        "trusted": True,
+        "laws": {},
+        "breaks": [],
+        "events": [],
+        "by_night": [{"night": 1, "mjd": 1.9, "chi2": 9.0, "dof": 9, "excess": 0.0}],
+    },
     "watch": {"holds": True},
 }
 

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from walop_jax.commands import conformance as program
-from walop_jax.commands.conformance import RESULTS, SHIPPED, conformance, rows, values
+from walop_jax.commands.conformance import RESULTS, SHIPPED, conformance
 from walop_jax.io.errors import DataError
 from walop_jax.model.mueller import retarder
 from walop_jax.model.sources import turned
+from walop_jax.science import conformance as science
+from walop_jax.science.conformance import rows, values
 from walop_jax.science.estimate import estimate
 from walop_jax.science.polarisation import polarisation
 
@@ -66,7 +67,7 @@ def cases() -> list[Case]:
 
 
 def judge(answers):
-    return program.judge(answers).deviations
+    return science.judge(answers).deviations
 
 
 def right() -> dict[tuple[str, str], float | None]:

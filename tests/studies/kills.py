@@ -45,7 +45,6 @@ sampling = importlib.import_module("walop_jax.commands.sample")
 diagnosing = importlib.import_module("walop_jax.commands.diagnose")
 from walop_jax.commands.compress import compress  # noqa: E402
 
-from walop_jax.commands.command import switch_on_jax  # noqa: E402
 from walop_jax.commands.diagnose import diagnose  # noqa: E402
 from walop_jax.commands.refit import refit  # noqa: E402
 from walop_jax.commands.sample import sample  # noqa: E402
@@ -53,6 +52,7 @@ from walop_jax.data.frames import Grid  # noqa: E402
 from walop_jax.data.write import write_calibration_set  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
 from walop_jax.likelihood import limits  # noqa: E402
+from walop_jax.model.compiled import switch_on  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
 
@@ -333,7 +333,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, count in {"states": 200, "full": 60, "kills": 0, "races": 0}.items():
         parser.add_argument(f"--{name}", type=int, default=count)
     options = parser.parse_args(arguments)
-    switch_on_jax()  # as the commands do: programs that were kept differ from others in the last digits
+    switch_on()  # as the commands do: programs that were kept differ from others in the last digits
     warnings.simplefilter("ignore")
     sys.addaudithook(_hook)
     bad = 0

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from walop_jax.io.display import Display
     from walop_jax.io.folder import OutputFolder
 
-CACHE_VARIABLE = "WALOP_JAX_CACHE"
 LOG = logging.getLogger("walop_jax")
 """Of calls in Python: progress (INFO), and the warnings of a result; silent unless the caller sets it up."""
 LOG.addHandler(logging.NullHandler())
@@ -117,7 +116,9 @@ class Job:
     def use_jax(self) -> None:
         """Switch JAX on, for commands that most often do without it."""
         if self.typed:
-            switch_on_jax()
+            from walop_jax.model.compiled import switch_on
+
+            switch_on()
 
 
 def text_file(text: str) -> Callable[[Path], object]:
@@ -334,7 +335,10 @@ class Command(Generic[T]):
 
     def run(self, job: Job, arguments: dict[str, Any]) -> Outcome[T]:
         """Do the work, with results written as they are asked for."""
-        load_elements(arguments.pop("elements", None))
+        if (elements := arguments.pop("elements", None)) is not None:
+            from walop_jax.model.elements import load_elements
+
+            load_elements(elements)
         output = arguments.get("output")
         if self.writes == "file" and output is not None:
             from walop_jax.io.atomic import check_output
@@ -344,27 +348,6 @@ class Command(Generic[T]):
         with job.reserved(output if names else None, names) as reserved:
             outcome = self.body(reserved, **arguments)
             return outcome if reserved.folder is None else outcome.save(reserved.folder)
-
-
-def load_elements(given: str | os.PathLike[str] | Sequence[type] | None) -> None:
-    """Run the file of kinds of elements of one's own: what is defined is known (`model.elements.defined_elements`).
-
-    Raises `DataError` for a file that defines none, TypeError for a class that is none.
-    """
-    if given is None:
-        return
-    from walop_jax.io.code import classes_of
-    from walop_jax.io.errors import fail
-    from walop_jax.model.elements import Element
-
-    if isinstance(given, str | os.PathLike):
-        advice = "give a Python file with subclasses of Element (walop-jax docs adding-an-instrument)"
-        if not any(vars(kind).get("kind") for kind in classes_of(given, Element, advice).values()):
-            raise fail("defines no kind of element", file=given, advice=advice)
-        return
-    for kind in given:
-        if not (isinstance(kind, type) and issubclass(kind, Element)):
-            raise TypeError(f"elements: {kind!r} is no class of elements, a subclass of Element")
 
 
 def command(**options: Any) -> Callable[[Callable[..., Outcome[T]]], Callable[..., T]]:
@@ -378,40 +361,3 @@ def command(**options: Any) -> Callable[[Callable[..., Outcome[T]]], Callable[..
 def command_of(function: Callable[..., T]) -> Command[T]:
     """The command that a Python function belongs to."""
     return vars(function)["command"]
-
-
-# --------------------------------------------------------------------------------------------- the compiled programs
-
-
-def cache_folder() -> Path | None:
-    """Folder of compiled code that is kept between runs; None when that is switched off or impossible.
-
-    WALOP_JAX_CACHE names the folder ("off": none), otherwise it is walop-jax/xla in the user's cache folder.
-    """
-    chosen = os.environ.get(CACHE_VARIABLE, "")
-    if chosen.lower() in ("off", "0", "none"):
-        return None
-    try:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = Path(chosen) if chosen else Path(base) / "walop-jax" / "xla"
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # no home
-        return None
-    return folder if os.access(folder, os.W_OK | os.X_OK) else None
-
-
-def switch_on_jax() -> None:
-    """Import JAX with float64 and with the cache of compiled code, which makes later runs start fast."""
-    import jax
-
-    from walop_jax.model import compiled
-
-    jax.config.update("jax_enable_x64", True)
-    folder = cache_folder()
-    if folder is not None:
-        with contextlib.suppress(OSError):
-            (folder / compiled.FOLDER).mkdir(exist_ok=True)
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-        jax.config.update("jax_raise_persistent_cache_errors", False)

@@ -13,7 +13,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, load_elements
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError
 from walop_jax.io.errors import DataError, errors_naming, fail
 from walop_jax.io.text import in_ascii, read_text
 
@@ -107,8 +107,10 @@ def read(
     from walop_jax.data.calset import read_calibration_set
     from walop_jax.io.fits_reading import primary_keywords
     from walop_jax.io.names import DOCUMENTS, FAILED, PRODUCT
+    from walop_jax.model.elements import load_elements
 
-    load_elements(elements)
+    if elements is not None:
+        load_elements(elements)
     if not paths:
         raise fail("no file was given", advice="name a calibration set, a calibration product or a run")
     first = path_of(paths[0], "a file", "the path of a set, a product or a run")

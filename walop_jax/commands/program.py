@@ -27,7 +27,6 @@ from walop_jax.commands.command import (
     Outcome,
     UsageError,
     command_of,
-    switch_on_jax,
 )
 from walop_jax.io.progress import interrupts_answered
 
@@ -218,7 +217,9 @@ def _run(command: Command[Any], given: dict[str, Any]) -> None:
     quiet, json = given.pop("quiet"), given.pop("json")
     common = {name: given.pop(name) for name in COMMON if name in given}
     if command.jax:
-        switch_on_jax()
+        from walop_jax.model.compiled import switch_on
+
+        switch_on()
     with progress(quiet or json, command.stages) as tell:
         found = command.run(Job(progress=tell, typed=True, **common), given)
     _show(dataclasses.replace(found, next=found.next or _next_steps(command, given)), quiet, json)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,17 +23,10 @@ from walop_jax.commands.inputs import (
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Instrument, Run
-    from walop_jax.model.trace import LightStage
+    from walop_jax.model.trace import Traced
 
 PRODUCT = Argument("An instrument as fitted; without it, as designed.", "[RUN/calibration.fits]", Path)
 ANGLE = Option("Polariser in, with its axis here (deg).", kind=float)
-
-
-class Traced(tuple["LightStage", ...]):
-    """The stages of a sightline; prints as the table of the command."""
-
-    def __repr__(self) -> str:
-        return "\n".join(table(self))
 
 
 @command()
@@ -66,7 +58,7 @@ def trace(
     from walop_jax import Instrument, Settings
     from walop_jax.data.settings import builtin_filter
     from walop_jax.model.instrument import nominal_instrument
-    from walop_jax.model.trace import Sightline
+    from walop_jax.model.trace import Sightline, Traced
     from walop_jax.model.trace import trace as traced
 
     if isinstance(calibration, Instrument):
@@ -102,22 +94,6 @@ def trace(
             ],
             NOT_CARRIED_OVER: list(lost),
         },
-        "\n".join(table(stages)),
+        repr(Traced(stages)),
         warnings=warnings,
     )
-
-
-def table(stages: Sequence[LightStage]) -> list[str]:
-    """The stages as lines of text; column names appear where they change."""
-    width = max(len(f"{stage.name} {row}") for stage in stages for row in stage.rows)
-    lines: list[str] = []
-    columns: tuple[str, ...] = ()
-    for stage in stages:
-        if stage.columns != columns:
-            columns = stage.columns
-            lines.append(" " * width + "".join(f"{column:>13}" for column in columns))
-        for i, (row, values) in enumerate(zip(stage.rows, stage.value, strict=True)):
-            name = f"{stage.name} {row}".strip()
-            about = f"   {stage.about}" if i == 0 else ""
-            lines.append(f"{name:<{width}}" + "".join(f"{value:13.6f}" for value in values) + about)
-    return lines

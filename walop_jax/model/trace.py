@@ -187,3 +187,21 @@ def _one(name: str, about: str, beam: Float[Array, " 4"]) -> LightStage:
 
 def _cameras(instrument: Instrument, name: str, about: str, beams: Float[Array, " k"]) -> LightStage:
     return LightStage(name, about, ("",), instrument.cameras.names, np.asarray(beams)[None])
+
+
+class Traced(tuple[LightStage, ...]):
+    """The stages of a sightline; prints as a table, with column names where they change."""
+
+    def __repr__(self) -> str:
+        width = max(len(f"{stage.name} {row}") for stage in self for row in stage.rows)
+        lines: list[str] = []
+        columns: tuple[str, ...] = ()
+        for stage in self:
+            if stage.columns != columns:
+                columns = stage.columns
+                lines.append(" " * width + "".join(f"{column:>13}" for column in columns))
+            for i, (row, values) in enumerate(zip(stage.rows, stage.value, strict=True)):
+                name = f"{stage.name} {row}".strip()
+                about = f"   {stage.about}" if i == 0 else ""
+                lines.append(f"{name:<{width}}" + "".join(f"{value:13.6f}" for value in values) + about)
+        return "\n".join(lines)
