@@ -96,7 +96,6 @@ def test_an_argument_that_does_not_exist_is_named_with_the_nearest(name: str):
             "diagnose: minutes is the text 'ten'; give a number",
         ),
         (lambda: walop.certify({}), "{} is not a run or a calibration; give a fit, a Run, or the path of a"),
-        (lambda: walop.read(5), "5 is not a file; give the path of a set, a product or a run"),
         (lambda: walop.trace(instrument=[]), "[] is not an instrument; give its name, its description file"),
         (lambda: walop.report(1.0), "1.0 is not a run or a calibration; give a fit, a Run, or the path of"),
         (
@@ -259,7 +258,8 @@ def test_quiet_is_quiet_and_without_output_nothing_is_written(
 def test_what_exists_stays_unless_told_otherwise(name: str, call, given: Given, tmp_path: Path):
     case = CASES[name]
     output = tmp_path / "out" / case.output
-    mine = output / "summary.json" if case.output == "RUN" else output
+    document = "commissioning.json" if name == "certify" else "summary.json"
+    mine = output / document if case.output == "RUN" else output
     mine.parent.mkdir(parents=True)
     mine.write_text("mine")
     refused = call(name, *case.words(given), "-o", output)

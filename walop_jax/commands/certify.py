@@ -133,7 +133,7 @@ def certify(
 def _requirements(
     job: Job, given: Calibration | FitResult | Run | PathLike, product: Calibration, path: Path
 ) -> tuple[Requirement, ...]:
-    """What is asked of a valid product; its exposures are looked at where the data of the run can be found."""
+    """Requirements on a valid product; its exposures are looked at where the data of the run can be found."""
     from walop_jax import FitResult, Run
     from walop_jax.science.commissioning import requirements
     from walop_jax.science.field_accuracy import field_accuracy

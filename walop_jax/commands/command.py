@@ -167,7 +167,7 @@ class Outcome(Generic[T]):
 
     @functools.cached_property
     def shown(self) -> Display:
-        """What is displayed."""
+        """The display: as given, or of the value."""
         value: Any = self.value
         return self.display or value.display()
 

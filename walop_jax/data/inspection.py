@@ -101,7 +101,7 @@ class Inspection(Displayed):
     findings: tuple[Finding, ...]
 
     def display(self) -> Display:
-        """What is in the set, and what is wrong with it."""
+        """Contents of the set, and findings."""
         low_x, high_x, low_y, high_y = self.field
         counted = math.isfinite(self.median_counts)
         apart = "; standards are measured at places of their own" if self.sources else ""

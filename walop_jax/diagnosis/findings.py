@@ -323,7 +323,7 @@ class Diagnosis(Drawn):
         )
 
     def _found(self) -> str:
-        """What was added to the starting model, and whether something without a name is left."""
+        """Names of what was added to the starting model, and whether something without a name is left."""
         names = [step.effect for step in self.steps] + ["something without a name"] * (
             self.unexplained is not None
         )

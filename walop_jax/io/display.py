@@ -56,7 +56,7 @@ class Display:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Display:
-        """What such a document was made of. Raises KeyError or TypeError for one that is none."""
+        """The display that such a document was made of. Raises KeyError or TypeError for one that is none."""
         return cls(
             str(document["title"]),
             tuple((str(name), str(words)) for name, words in document["facts"]),

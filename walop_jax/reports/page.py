@@ -74,7 +74,7 @@ class Section(NamedTuple):
 
 
 def display_of(document: Mapping[str, Any], path: Path) -> Display:
-    """What a command displayed of a document. Raises `DataError` for one that does not hold it."""
+    """The display of a result, from its document. Raises `DataError` for one that does not hold it."""
     try:
         return Display.of(document["shown"])
     except (KeyError, TypeError, ValueError) as error:
@@ -239,7 +239,7 @@ class _Drawn:
 
 
 def _diagnosed(run: RunContents, head: Display) -> list[Section]:
-    """What was found, with the figures of every addition."""
+    """Sections on findings, with the figures of every addition."""
     assert run.diagnosis is not None
     left, data, pictures = run.diagnosis["unexplained"], run.figure_data, []
     for number, one in enumerate(() if data is None else data.comparisons[1:], start=1):
@@ -306,7 +306,7 @@ def _limits(run: RunContents) -> list[Display]:
 
 
 def _doubts(summary: Mapping[str, Any]) -> list[str]:
-    """What forbids the use of a fit: first that it does not explain its data, if so."""
+    """Sentences that forbid the use of a fit: first that it does not explain its data, if so."""
     doubts, warnings = summary.get("doubts", ()), summary["warnings"]
     first = warnings[:1] if Quality.UNEXPLAINED & int(summary.get("quality", 0)) or not doubts else ()
     return list(dict.fromkeys((*first, *doubts)))
