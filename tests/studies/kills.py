@@ -43,8 +43,6 @@ from small_run import SEED, SMALL  # noqa: E402
 
 sampling = importlib.import_module("walop_jax.commands.sample")
 diagnosing = importlib.import_module("walop_jax.commands.diagnose")
-from walop_jax.commands.compress import compress  # noqa: E402
-
 from walop_jax.commands.diagnose import diagnose  # noqa: E402
 from walop_jax.commands.refit import refit  # noqa: E402
 from walop_jax.commands.sample import sample  # noqa: E402
@@ -69,7 +67,7 @@ LINES = {
     "refit": ("refit", "{set}", "-o", "{run}", "--overwrite"),
     "sample": ("sample", "{run}", "--overwrite", "--interval", "50", "--maximum-steps", "100", "--moves", "laplace"),
     "diagnose": ("diagnose", "{set}", "-o", "{run}", "--overwrite", "--minutes", "0"),
-    "compress": ("compress", "{set}", "-o", "{run}/set.fits", "--overwrite"),
+    "compress": ("refit", "{set}", "-o", "{run}", "--compress", "{run}/set.fits", "--overwrite"),
 }  # fmt: skip
 SIDE = int(limits.LARGE_ABOVE**0.5) + 8  # pixels: frames so large are fitted by sums over cells
 FRAMES = ObservingPlan(
@@ -114,7 +112,7 @@ class Study:
         elif self.command == "sample":
             sample(self.run, interval=50, maximum_steps=100, moves="laplace", seed=number, overwrite=True)
         elif self.command == "compress":
-            compress(self.sets[number], output=self.run / "set.fits", overwrite=True)
+            refit(self.sets[number], compress=self.run / "set.fits", output=self.run, overwrite=True)
         else:
             diagnose(self.sets[number], output=self.run, overwrite=True, minutes=0.0)
 
