@@ -31,7 +31,7 @@ PYTHON_ONLY = {
     "simulate": {"noiseless", "catalogue_seed"},
     "compare": {"calibration"},
     "plot": {"ax", "figsize", "reference"},
-    "sample": {"options"},
+    "sample": {"parameters", "options"},
 }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -44,6 +44,7 @@ def sample(
         int, Option("Steps after which convergence is judged and the chain kept.", least=1)
     ] = 500,
     moves: Annotated[str, Option("Moves of emcee: laplace, de or stretch.")] = "laplace",
+    parameters: Sequence[str] | None = None,
     options: Options | None = None,
 ) -> Outcome[PosteriorSample]:
     """Sample the posterior: RUN/posterior.nc, intervals and figures; the covariance goes into calibration.fits.
@@ -52,8 +53,9 @@ def sample(
     priors, sampler, settings or versions have changed. Other samplers start anew. A chain that has not converged is
     written and marked so, with exit code 1; the covariance of the fit then stays in calibration.fits.
 
-    In Python: a `PosteriorSample`, of a fit in memory or of a run, which is then written. `options` (`walop.Options`)
-    are all settings at once, with those that the command line does not have, in place of the others and of `seed`.
+    In Python: a `PosteriorSample`, of a fit in memory or of a run, which is then written. `parameters` names what is
+    sampled (None: the physics coefficients); `options` (`walop.Options`) are all settings at once, with those that the
+    command line does not have, in place of the others and of `seed`.
     Raises `DataError` if the run is no folder of a fit, holds a posterior already, or does not fit its data any more.
 
     >>> walop.sample(result, seed=1).to_arviz()  # doctest: +SKIP
@@ -69,6 +71,7 @@ def sample(
         walkers=walkers,
         interval=interval,
         moves=moves,
+        parameters=None if parameters is None else tuple(parameters),
     )
 
     def tell(progress: Progress) -> None:
