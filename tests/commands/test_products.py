@@ -60,7 +60,7 @@ def test_a_report_that_fails_leaves_the_old_one(fitted: FittedSet, tmp_path: Pat
         path.write_bytes(b"<!DOCTYPE")
         raise OSError("No space left on device")
 
-    monkeypatch.setattr("walop_jax.reports.page.render", lambda *args: "<!DOCTYPE html>")
+    monkeypatch.setattr("walop_jax.reports.page.render", lambda *args: ("<!DOCTYPE html>", ()))
     monkeypatch.setattr(Path, "write_text", half)
     with pytest.raises(DataError, match="what stood there before is untouched"):
         walop.report(fitted.run, tmp_path / "page.html", overwrite=True)
