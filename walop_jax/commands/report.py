@@ -52,7 +52,7 @@ def report(
     The verdict, the accuracy of p over the field, what the data were, what was found, residuals before and after, maps
     of the matrix and of its errors, pulls from the priors, all parameters, warnings, inputs and versions, as far as RUN
     holds them; the page says what is missing. What sample and limits have put into RUN is there as well; compare,
-    epoch, limits, plan, stack and watch have pages of their own. A page that exists is made anew; another file of that
+    epoch, limits, plan, stack, watch and certify have pages of their own. A page that exists is made anew; another file of that
     name is left alone unless --overwrite is given.
 
     In Python: a `Page`; of a fit in memory, which needs an `output`.

@@ -21,7 +21,17 @@ from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.display import Display, signed
 from walop_jax.io.errors import DataError, fail
-from walop_jax.io.names import COMPARISON, EPOCH, LIMITS, PLANNED, SUMMARY, SURVEY, TRACKS, WATCHED
+from walop_jax.io.names import (
+    COMMISSIONING,
+    COMPARISON,
+    EPOCH,
+    LIMITS,
+    PLANNED,
+    SUMMARY,
+    SURVEY,
+    TRACKS,
+    WATCHED,
+)
 from walop_jax.io.text import probability, read_json, rounded, value_and_error, with_error, with_minus_sign
 from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import draw
@@ -405,6 +415,7 @@ OTHERS = {
     "limits": OtherPage(LIMITS, "What these data can show"),
     "survey": OtherPage(SURVEY, "Many nights of one instrument", "trusted"),
     "watch": OtherPage(WATCHED, "Does the calibration still hold?", "holds"),
+    "commissioning": OtherPage(COMMISSIONING, "Go or no-go", "go"),
 }
 
 
@@ -470,7 +481,7 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
         except DataError as error:
             missing.append(f"Parameters against time are not drawn: {error}.")
         return [*found, picture("nights", survey_figures.nights_figure(document))]
-    names = [name for name in CAPTIONS if name.startswith(f"{'watch' if kind == 'watch' else 'comparison_'}")]
+    names = [name for name in CAPTIONS if name.endswith(".png") and name.startswith(kind)]
     there = [name for name in names if (folder / name).exists()]
     missing += [f"{name} is not there." for name in names if name not in there]
     return [Picture(png((folder / name).read_bytes()), CAPTIONS[name]) for name in there]
