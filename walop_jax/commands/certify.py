@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +14,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, errors_naming
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Run
+    from walop_jax import Calibration, Effect, FitResult, Run
     from walop_jax.calibration.certify import Check, Validity
     from walop_jax.science.commissioning import Requirement
 
@@ -105,20 +106,19 @@ def certify(
     from walop_jax import Calibration, FitResult
     from walop_jax.calibration.certify import certify as checks_of
     from walop_jax.calibration.certify import validity
-    from walop_jax.calibration.product import product_path, read_calibration
+    from walop_jax.calibration.product import product_path, read_product
 
     job.tell("checking")
     if isinstance(calibration, Calibration | FitResult):
-        product = Calibration.from_fit(calibration) if isinstance(calibration, FitResult) else calibration
-        path = Path(IN_MEMORY)
+        there = Calibration.from_fit(calibration) if isinstance(calibration, FitResult) else calibration
+        path, product, catalogue = Path(IN_MEMORY), there.product, there.model.catalogue
     else:
         path = product_path(folder_of(calibration))
-        product = read_calibration(path, catalogue_of(effects), rebuild=False)
+        product, catalogue = read_product(path), catalogue_of(effects)
     with errors_naming(path):
-        checks = tuple(checks_of(product))
-    asked = (
-        () if not all(check.passed for check in checks) else _requirements(job, calibration, product, path)
-    )
+        checks = tuple(checks_of(product, catalogue))
+    rebuilt = any(check.name == "model" and check.passed for check in checks)
+    asked = _requirements(job, calibration, path, catalogue) if rebuilt else ()
     parents = tuple(entry.sha256 for entry in product.inputs)
     made = Certificate(path, checks, asked, validity(product), product.content_hash(), parents)
     why = "; ".join(f"{check.name} ({check.found})" for check in made.failed)
@@ -131,18 +131,21 @@ def certify(
 
 
 def _requirements(
-    job: Job, given: Calibration | FitResult | Run | PathLike, product: Calibration, path: Path
+    job: Job, given: Calibration | FitResult | Run | PathLike, path: Path, catalogue: Sequence[type[Effect]]
 ) -> tuple[Requirement, ...]:
     """Requirements on a valid product; its exposures are looked at where the data of the run can be found."""
-    from walop_jax import FitResult, Run
+    from walop_jax import Calibration, FitResult, Run
+    from walop_jax.calibration.product import read_calibration
     from walop_jax.science.commissioning import requirements
     from walop_jax.science.field_accuracy import field_accuracy
 
     job.tell("working out the accuracy of p")
     if isinstance(given, FitResult):
-        accuracy = given.answer() if given.answer is not None else field_accuracy(product)
-        return requirements(product.verdict, given.minimum.message, accuracy, given.calset)
-    calset = None
+        accuracy = field_accuracy(Calibration.from_fit(given)) if given.answer is None else given.answer()
+        return requirements(given.checked_verdict(), given.minimum.message, accuracy, given.calset)
+    if isinstance(given, Calibration):
+        return requirements(given.verdict, "", field_accuracy(given), None)
+    calibration, calset = read_calibration(path, catalogue), None
     with contextlib.suppress(DataError):
-        calset = Run(path.parent).calset if path.exists() else None
-    return requirements(product.verdict, "", field_accuracy(product.rebuilt()), calset)
+        calset = Run(path.parent).calset
+    return requirements(calibration.verdict, "", field_accuracy(calibration), calset)

@@ -64,7 +64,7 @@ def matrix(
     """
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.plain_tables import MatrixTable, table_format
-    from walop_jax.posterior.files import with_draws
+    from walop_jax.posterior.draws import with_draws
     from walop_jax.science.catalogue import field_points
 
     if (points is None) == (x is None):

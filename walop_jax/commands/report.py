@@ -52,8 +52,8 @@ def report(
     The verdict, the accuracy of p over the field, what the data were, what was found, residuals before and after, maps
     of the matrix and of its errors, pulls from the priors, all parameters, warnings, inputs and versions, as far as RUN
     holds them; the page says what is missing. What sample and limits have put into RUN is there as well; compare,
-    epoch, limits, plan, stack, watch and certify have pages of their own. A page that exists is made anew; another file of that
-    name is left alone unless --overwrite is given.
+    epoch, limits, plan, stack, watch and certify have pages of their own. A page that exists is made anew; another file
+    of that name is left alone unless --overwrite is given.
 
     In Python: a `Page`; of a fit in memory, which needs an `output`.
 
@@ -61,7 +61,7 @@ def report(
     """
     from walop_jax import FitResult, Run
     from walop_jax.io.atomic import atomic_path, check_output
-    from walop_jax.io.text import printable
+    from walop_jax.io.text import encodable
     from walop_jax.reports.page import kind_of_run, render, render_other
     from walop_jax.reports.run import read_run
 
@@ -80,7 +80,7 @@ def report(
     check_output(target, overwrite=overwrite)
     job.tell("drawing", "drawing")
     text, missing = render_other(folder, kind) if found is None else render(found)
-    text = printable(text)
+    text = encodable(text)
     with atomic_path(target, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
     page = Page(target, len(text.encode()), missing)

@@ -107,7 +107,8 @@ def _sampled_run(
     from walop_jax.calibration.product import read_calibration
     from walop_jax.io.folder import output_folder
     from walop_jax.io.names import PRODUCT
-    from walop_jax.posterior.files import Chain, digest_of_fit
+    from walop_jax.posterior.draws import digest_of_fit
+    from walop_jax.posterior.files import Chain
     from walop_jax.posterior.sampling import sample as sample_fit
 
     folder = run.folder
@@ -120,12 +121,12 @@ def _sampled_run(
     if found and not (job.overwrite or resume):
         raise fail(f"holds {found[0]} already", file=folder, advice="go on with --resume, or --overwrite it")
     with output_folder(folder, OUTPUTS, overwrite=True) as out:
-        product = read_calibration(folder / PRODUCT, run.catalogue, rebuild=False)
+        product = read_calibration(folder / PRODUCT, run.catalogue)
         result = run.fit(text)
         if job.overwrite and not resume:
             Chain(folder / CHAINS, {}).path.unlink(missing_ok=True)
         posterior = sample_fit(result, options, folder=folder / CHAINS, resume=resume, report=tell)
-        fitted = digest_of_fit(product.inputs, product.fitted.names, product.values)
+        fitted = digest_of_fit(product.inputs, product.model.names, product.values)
         posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)
         with out.filled(((PRODUCT,) if posterior.trusted else ()) + OUTPUTS) as temporary:
             for name, write in _writers(product, posterior).items():
@@ -155,6 +156,6 @@ def _writers(product: Calibration, posterior: PosteriorSample) -> dict[str, Call
         "sample.json": text_file(json_text(posterior.document() | {"shown": posterior.display().document()})),
     }
     if posterior.trusted:
-        better = product.rebuilt().with_covariance(posterior.covariance, posterior.errors_from)
+        better = product.with_covariance(posterior.covariance, posterior.errors_from)
         writers[PRODUCT] = lambda path: write_calibration(path, better)
     return writers

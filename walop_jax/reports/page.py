@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jinja2
 from matplotlib.figure import Figure
 
-from walop_jax.calibration.product import read_calibration
+from walop_jax.calibration.product import read_product
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.display import Display, signed
@@ -32,7 +32,9 @@ from walop_jax.io.names import (
     TRACKS,
     WATCHED,
 )
-from walop_jax.io.text import probability, read_json, rounded, value_and_error, with_error, with_minus_sign
+from walop_jax.io.run_folder import RunFolder
+from walop_jax.io.text import probability, rounded, value_and_error, with_error, with_minus_sign
+from walop_jax.model.effects import EFFECTS
 from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import draw
 from walop_jax.reports.posterior_figures import unit_in_words
@@ -207,7 +209,7 @@ class _Drawn:
         found = (
             []
             if self.product is None
-            else self.named("accuracy", missing, {"filter": self.product.usual_filter})
+            else self.named("accuracy", missing, {"filter": self.product.maps.filter})
         )
         if found and self.run.limits is not None and self.run.limits.worst is not None:
             found.append(
@@ -273,7 +275,7 @@ def _diagnosed(run: RunContents, head: Display) -> list[Section]:
 def _candidates(run: RunContents) -> Section:
     """Every effect of the catalogue at the first look, limits on what was not found, other descriptions."""
     assert run.diagnosis is not None
-    catalogue = run.source.catalogue
+    catalogue = EFFECTS if run.source.run is None else run.source.run.catalogue
     rows = tuple(
         (
             row["effect"],
@@ -337,7 +339,7 @@ def _pulls(run: RunContents) -> Display:
     pulls = []
     if run.product is not None:
         c = run.product
-        for p, value, sigma in zip(c.fitted.parameters, c.values.tolist(), c.sigma.tolist(), strict=True):
+        for p, value, sigma in zip(c.parameters, c.values.tolist(), c.sigma.tolist(), strict=True):
             if p.free and p.tie is None and p.prior is not None and sigma > 0:
                 pulls.append(((value - p.prior[0]) / p.prior[1], p, p.prior, value, sigma))
     rows = tuple(
@@ -432,7 +434,7 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
     Raises `DataError` for a document that cannot be read or lacks what the page shows.
     """
     other, missing = OTHERS[kind], []
-    document: dict[str, Any] = read_json(folder / other.file)
+    document = RunFolder(folder).document(other.file, ("shown",))
     head = display_of(document, folder / other.file)
     pictures = _pictures(folder, kind, document, missing)
     limits = None
@@ -492,9 +494,7 @@ def _change_of_the_matrix(folder: Path, document: Mapping[str, Any], missing: li
     if document["fits"] is None or document.get("same"):
         return []
     try:
-        old, new = (
-            read_calibration(Path(path), rebuild=False).maps for path in (document["old_file"], folder)
-        )
+        old, new = (read_product(Path(path)).maps for path in (document["old_file"], folder))
         return [picture("change", figures.matrix_change_figure(old, new))]
     except (ValueError, OSError, KeyError, TypeError) as error:
         missing.append(f"The change of the instrument matrix is not drawn: {error}.")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.calibration import Calibration, Product
 from walop_jax.data.records import CALIBRATION_PLATE, POLARISER
 from walop_jax.io.text import rounded, some, with_minus_sign
 from walop_jax.model.effects import EFFECTS, Effect
@@ -54,7 +54,7 @@ _MANY = 12
 _KINDS = {"clp": "through the polariser", "moon": "of the Moon sky", "standard": "of standard stars"}
 
 
-def data_in_words(product: Calibration) -> tuple[tuple[str, str], ...]:
+def data_in_words(product: Calibration | Product) -> tuple[tuple[str, str], ...]:
     """Nights, exposures, polariser angles, plate settings, Moon patches, standards, temperatures, filters."""
     e = product.exposures
     kinds = ", ".join(
