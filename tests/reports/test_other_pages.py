@@ -67,7 +67,7 @@ def test_what_was_displayed_is_on_the_page(tmp_path: Path, kind: str):
 
 def test_a_document_that_holds_nothing_displayed_is_refused(tmp_path: Path):
     (tmp_path / "comparison.json").write_text("{}")
-    with pytest.raises(DataError, match=r"comparison.json: does not hold what was displayed"):
+    with pytest.raises(DataError, match=r"comparison.json: has no 'shown'"):
         render_other(tmp_path, "comparison")
 
 
