@@ -22,11 +22,33 @@ from walop_jax.diagnosis.figure_data import (
 )
 from walop_jax.diagnosis.limits_found import DetectionLimit, DetectionLimits
 from walop_jax.fit.verdict import Verdict
+from walop_jax.io.display import Display
 from walop_jax.io.text import json_text
 from walop_jax.model.parameters import Parameter
 
 INPUT = "night <b>one</b> & two.fits"
 X, Y = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.2, 0.2, 3), np.linspace(-0.2, 0.2, 3)))
+
+FIT = Display(
+    "Fit of WALOP-SOUTH: trusted",
+    (("p of a star", "0.070 % (median error for p ≤ 5 %)"), ("χ²/dof", "1234.5 / 1200 = 1.029")),
+    ("parameter", ">value", ">error", "unit", ">start", "prior", ""),
+    (
+        ("pupil.magnification", "15.751", "0.021", "", "", "15.630 ± 0.050", ""),
+        ("half1.wedge", "-0.23012", "0.00045", "rad", "", "-0.2300 ± 0.0010", ""),
+        ("clp_wobble.amplitude", "0.0613", "0.0012", "deg", "", "0.00 ± 0.10", ""),
+    ),
+    ("1 throughput term not shown",),
+)
+"""What `refit` displays."""
+FOUND = Display(
+    "Diagnosis: effect_found; fit trusted",
+    (("found", "clp_wobble"), ("χ²/dof", "1.625 → 1.029")),
+    ("effect", "parameter", ">value", ">error", "unit", ">p"),
+    (("clp_wobble", "amplitude", "0.0613", "0.0012", "deg", "2.1 × 10⁻⁷"),),
+    ("clp_wobble: χ² 1950.2 → 1234.5", "what would: polariser angles <over> a full turn"),
+)
+"""What `diagnose` displays."""
 
 SUMMARY: dict[str, Any] = {
     "chi2": 1234.5, "dof": 1200, "n_data": 1608,
@@ -41,7 +63,7 @@ SUMMARY: dict[str, Any] = {
     "versions": {"python": "3.11.7", "walop-jax": "0.1.0"},
     "inputs": [{"path": INPUT, "sha256": "ab" * 32}],
     "trusted": True, "quality": 0, "warnings": ["half1.wedge lies <far> out"], "instrument": "WALOP-SOUTH",
-    "free_parameters": 4, "misfit": None, "remarks": [],
+    "free_parameters": 4, "misfit": None, "remarks": [], "shown": FIT.document(),
 }  # fmt: skip
 
 DIAGNOSIS: dict[str, Any] = {
@@ -62,7 +84,7 @@ DIAGNOSIS: dict[str, Any] = {
     ],
     "unexplained": None,
     "p_value": 2.1e-7, "cannot_be_tested": ["chwp_axis"],
-    "chi2_per_dof_before": 1.625208, "chi2_per_dof_after": 1234.5 / 1200,
+    "chi2_per_dof_before": 1.625208, "chi2_per_dof_after": 1234.5 / 1200, "shown": FOUND.document(),
 }  # fmt: skip
 
 
@@ -194,6 +216,7 @@ def limits() -> DetectionLimits:
 def make_limits(folder: Path, sha256: str = "ab" * 32) -> Path:
     """A folder as `limits` leaves it, of data with this checksum."""
     document = limits().document() | {
+        "shown": limits().display().document(),
         "instrument": "WALOP-SOUTH",
         "inputs": [{"path": INPUT, "sha256": sha256}],
     }

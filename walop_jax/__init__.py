@@ -35,7 +35,7 @@ def _homes() -> dict[str, tuple[str, str]]:
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public name when it is first asked for; functions look at what they are given."""
+    """Load a public name when it is first asked for; functions compute in float64."""
     if name == "__all__":
         return _public()
     if name.startswith("__") or name not in _homes():
@@ -43,10 +43,12 @@ def __getattr__(name: str) -> Any:
     module, attribute = _homes()[name]
     found = getattr(importlib.import_module(module), attribute)
     _switch_on_float64()
-    if isinstance(found, types.FunctionType) and not hasattr(found, "command"):
-        from walop_jax.commands.door import checked
+    if isinstance(found, types.FunctionType) and not hasattr(found, "command") and name != "forward":
+        from walop_jax.model.compiled import (
+            in_float64,
+        )  # `forward`: the session itself compiles what it gives
 
-        found = checked(found, name)
+        found = in_float64(found, name)
     globals()[name] = found
     return found
 

@@ -55,7 +55,8 @@ def comes_out(found: Diagnosis, monkeypatch) -> None:
 def test_print_command_and_page_say_the_same(found: Diagnosis, call, calset_file, tmp_path, monkeypatch):
     comes_out(found, monkeypatch)
     run = handmade_run.make_refit(tmp_path / "run")
-    (run / "diagnosis.json").write_text(json.dumps(document(dataclasses.replace(found))))
+    content = document(found) | {"shown": found.display().document()}
+    (run / "diagnosis.json").write_text(json.dumps(content))
     shown = call("diagnose", calset_file, "-o", tmp_path / "made").stdout
     call("report", run)
     page = html.unescape((run / "report.html").read_text()).replace("\N{NO-BREAK SPACE}", " ")

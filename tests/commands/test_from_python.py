@@ -109,7 +109,7 @@ def test_matrix_is_the_table_of_the_command(call, fitted, tmp_path):
     assert result.exit_code == 0, result.output
     expected = Table.read(tmp_path / "out.ecsv")
     for given in (points, Table.read(points), QTable.read(points)):
-        found = walop.matrix(fitted.run, given)
+        found = walop.matrix(fitted.run, points=given)
         assert found.colnames == expected.colnames
         np.testing.assert_array_equal(found["M32_ERR"], expected["M32_ERR"])
     found = walop.matrix(fitted.run, [6, -3] * units.arcmin, [0.2, 0.1], teff=[5000, 6000])
@@ -142,14 +142,14 @@ def test_apply_is_the_table_of_the_command(call, fitted, tmp_path):
 
 def test_trace_ends_with_the_counts_of_the_command(call, fitted):
     text = call("trace", fitted.run, "--x", "0.1", "--q", "0.03").output.splitlines()[-1]
-    counts = walop.trace(0.1, q=0.03, calibration=fitted.run)[-1].value[0]
+    counts = walop.trace(fitted.run, x=0.1, q=0.03)[-1].value[0]
     assert [f"{value:.6f}" for value in counts] == text.split()[1:5]
 
 
 @pytest.mark.long
 def test_limits_as_a_table():
     zero = walop.effect_by_name("clp_zero")
-    table = walop.limits(small_fit(), catalogue=(zero,)).to_table()
+    table = walop.limits(small_fit(), effects=(zero,)).to_table()
     assert table["EFFECT"].tolist() == ["clp_zero"]
     assert 0 < table["DETECTED"][0, 0] < 0.1  # deg
 
@@ -201,7 +201,7 @@ def test_an_effect_of_ones_own_from_a_file(call, fitted, tmp_path):
     assert call("certify", run, "--effects", own).exit_code == 0
     catalogue = (
         *walop.EFFECTS,
-        walop.read(run, catalogue=_own(own)).calibration.model.template.effects[0].__class__,
+        walop.read(run, effects=_own(own)).calibration.model.template.effects[0].__class__,
     )
     assert catalogue[-1].name == "late_zero"
 

@@ -70,9 +70,8 @@ def test_a_plan_for_an_instrument_of_ones_own(call, tmp_path, monkeypatch):
         hdus.writeto("bare.fits")
     (note,) = [line for line in call("inspect", "bare.fits").stdout.splitlines() if "missing" in line]
     assert "[EXPOSURES] MJD, TEMP, HA: columns missing; using nan" in note
-    told = call(
-        "simulate", "--instrument", "own.toml", "-o", "no.fits", "--moon-patches", 0, "--standards", 0
-    )
+    Path("still.toml").write_text("moon_patches = 0\nstandards = 0\n")
+    told = call("simulate", "still.toml", "--instrument", "own.toml", "-o", "no.fits")
     assert "no moving element 'WIN'" in told.stderr
     assert "moving = { WIN = [0, 22.5, 45] }" in told.stderr
     assert "did you mean" not in told.stderr

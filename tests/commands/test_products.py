@@ -59,7 +59,7 @@ def test_a_report_that_fails_leaves_the_old_one(fitted: FittedSet, tmp_path: Pat
         path.write_bytes(b"<!DOCTYPE")
         raise OSError("No space left on device")
 
-    monkeypatch.setattr("walop_jax.reports.page.render", lambda *args: "<!DOCTYPE html>")
+    monkeypatch.setattr("walop_jax.reports.page.render", lambda *args: ("<!DOCTYPE html>", ()))
     monkeypatch.setattr(Path, "write_text", half)
     with pytest.raises(DataError, match="what stood there before is untouched"):
         walop.report(fitted.run, tmp_path / "page.html", overwrite=True)
@@ -74,7 +74,7 @@ def test_light_is_traced_through_what_was_fitted(fitted: FittedSet):
     star = {"x": 0.2, "y": -0.1, "q": 0.03, "u": 0.01, "teff": 5772.0}
     for found in (walop.trace(fitted.run, **star), walop.trace(calibration=fitted.calibration, **star)):
         np.testing.assert_allclose(found[-1].value, expected[-1].value, rtol=1e-12)
-    designed = walop.trace(0.2, -0.1, 0.03, 0.01, teff=5772.0, instrument="walop-south")
+    designed = walop.trace(**star, instrument="walop-south")
     assert np.abs(designed[-1].value - expected[-1].value).max() > 1e-4
     with pytest.raises(ValueError, match="WALOP-SOUTH"):
         walop.trace(instrument="WALOP-SUOTH")

@@ -15,7 +15,7 @@ import handmade_run
 import pytest
 from south_sets import CUTS
 
-from walop_jax.commands.command import CACHE_VARIABLE, cache_folder
+from walop_jax.model.compiled import CACHE_VARIABLE, cache_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -20,7 +20,6 @@ class Examined(Exception):
 
 CALLS = {
     "refit": lambda g, **k: walop.refit(g.calset, **k),
-    "commission": lambda g, **k: walop.commission(g.calset, **k),
     "limits": lambda g, **k: walop.limits(g.calset, **k),
     "compare": lambda g, **k: walop.compare(g.calset, **k),
     "epoch": lambda g, **k: walop.epoch(g.run, g.calset, **k),

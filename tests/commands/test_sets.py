@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -14,7 +15,9 @@ from walop_jax.io.errors import DataError
 
 from .conftest import FittedSet
 
-SMALL = {"grid": 3, "standard_grid": 1, "angles": 4, "moon_patches": 2, "standards": 3}
+SMALL = walop.ObservingPlan(
+    grid=3, standard_grid=1, polariser_angles=(0.0, 45.0, 90.0, 135.0), moon_patches=2, standards=3
+)
 PLAN = """
 grid = 3
 standard_grid = 1
@@ -26,7 +29,7 @@ standards = 3
 
 def test_a_simulated_set(tmp_path: Path):
     wobble = {"clp_wobble": {"amplitude": 0.06, "phase": 1.1}}
-    made = walop.simulate(**SMALL, effect=wobble, seed=3, truth=tmp_path / "truth.json")
+    made = walop.simulate(SMALL, effect=wobble, seed=3, truth=tmp_path / "truth.json")
     # 4 polariser angles and 2 Moon patches at 9 points, 3 standards at one place.
     counted = (len(made.calset.points), len(made.calset.exposures), made.calset.intensities.rows)
     assert counted == (10, 9, 57)
@@ -37,28 +40,23 @@ def test_a_simulated_set(tmp_path: Path):
 
 def test_an_effect_may_be_a_dict_a_text_or_an_object_and_a_plan_a_file(tmp_path: Path):
     (tmp_path / "plan.toml").write_text(PLAN)
-    plan = walop.ObservingPlan(
-        grid=3, standard_grid=1, polariser_angles=(0.0, 45.0, 90.0, 135.0), moon_patches=2, standards=3
-    )
-    axis = walop.effect_by_name("hwp1_axis").of(plan.context(), angle=0.3)
+    axis = walop.effect_by_name("hwp1_axis").of(SMALL.context(), angle=0.3)
     sets = [
-        walop.simulate(plan, 3, effects=(axis,)),  # as it has been
-        walop.simulate(plan, seed=3, effects={"hwp1_axis": 0.3}),
+        walop.simulate(SMALL, seed=3, effect=(axis,)),
+        walop.simulate(SMALL, seed=3, effect={"hwp1_axis": 0.3}),
         walop.simulate(tmp_path / "plan.toml", seed=3, effect=["hwp1_axis=0.3"]),
-        walop.simulate(**SMALL, seed=3, effect="hwp1_axis=0.3"),
+        walop.simulate(SMALL, seed=3, effect="hwp1_axis=0.3"),
     ]
     blocks = [made.calset.intensities.block(0, 10).counts for made in sets]
     for block in blocks[1:]:
         np.testing.assert_array_equal(block, blocks[0])
-    with pytest.raises(ValueError, match="the plan says all of that: leave grid out"):
-        walop.simulate(plan, grid=4)
 
 
 @pytest.mark.parametrize("name", ["set.fits", "truth.json"])
 def test_what_exists_is_not_simulated_over(tmp_path: Path, name: str):
     (tmp_path / name).write_text("mine")
     with pytest.raises(DataError, match="exists already"):
-        walop.simulate(**SMALL, output=tmp_path / "set.fits", truth=tmp_path / "truth.json")
+        walop.simulate(SMALL, output=tmp_path / "set.fits", truth=tmp_path / "truth.json")
     assert [entry.read_text() for entry in tmp_path.iterdir()] == ["mine"]
 
 
@@ -70,7 +68,7 @@ def test_neither_set_nor_truth_after_an_exception(tmp_path: Path, monkeypatch, e
 
     monkeypatch.setattr("walop_jax.data.write.sign_and_write", half)
     with pytest.raises(type(error) if isinstance(error, KeyboardInterrupt) else DataError):
-        walop.simulate(**SMALL, output=tmp_path / "set.fits", truth=tmp_path / "truth.json")
+        walop.simulate(SMALL, output=tmp_path / "set.fits", truth=tmp_path / "truth.json")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -86,7 +84,7 @@ def test_an_imported_set(tmp_path: Path):
 
 def test_sets_are_inspected_one_by_one_and_as_one(fitted: FittedSet, tmp_path: Path):
     other = tmp_path / "other.fits"
-    walop.simulate(**(SMALL | {"standards": 0}), seed=1, output=other)
+    walop.simulate(dataclasses.replace(SMALL, standards=0), seed=1, output=other)
     found = walop.inspect([fitted.calset, other])
     assert found.joint is not None
     assert found.joint.rows == sum(walop.read(path).intensities.rows for path in (fitted.calset, other))

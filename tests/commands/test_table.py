@@ -29,11 +29,9 @@ FUNCTIONS = {name: getattr(walop, name.replace("-", "_")) for name in COMMANDS}
 # What only Python can say: columns and elements by name, fits in memory, what is no text.
 PYTHON_ONLY = {
     "simulate": {"noiseless", "catalogue_seed"},
-    "matrix": {"columns"},
     "compare": {"calibration"},
-    "trace": {"positions"},
     "plot": {"ax", "figsize", "reference"},
-    "sample": {"parameters", "more"},
+    "sample": {"parameters", "options"},
 }
 
 
@@ -76,57 +74,41 @@ def test_defaults_are_those_of_what_is_called():
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_an_argument_that_does_not_exist_is_named_with_the_nearest(name: str, fitted: FittedSet):
-    given = {"trace": {"ouptut": 1.0}}.get(name, {"sede": 1})
-    with pytest.raises(
-        (TypeError, ValueError), match=r"'(sede|ouptut|OUPTUT)'.*(did you mean|nearest|known)"
-    ):
-        FUNCTIONS[name](*{"matrix": (fitted.run, 0.0, 0.0), "sample": ("RUN",)}.get(name, ()), **given)
+def test_an_argument_that_does_not_exist_is_named_with_the_nearest(name: str):
+    with pytest.raises(TypeError, match=r"'sede'.*did you mean 'seed'"):
+        FUNCTIONS[name](sede=1)
 
 
 @pytest.mark.parametrize(
     ("call_it", "message"),
     [
-        (lambda: walop.refit(3), "refit: data is 3, but a calibration set or a path"),
-        (lambda: walop.refit("x.fits", 7), "refit: model is 7, but a model or a path is wanted"),
-        (lambda: walop.refit("x.fits", overwrite="yes"), "overwrite is the text 'yes'"),
+        (
+            lambda: walop.refit(3),
+            "3 is not a calibration set; give a set, the path of one (FITS), or several",
+        ),
+        (
+            lambda: walop.refit("x.fits", 7),
+            "7 is not a model; give base_model(calset), or the path of a model",
+        ),
+        (lambda: walop.refit("x.fits", overwrite="yes"), "refit: overwrite is the text 'yes'; give a number"),
         (
             lambda: walop.diagnose("x.fits", minutes="ten"),
-            "minutes is the text 'ten', but a number is wanted",
+            "diagnose: minutes is the text 'ten'; give a number",
         ),
-        (lambda: walop.certify({}), "certify: calibration is a dict, but a calibration or a fit or a run"),
-        (lambda: walop.read(5), "read: paths is 5, but a path is wanted"),
-        (lambda: walop.trace(instrument=[]), "trace: instrument is a list"),
-        (lambda: walop.report(1.0), "report: run is 1.0, but a fit or a run or a path is wanted"),
+        (lambda: walop.certify({}), "{} is not a run or a calibration; give a fit, a Run, or the path of a"),
+        (lambda: walop.trace(instrument=[]), "[] is not an instrument; give its name, its description file"),
+        (lambda: walop.report(1.0), "1.0 is not a run or a calibration; give a fit, a Run, or the path of"),
         (
             lambda: walop.refit("x.fits", free=["half1.wedge"]),
             "refit: there is no argument 'free'; the model says that of its parameters: model=base_model(calset)",
         ),
         (walop.refit, "refit: missing a required argument: 'data'; the arguments are data, model"),
-        (lambda: walop.effect_by_name(3), "effect_by_name: name is 3, but a text is wanted"),
     ],
 )
 def test_a_wrong_kind_of_argument_is_one_sentence(call_it: Callable[[], Any], message: str):
-    with pytest.raises(TypeError) as raised:
+    with pytest.raises((TypeError, ValueError)) as raised:
         call_it()
     assert message in str(raised.value)
-
-
-def test_exchanged_arguments_are_told(fitted: FittedSet, tmp_path: Path):
-    """The set and its path the other way round were an AttributeError."""
-    calset = walop.read(fitted.calset)
-    with pytest.raises(
-        TypeError, match="path is a calibration set, but a path is wanted; exchange path and calset"
-    ):
-        walop.write_calibration_set(calset, tmp_path / "set.fits")
-    walop.write_calibration_set(tmp_path / "set.fits", calset)
-
-
-def test_names_that_arguments_have_had():
-    zero = walop.effect_by_name("clp_zero")
-    assert walop.model(effect=["clp_zero"], catalogue=[zero]).model.effect_names == ("clp_zero",)
-    with pytest.raises(ValueError, match="'MLE' is neither MAS nor WK"):
-        walop.apply("RUN", {}, estimator="MLE")
 
 
 # ---------------------------------------------------------------------------------------------- run, both ways
@@ -141,13 +123,12 @@ class Case(NamedTuple):
     long: bool = False
 
 
-PLAN = {"grid": 3, "standard_grid": 1, "angles": 4, "moon_patches": 2, "standards": 3}
-PLAN_WORDS = [word for key, value in PLAN.items() for word in (f"--{key.replace('_', '-')}", value)]
+PLAN = "grid = 3\nstandard_grid = 1\npolariser_angles = 4\nmoon_patches = 2\nstandards = 3\n"
 CASES = {
     "inspect": Case(lambda g: (g.calset,), lambda g, **k: walop.inspect(g.calset, **k)),
     "simulate": Case(
-        lambda g: (*PLAN_WORDS, "--effect", "hwp1_axis=0.3"),
-        lambda g, **k: walop.simulate(**PLAN, effect={"hwp1_axis": 0.3}, **k),
+        lambda g: (g.plan, "--effect", "hwp1_axis=0.3"),
+        lambda g, **k: walop.simulate(g.plan, effect={"hwp1_axis": 0.3}, **k),
         "set.fits",
     ),
     "refit": Case(lambda g: (g.calset,), lambda g, **k: walop.refit(g.calset, **k), "RUN"),
@@ -158,14 +139,13 @@ CASES = {
     "compare": Case(lambda g: (g.calset,), lambda g, **k: walop.compare(g.calset, **k), "RUN", True),
     "report": Case(lambda g: (g.run,), lambda g, **k: walop.report(g.run, **k), "page.html", True),
     "plot": Case(lambda g: (g.run, "matrix"), lambda g, **k: walop.plot(g.run, "matrix", **k), "m.png", True),
-    "commission": Case(lambda g: (g.calset,), lambda g, **k: walop.commission(g.calset, **k), "RUN", True),
     "matrix": Case(
         lambda g: (g.run, "--points", g.points),
         lambda g, **k: walop.matrix(g.run, points=g.points, **k),
         "m.ecsv",
     ),
     "apply": Case(lambda g: (g.run, g.stars), lambda g, **k: walop.apply(g.run, g.stars, **k), "s.ecsv"),
-    "certify": Case(lambda g: (g.run,), lambda g, **k: walop.certify(g.run, **k)),
+    "certify": Case(lambda g: (g.run,), lambda g, **k: walop.certify(g.run, **k), "RUN"),
     "epoch": Case(lambda g: (g.run, g.calset), lambda g, **k: walop.epoch(g.run, g.calset, **k), "RUN", True),
     "watch": Case(lambda g: (g.run, g.stars), lambda g, **k: walop.watch(g.run, g.stars, **k), "RUN", True),
     "model": Case(
@@ -182,14 +162,8 @@ CASES = {
     "conformance": Case(lambda g: ("--make", g.pack), lambda g, **k: walop.conformance(make=g.pack, **k)),
     "docs": Case(lambda g: ("files",), lambda g, **k: walop.docs("files", **k)),
 }
-ELSEWHERE = {
-    "demo",
-    "compress",
-    "clip",
-    "sample",
-    "plan",
-    "stack",
-}  # frames; fit/test_outliers; test_sample; tests/plans; tests/nights
+ELSEWHERE = {"demo", "clip", "sample", "plan", "stack"}
+# fit/test_outliers; test_sample; tests/plans; tests/nights
 CHEAP = [name for name, case in CASES.items() if not case.long]
 WRITING = [name for name in CHEAP if CASES[name].output]
 TABLE = [pytest.param(name, marks=[pytest.mark.long] if CASES[name].long else []) for name in CASES]
@@ -200,6 +174,7 @@ def test_every_command_is_in_the_table():
 
 
 class Given(NamedTuple):
+    plan: Path
     calset: Path
     run: Path
     points: Path
@@ -215,7 +190,9 @@ def given(fitted: FittedSet, tmp_path: Path) -> Given:
     stars = Table({"X": [0.1, 0.2], "Y": [0.0, 0.1], "N": n, "N_ERR": np.sqrt(n)})
     stars.write(tmp_path / "stars.fits")
     exports = write_folder(tmp_path / "exports")
+    (tmp_path / "plan.toml").write_text(PLAN)
     return Given(
+        tmp_path / "plan.toml",
         fitted.calset,
         fitted.run,
         tmp_path / "points.csv",
@@ -281,7 +258,8 @@ def test_quiet_is_quiet_and_without_output_nothing_is_written(
 def test_what_exists_stays_unless_told_otherwise(name: str, call, given: Given, tmp_path: Path):
     case = CASES[name]
     output = tmp_path / "out" / case.output
-    mine = output / "summary.json" if case.output == "RUN" else output
+    document = "commissioning.json" if name == "certify" else "summary.json"
+    mine = output / document if case.output == "RUN" else output
     mine.parent.mkdir(parents=True)
     mine.write_text("mine")
     refused = call(name, *case.words(given), "-o", output)

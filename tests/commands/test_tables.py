@@ -99,14 +99,14 @@ def test_what_cannot_be_is_said_before_any_work(fitted: FittedSet, catalogue: Pa
     with pytest.raises(DataError, match="no such file"):
         walop.apply(tmp_path / "none.fits", catalogue, output=tmp_path / "o.fits")
     with pytest.raises(DataError, match="no such file"):
-        walop.matrix(fitted.run / "other.fits", catalogue, output=tmp_path / "o.fits")
+        walop.matrix(fitted.run / "other.fits", points=catalogue, output=tmp_path / "o.fits")
 
 
 def test_a_column_that_does_not_exist_is_no_setting(fitted: FittedSet):
     """It was added to the table, and the temperature stayed as it was."""
-    with pytest.raises(TypeError, match="'temperature'; did you mean 'TEMP'"):
+    with pytest.raises(TypeError, match="there is no argument 'temperature'"):
         walop.matrix(fitted.run, 0.1, 0.1, temperature=4)
-    assert walop.matrix(fitted.run, 0.1, 0.1, temp=4)["TEMP"] == 4
+    assert walop.matrix(fitted.run, points={"X": 0.1, "Y": 0.1, "TEMP": 4})["TEMP"] == 4
 
 
 def test_a_filter_that_the_calibration_does_not_cover_is_refused_unless_forced(
@@ -157,7 +157,7 @@ def test_columns_that_are_not_used_or_replaced_are_named(call, fitted: FittedSet
     assert Table.read(tmp_path / "o.fits").meta["REMARK"] == expected
     for sentence in expected:
         assert f"p.csv: {sentence}" in told.stderr
-    made = walop.matrix(fitted.calibration, given)
+    made = walop.matrix(fitted.calibration, points=given)
     made["x"] *= 60.0
     assert given["x"][0] == 0.1
 

@@ -84,7 +84,7 @@ def test_an_instrument_tells_what_its_plates_do(tmp_path):
 
 def test_an_instrument_may_be_traced_as_it_is():
     """It was refused as a wrong kind of calibration; `instrument=` is the same."""
-    _, truth = walop.simulate(grid=2, standard_grid=1, angles=3, moon_patches=0, standards=0)
+    _, truth = walop.simulate(walop.ObservingPlan(grid=2, standard_grid=1, moon_patches=0, standards=0))
     one, other = walop.trace(truth, x=0.1, q=0.02), walop.trace(instrument=truth, x=0.1, q=0.02)
     np.testing.assert_array_equal(one[-1].value, other[-1].value)
 

@@ -1,12 +1,15 @@
 """Go or no-go: each requirement missed by itself, and what is told then."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 from small_run import small_fit
 
-from walop_jax.science.commissioning import commissioning
+from walop_jax.calibration.certify import Validity
+from walop_jax.commands.certify import Certificate
+from walop_jax.science.commissioning import requirements
 from walop_jax.science.field_accuracy import FieldAccuracy
 
 FIELD = np.linspace(1e-4, 4.9e-4, 100).reshape(10, 10)  # median 2.95e-4
@@ -19,8 +22,13 @@ def accuracy(**changes):
     return dataclasses.replace(plain, **changes)
 
 
+def certificate(result, accuracy):
+    asked = requirements(result.checked_verdict(), "", accuracy, result.calset)
+    return Certificate(Path("calibration.fits"), (), asked, Validity((0.0, 0.0), (), (0.0, 0.0)), "", ())
+
+
 def test_a_go():
-    found = commissioning(small_fit(), accuracy(hidden=2e-4, hidden_by="the filter"))
+    found = certificate(small_fit(), accuracy(hidden=2e-4, hidden_by="the filter"))
     assert found.go
     assert "go" in found.display().title
     assert "p known to 0.050 % in 95 % of the field" in found.display().text()
@@ -37,7 +45,7 @@ def test_a_go():
     ],
 )
 def test_a_no_go(change, words):
-    found = commissioning(small_fit(), accuracy(**change))
+    found = certificate(small_fit(), accuracy(**change))
     assert not found.go
     assert "NO GO" in found.display().title
     assert words in found.missing[0]
@@ -46,13 +54,13 @@ def test_a_no_go(change, words):
 
 def test_what_is_not_trusted_is_no_go():
     bad = small_fit().judged(["the residuals hold patterns"])
-    assert commissioning(small_fit().remarked("a remark"), accuracy()).go
-    assert not commissioning(bad, accuracy()).go
-    assert "diagnose" in commissioning(bad, accuracy()).missing[0]
+    assert certificate(small_fit().remarked("a remark"), accuracy()).go
+    assert not certificate(bad, accuracy()).go
+    assert "diagnose" in certificate(bad, accuracy()).missing[0]
 
 
 def test_mistakes_that_could_hide_are_told_but_forbid_nothing():
-    found = commissioning(
+    found = certificate(
         small_fit(),
         accuracy(
             hidden=3e-3, hidden_by="the scale of X and Y (wrong by 2 %)", remedy="check the field positions"
@@ -64,7 +72,7 @@ def test_mistakes_that_could_hide_are_told_but_forbid_nothing():
 
 def test_the_edge_of_the_field_is_told():
     """1.6 · 2.95·10⁻⁴ in half of the field, 1.6 · 4.7·10⁻⁴ in 95 % of it: a go, and more nights are advised."""
-    found = commissioning(small_fit(), accuracy(error=1.6 * FIELD))
+    found = certificate(small_fit(), accuracy(error=1.6 * FIELD))
     assert found.go
     assert any(text.startswith("0.075 %") and "walop-jax stack" in text for text in found.missing)
 
@@ -77,14 +85,14 @@ def test_the_strip_without_u_is_left_out_and_said():
     found = accuracy(error=error, without_u=0.2, with_u=with_u)
     assert found.reached == pytest.approx(np.quantile(FIELD[with_u], 0.95))
     assert found.reached < 5e-4
-    said = commissioning(small_fit(), found).display().text()
+    said = certificate(small_fit(), found).display().text()
     assert "in 95 % of the field where one exposure measures u (80 % of it)" in said
     assert np.quantile(error, 0.95) == pytest.approx(1e-2)
 
 
 def test_where_one_exposure_holds_no_u_more_light_is_no_cure():
     """8 % of the field in the strip: the edge of the field is its matter, half of the field is not."""
-    found = commissioning(small_fit(), accuracy(error=1.6 * FIELD, without_u=0.08))
+    found = certificate(small_fit(), accuracy(error=1.6 * FIELD, without_u=0.08))
     assert found.go
     (told,) = [text for text in found.missing if text.startswith("0.075 %")]
     assert "8 % of the field" in told

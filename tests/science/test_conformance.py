@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import csv
 import math
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from walop_jax.commands.conformance import OUTPUTS, conformance
+from walop_jax.commands.conformance import RESULTS, SHIPPED, conformance
 from walop_jax.io.errors import DataError
 from walop_jax.model.mueller import retarder
 from walop_jax.model.sources import turned
-from walop_jax.science.conformance import Case, cases, judge
+from walop_jax.science import conformance as science
+from walop_jax.science.conformance import rows, values
 from walop_jax.science.estimate import estimate
 from walop_jax.science.polarisation import polarisation
 
@@ -42,12 +44,38 @@ BY_HAND = {
 }
 
 
+class Case(NamedTuple):
+    """A question: numbers that are given, the right answers, and what mistakes (in words) would answer."""
+
+    name: str
+    topic: str
+    given: dict[str, float]
+    answers: dict[str, float]
+    mistakes: dict[str, dict[str, float]]
+
+
+def cases() -> list[Case]:
+    """The questions as the package holds them."""
+    made = {row["CASE"]: Case(row["CASE"], row["TOPIC"], {}, {}, {}) for row in rows("cases.csv")}
+    for file in ("given", "answers"):
+        for (case, quantity), value in values(f"{file}.csv").items():
+            getattr(made[case], file)[quantity] = value
+    for row in rows("mistakes.csv"):
+        wrong = made[row["CASE"]].mistakes.setdefault(row["MISTAKE"], {})
+        wrong[row["QUANTITY"]] = float(row["VALUE"])
+    return list(made.values())
+
+
+def judge(answers):
+    return science.judge(answers).deviations
+
+
 def right() -> dict[tuple[str, str], float | None]:
     return {(case.name, quantity): value for case in cases() for quantity, value in case.answers.items()}
 
 
 def test_questions_with_answers_known_by_hand():
-    found = list(cases())
+    found = cases()
     assert len(found) == len({case.name for case in found}) == 43
     for key, value in BY_HAND.items():
         assert right()[key] == pytest.approx(value, rel=1e-12, abs=1e-12), key
@@ -149,7 +177,7 @@ def fill(folder, change):
 def test_tables_are_written_and_judged(tmp_path):
     folder = tmp_path / "pack"
     assert conformance(make=folder) == 43
-    assert sorted(entry.name for entry in folder.iterdir()) == sorted(OUTPUTS)
+    assert sorted(entry.name for entry in folder.iterdir()) == sorted((*SHIPPED, RESULTS))
     asked = len(right())
     empty = conformance(check=folder)
     assert len(empty.deviations) == asked

@@ -43,8 +43,6 @@ from small_run import SEED, SMALL  # noqa: E402
 
 sampling = importlib.import_module("walop_jax.commands.sample")
 diagnosing = importlib.import_module("walop_jax.commands.diagnose")
-from walop_jax.commands.command import switch_on_jax  # noqa: E402
-from walop_jax.commands.compress import compress  # noqa: E402
 from walop_jax.commands.diagnose import diagnose  # noqa: E402
 from walop_jax.commands.refit import refit  # noqa: E402
 from walop_jax.commands.sample import sample  # noqa: E402
@@ -52,6 +50,7 @@ from walop_jax.data.frames import Grid  # noqa: E402
 from walop_jax.data.write import write_calibration_set  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
 from walop_jax.likelihood import limits  # noqa: E402
+from walop_jax.model.compiled import switch_on  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
 
@@ -68,7 +67,7 @@ LINES = {
     "refit": ("refit", "{set}", "-o", "{run}", "--overwrite"),
     "sample": ("sample", "{run}", "--overwrite", "--interval", "50", "--maximum-steps", "100", "--moves", "laplace"),
     "diagnose": ("diagnose", "{set}", "-o", "{run}", "--overwrite", "--minutes", "0"),
-    "compress": ("compress", "{set}", "-o", "{run}/set.fits", "--overwrite"),
+    "compress": ("refit", "{set}", "-o", "{run}", "--compress", "{run}/set.fits", "--overwrite"),
 }  # fmt: skip
 SIDE = int(limits.LARGE_ABOVE**0.5) + 8  # pixels: frames so large are fitted by sums over cells
 FRAMES = ObservingPlan(
@@ -113,7 +112,7 @@ class Study:
         elif self.command == "sample":
             sample(self.run, interval=50, maximum_steps=100, moves="laplace", seed=number, overwrite=True)
         elif self.command == "compress":
-            compress(self.sets[number], output=self.run / "set.fits", overwrite=True)
+            refit(self.sets[number], compress=self.run / "set.fits", output=self.run, overwrite=True)
         else:
             diagnose(self.sets[number], output=self.run, overwrite=True, minutes=0.0)
 
@@ -332,7 +331,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, count in {"states": 200, "full": 60, "kills": 0, "races": 0}.items():
         parser.add_argument(f"--{name}", type=int, default=count)
     options = parser.parse_args(arguments)
-    switch_on_jax()  # as the commands do: programs that were kept differ from others in the last digits
+    switch_on()  # as the commands do: programs that were kept differ from others in the last digits
     warnings.simplefilter("ignore")
     sys.addaudithook(_hook)
     bad = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -85,72 +86,66 @@ def apply(
     job.begin("reading")
     table = table_of(catalogue, {})
     if is_survey(calibration):
-        survey = read_survey(calibration, catalogue_of(effects))
-        held = calibration_of_stars(survey, table, force=force)
+        held = calibration_of_stars(read_survey(calibration, catalogue_of(effects)), table, force=force)
     else:
         held = calibration_of(calibration, effects)
-    limit = math.inf if saturation is None else saturation
-    instrument, always, never = held.model.template.patched(), held.always_in, held.never_in
-    rows = read_catalogue(table, instrument, limit, always_in=always, never_in=never)
+    instrument, limit = held.model.template.patched(), math.inf if saturation is None else saturation
+    rows = read_catalogue(table, instrument, limit, always_in=held.always_in, never_in=held.never_in)
     job.tell("tabulating the analysis vectors", "tabulating")
     used = held if posterior is None else with_moments(held, posterior)
     with errors_naming(table.path):
         stars = apply_to_rows(
             used, rows, lambda done, total: job.tell(f"{done} of {total} rows"), force=force
         )
-    at_places = {place.words() for place in stars.check.places}
     job.begin("writing")
-    alone = len(set(rows.star.tolist())) == len(rows.star) and len(used.model.template.arms) == 1
-    settings = ": with one arm a star needs rows at several settings, of one ID" if alone else ""
-    on_the_sky = sum(map(math.isfinite, rows.rotator)) / max(len(rows.rotator), 1)
     columns = stokes_columns(stars, rows.star, debias)
-    return table_outcome(
+    on_the_sky = sum(map(math.isfinite, rows.rotator)) / max(len(rows.rotator), 1)
+    at_places = {place.words() for place in stars.check.places}
+    doubts = (
+        f"{text} (FLAG {Quality.PLACE if text in at_places else Quality.CATALOGUE:d})"
+        for text in stars.check.warnings()
+    )
+    alone = len(set(rows.star.tolist())) == len(rows.star) and len(used.model.template.arms) == 1
+    outcome = table_outcome(
         job,
         held,
         table,
         columns,
         header(held.content_hash(), debias, on_the_sky, stars.check),
         output,
-        flag=stars.flag,
-        told={
-            Quality.NO_STOKES: f"star(s) without a result (FLAG 16384){settings}",
-            Quality.BEYOND_FIELD: "star(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)",
-            Quality.BEYOND_SETTINGS: "star(s) with a filter, temperature or TEFF beyond the calibration",
-            Quality.DISAGREES: "star(s) whose intensities disagree with the calibration (FLAG 131072, CHI2): is "
-            "the background subtracted, are the cameras in order?",
-            Quality.PLACE: "star(s) at a place of the field where stars disagree with the calibration together "
-            "(FLAG 1048576): their errors are enlarged",
-            Quality.OTHER_FRAME: "star(s) without ROTATOR, in the frame of the instrument (FLAG 2097152)",
-            Quality.REPEATED: "star(s) with the place and counts of another star or setting (FLAG 4194304)",
-        },
-        untold=(
-            Quality.HIGH_CROSSTALK,
-            Quality.CAMERA_MISSING,
-            Quality.SATURATED,
-            Quality.VALIDITY_FORCED,
-            Quality.UNKNOWN_COLOUR,
-        ),
-        lost=used.left_behind,
-        more={
+        counted=_counted(alone),
+        warnings=[*doubts, *_about_noise(rows.counts, rows.sigma), *_about_places(rows, stars.flag)],
+        extra={
             "stars": len(stars.qu),
             "seconds": job.seconds,
             "estimator": debias,
             "catalogue": stars.check.document(),
         },
-        text=lambda n: (
-            f"{output}: {table.rows} rows, {len(stars.qu)} stars, {job.seconds:.1f} s{_errors(columns)}"
-            + f"; {n[Quality.HIGH_CROSSTALK]} in zones of high cross-talk (FLAG 16)"
-            * (n[Quality.HIGH_CROSSTALK] > 0)
-        ),
-        warnings=[
-            *(
-                f"{text} (FLAG {Quality.PLACE if text in at_places else Quality.CATALOGUE:d})"
-                for text in stars.check.warnings()
-            ),
-            *_about_noise(rows.counts, rows.sigma),
-            *_about_places(rows, stars.flag),
-        ],
     )
+    crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
+    text = f"{output}: {table.rows} rows, {len(stars.qu)} stars, {job.seconds:.1f} s{_errors(columns)}"
+    if crossed:
+        text += f"; {crossed} in zones of high cross-talk (FLAG 16)"
+    return dataclasses.replace(outcome, text=text)
+
+
+def _counted(alone: bool) -> dict[Any, str]:
+    """The bits of FLAG that are counted, with their warnings; `alone`: stars of one row each, of a single arm."""
+    from walop_jax.fit.verdict import Quality
+
+    settings = ": with one arm a star needs rows at several settings, of one ID" if alone else ""
+    quiet = (Quality.HIGH_CROSSTALK, Quality.CAMERA_MISSING, Quality.SATURATED, Quality.VALIDITY_FORCED)
+    return dict.fromkeys((*quiet, Quality.UNKNOWN_COLOUR), "") | {
+        Quality.NO_STOKES: f"star(s) without a result (FLAG 16384){settings}",
+        Quality.BEYOND_FIELD: "star(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)",
+        Quality.BEYOND_SETTINGS: "star(s) with a filter, temperature or TEFF beyond the calibration",
+        Quality.DISAGREES: "star(s) whose intensities disagree with the calibration (FLAG 131072, CHI2): is "
+        "the background subtracted, are the cameras in order?",
+        Quality.PLACE: "star(s) at a place of the field where stars disagree with the calibration together "
+        "(FLAG 1048576): their errors are enlarged",
+        Quality.OTHER_FRAME: "star(s) without ROTATOR, in the frame of the instrument (FLAG 2097152)",
+        Quality.REPEATED: "star(s) with the place and counts of another star or setting (FLAG 4194304)",
+    }
 
 
 def _about_noise(counts: Any, sigma: Any) -> Iterator[str]:

@@ -1,34 +1,57 @@
-"""`walop-jax certify`: is this calibration product fit for use?"""
+"""`walop-jax certify`: is this calibration fit for use? Go or no-go, with what is missing."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Job, Outcome, command
-from walop_jax.commands.inputs import IN_MEMORY, Effects, Product, catalogue_of, folder_of
+from walop_jax.commands.command import Job, Option, Outcome, command
+from walop_jax.commands.inputs import IN_MEMORY, Effects, PathLike, Product, catalogue_of, folder_of
 from walop_jax.io.display import Display, Displayed
-from walop_jax.io.errors import errors_naming
+from walop_jax.io.errors import DataError, errors_naming
 
 if TYPE_CHECKING:
+    from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.certify import Check, Validity
+    from walop_jax.model.effects import EffectKind
+    from walop_jax.science.commissioning import Requirement
+
+DOCUMENT = "commissioning.json"
+FOLDER = Option(f"Folder for {DOCUMENT}; it may be that of the fit.", "RUN", Path, "-o")
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Certificate(Displayed):
-    """The checks of a product, what it may be applied to, its content hash and the SHA-256 of its inputs."""
+    """The checks of a product and what is asked of it for stars, its range of application, hash, and parents.
+
+    `content` is its content hash, `parents` are the SHA-256 of its inputs.
+    """
 
     path: Path
     checks: tuple[Check, ...]
+    requirements: tuple[Requirement, ...]
     validity: Validity
     content: str
     parents: tuple[str, ...]
 
     @property
     def failed(self) -> tuple[Check, ...]:
-        """The checks that do not hold; the product is fit for use if there are none."""
+        """The checks that do not hold; the product is valid if there are none."""
         return tuple(check for check in self.checks if not check.passed)
+
+    @property
+    def go(self) -> bool:
+        """True if the product is valid and everything that is needed is met."""
+        return not self.failed and all(one.met for one in self.requirements if one.needed)
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Advice on requirements that are not met, what is needed first."""
+        ordered = sorted(self.requirements, key=lambda one: not one.needed)
+        return tuple(f"{one.found}: {one.advice}" for one in ordered if not one.met)
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
@@ -36,6 +59,8 @@ class Certificate(Displayed):
 
         return {
             "product": str(self.path),
+            "go": self.go,
+            "requirements": [dataclasses.asdict(one) for one in self.requirements],
             "valid": not self.failed,
             "schema": PRODVERS,
             "content": self.content,
@@ -45,18 +70,34 @@ class Certificate(Displayed):
         }
 
     def display(self) -> Display:
-        """Every check, and the verdict."""
+        """Go or no-go, a line for each check and requirement, and what is missing."""
         rows = [("ok" if check.passed else "FAILED", check.name, check.found) for check in self.checks]
-        verdict = "NOT fit for use" if self.failed else "fit for use"
-        return Display(f"{self.path}: {verdict}", head=("", "check", "found"), rows=tuple(rows))
+        rows += [
+            ("ok", one.what, one.found) if one.met else ("NO" if one.needed else "no", one.what, one.found)
+            for one in self.requirements
+        ]
+        title = f"{self.path}: {'go' if self.go else 'NO GO'}"
+        return Display(title, head=("", "asked", "found"), rows=tuple(rows), notes=self.missing)
 
 
-@command()
-def certify(job: Job, calibration: Product, effects: Effects = None) -> Outcome[Certificate]:
-    """Check a calibration product from its checksums to its physics; exit code 1 if anything does not hold.
+@command(writes=(DOCUMENT,))
+def certify(
+    job: Job,
+    calibration: Product,
+    effects: Effects = None,
+    *,
+    output: Annotated[PathLike | None, FOLDER] = None,
+) -> Outcome[Certificate]:
+    """Check a calibration from its checksums to its physics and its accuracy: go or no-go, with what is missing.
 
     Version, content hash, convergence, covariance, validity (dates, filters, temperatures), hashes of the
-    calibration sets it was made from, maps against parameters, and that no camera has a negative transmission.
+    calibration sets it was made from, maps against parameters, and that no camera has a negative transmission: exit
+    code 1 if any of these does not hold.
+
+    A go needs a fit that converged and explains the data, exposures that are enough for a fit, and p of stars (p ≤ 5 %)
+    known to 0.05 % in half of the field by the calibration alone; else it is a no-go, exit code 3. How well p is known
+    in 95 % of the field, what else the exposures lack, and mistakes that they would not show, are told with what to do.
+    To rehearse a night, give the fit of a set of walop-jax simulate PLAN.
 
     In Python: a `Certificate`. Raises `DataError` for a file that cannot be read, has been changed, or is of another
     version.
@@ -77,10 +118,35 @@ def certify(job: Job, calibration: Product, effects: Effects = None) -> Outcome[
         product, catalogue = read_product(path), catalogue_of(effects)
     with errors_naming(path):
         checks = tuple(checks_of(product, catalogue))
+    rebuilt = any(check.name == "model" and check.passed for check in checks)
+    asked = _requirements(job, calibration, path, catalogue) if rebuilt else ()
     parents = tuple(entry.sha256 for entry in product.inputs)
-    found = Certificate(path, checks, validity(product), product.content_hash(), parents)
-    why = "; ".join(f"{check.name} ({check.found})" for check in found.failed)
+    made = Certificate(path, checks, asked, validity(product), product.content_hash(), parents)
+    why = "; ".join(f"{check.name} ({check.found})" for check in made.failed)
     return Outcome(
-        found,
-        failure=f"{path}: not valid: {why}" if found.failed else "",
+        made,
+        saved_as=DOCUMENT,
+        failure=f"{path}: not valid: {why}" if made.failed else "",
+        trusted=made.go,
     )
+
+
+def _requirements(
+    job: Job, given: Calibration | FitResult | Run | PathLike, path: Path, catalogue: Sequence[EffectKind]
+) -> tuple[Requirement, ...]:
+    """Requirements on a valid product; its exposures are looked at where the data of the run can be found."""
+    from walop_jax import Calibration, FitResult, Run
+    from walop_jax.calibration.product import read_calibration
+    from walop_jax.science.commissioning import requirements
+    from walop_jax.science.field_accuracy import field_accuracy
+
+    job.tell("working out the accuracy of p")
+    if isinstance(given, FitResult):
+        accuracy = field_accuracy(Calibration.from_fit(given)) if given.answer is None else given.answer()
+        return requirements(given.checked_verdict(), given.minimum.message, accuracy, given.calset)
+    if isinstance(given, Calibration):
+        return requirements(given.verdict, "", field_accuracy(given), None)
+    calibration, calset = read_calibration(path, catalogue), None
+    with contextlib.suppress(DataError):
+        calset = Run(path.parent).calset
+    return requirements(calibration.verdict, "", field_accuracy(calibration), calset)

@@ -50,10 +50,10 @@ def cite(
         with errors_naming(path):
             calibration = calibration_of(run if path is None else path, catalogue_of(effects))
             model, filters = calibration.model, calibration.exposures.filter.tolist()
-    found = (*references(model, filters), Reference("fit", minimise.SOURCE))
-    lines = [f"{entry.what}: {entry.source}" for entry in found]
+    sources = (*references(model, filters), Reference("fit", minimise.SOURCE))
+    lines = [f"{entry.what}: {entry.source}" for entry in sources]
     return Outcome(
-        found,
-        lambda: [{"what": entry.what, "source": entry.source} for entry in found],
-        lambda: entries(found, __version__, sampled=sampled) if bibtex else "\n".join(lines),
+        sources,
+        [{"what": entry.what, "source": entry.source} for entry in sources],
+        entries(sources, __version__, sampled=sampled) if bibtex else "\n".join(lines),
     )

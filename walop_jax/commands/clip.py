@@ -64,28 +64,23 @@ def clip(
         )
     with job.repeated() as say:
         say(Stage("fitting", "fitting"))
-        found = clipped(calset, chosen, sigma)
+        flagged = clipped(calset, chosen, sigma)
         # Of too many rows the model lacks something: no need to ask what.
-        result = (
-            found.result.judged() if found.too_many else examined(found.result, job.seed, as_written=True)
-        )
-        found = dataclasses.replace(found, result=result)
+        left = flagged.result
+        result = left.judged() if flagged.too_many else examined(left, job.seed, as_written=True)
     job.begin("writing")
     if output is not None:
-        write_calibration_set(output, found.calset, overwrite=job.overwrite)
-    share = f"{100 * found.share:.2g} %"
-    warnings = [f"the fit of what is left: {sentence}" for sentence in found.result.warnings]
-    if found.too_many:
-        warnings.insert(
-            0,
-            f"{share} of the rows lie off: that is not single intensities but something that the "
-            "model lacks; walop-jax diagnose looks for it",
-        )
-    ratio = found.result.chi2 / max(found.result.dof, 1)
+        write_calibration_set(output, flagged.calset, overwrite=job.overwrite)
+    share = f"{100 * flagged.share:.2g} %"
+    warnings = [f"the fit of what is left: {sentence}" for sentence in result.warnings]
+    if flagged.too_many:
+        text = f"{share} of the rows are outliers: too many to be isolated; the model lacks something"
+        warnings.insert(0, f"{text}; walop-jax diagnose looks for it")
+    ratio = result.chi2 / max(result.dof, 1)
     return Outcome(
-        found,
-        lambda: {"output": str(output), "sigma": sigma, "clipped": found.rows, "used": found.used},
-        lambda: f"{found.rows} of {found.used} rows flagged ({share}), χ²/dof {ratio:.4f}: {output}",
+        dataclasses.replace(flagged, result=result),
+        {"output": str(output), "sigma": sigma, "clipped": flagged.rows, "used": flagged.used},
+        f"{flagged.rows} of {flagged.used} rows flagged ({share}), χ²/dof {ratio:.4f}: {output}",
         warnings=warnings,
-        trusted=found.result.trusted and not found.too_many,
+        trusted=result.trusted and not flagged.too_many,
     )

@@ -7,24 +7,26 @@ and the command of the program, whose options are the annotated parameters (`pro
 
 from __future__ import annotations
 
+import builtins
 import contextlib
 import dataclasses
 import functools
 import inspect
 import logging
 import os
+import sys
 import time
+import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
-from walop_jax.commands import door
 from walop_jax.io.progress import Stage, repeated
 
 if TYPE_CHECKING:
+    from walop_jax.io.display import Display
     from walop_jax.io.folder import OutputFolder
 
-CACHE_VARIABLE = "WALOP_JAX_CACHE"
 LOG = logging.getLogger("walop_jax")
 """Of calls in Python: progress (INFO), and the warnings of a result; silent unless the caller sets it up."""
 LOG.addHandler(logging.NullHandler())
@@ -33,7 +35,7 @@ T = TypeVar("T")
 Tell = Callable[[str], None]
 Writers = Mapping[str, Callable[[Path], object] | None]
 """Writers of files by name; None: this result has no such file."""
-Given = Callable[[tuple[Any, ...], dict[str, Any]], tuple[tuple[Any, ...], dict[str, Any]]]
+PathLike = str | os.PathLike[str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +116,9 @@ class Job:
     def use_jax(self) -> None:
         """Switch JAX on, for commands that most often do without it."""
         if self.typed:
-            switch_on_jax()
+            from walop_jax.model.compiled import switch_on
+
+            switch_on()
 
 
 def text_file(text: str) -> Callable[[Path], object]:
@@ -129,19 +133,23 @@ def figure_file(figure: Any) -> Callable[[Path], object]:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome(Generic[T]):
-    """Result of a command: `value` for Python; the rest is worked out when it is asked for.
+    """Result of a command: `value` for Python, and what the program prints and writes of it.
 
-    `document` is the result as plain data, `text` as a terminal shows it: what the value says of itself, unless given.
-    `files` write the files of the output folder,
-    each given its path; the document is written as the file `saved_as`. `warnings` are sentences to bear in mind.
-    `failure` says what has gone wrong (exit code 1), `trusted` whether the result can be used (exit code 3 if not).
-    `next` are command lines that one might want to type next. `markdown`: the text is laid out
-    on a terminal.
+    `document` is plain data (None: what the value gives), to which `extra` is added; `display` is shown on a terminal
+    (None: that of the value), with the text `below` it; `text` is printed in its place. `files` write the files of the
+    output folder, each given its path; the document is written as the file `saved_as`, with what is displayed.
+    `warnings` are sentences to bear in mind. `failure` says what has gone wrong (exit code 1), `trusted` whether the
+    result can be used (exit code 3 if not). `next` are command lines that one might want to type next. `markdown`: the
+    text is laid out on a terminal.
     """
 
     value: T
-    document: Callable[[], Any] | None = None
-    text: Callable[[], str] | None = None
+    document: Any = None
+    text: str | None = None
+    _: dataclasses.KW_ONLY
+    extra: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    display: Display | None = None
+    below: str = ""
     files: Callable[[], Writers] = dict
     saved_as: str = ""
     warnings: Sequence[str] = ()
@@ -154,12 +162,25 @@ class Outcome(Generic[T]):
     def content(self) -> Any:
         """The document, made once."""
         value: Any = self.value
-        return (self.document or value.document)()
+        plain = value.document() if self.document is None else self.document
+        return {**plain, **self.extra} if self.extra else plain
 
-    def shown(self) -> str:
-        """The text."""
+    @functools.cached_property
+    def shown(self) -> Display:
+        """The display: as given, or of the value."""
         value: Any = self.value
-        return value.display().text() if self.text is None else self.text()
+        return self.display or value.display()
+
+    def printed(self) -> str:
+        """The text for a terminal."""
+        if self.text is not None:
+            return self.text
+        return "\n".join(filter(None, (self.shown.text(), self.below)))
+
+    def saved_document(self) -> dict[str, Any]:
+        """The document with what is displayed, if anything is."""
+        displayed = self.display is not None or hasattr(self.value, "display")
+        return {**self.content, **({"shown": self.shown.document()} if displayed else {})}
 
     def save(self, folder: OutputFolder, drop: Sequence[str] = ()) -> Outcome[T]:
         """Put all files into the output folder, together; gives the outcome, a failure where one was not written."""
@@ -175,7 +196,7 @@ class Outcome(Generic[T]):
                     if write is not None:
                         write(temporary / name)
                 if self.saved_as:
-                    text_file(json_text(self.content))(temporary / self.saved_as)
+                    text_file(json_text(self.saved_document()))(temporary / self.saved_as)
         except NotWrittenError as error:
             return dataclasses.replace(self, failure=self.failure or str(error))
         return self
@@ -191,8 +212,29 @@ COMMON = {
 }
 """The parameters that every command takes in Python, with their defaults, and their options."""
 
-OLDER = {"catalogue": "effects", "estimator": "debias", "filter_name": "filter"}
-"""Names that arguments have had, and have still."""
+OF_MODELS = ("free", "fixed", "fix", "frozen", "start", "prior", "priors", "tie", "ties", "bounds")
+IN_THE_MODEL = (
+    "the model says that of its parameters: model=base_model(calset).change('half1.wedge', free=False)"
+)
+"""Advice on arguments that users of other fitting programs expect."""
+
+
+class _Names(dict[str, Any]):
+    """The names of an annotation; what is imported for type checkers alone stands in as a class of that name."""
+
+    def __missing__(self, name: str) -> Any:
+        return getattr(builtins, name, None) or type(name, (), {"__module__": "walop_jax"})
+
+
+def _annotation(function: Callable[..., Any], parameter: inspect.Parameter) -> tuple[Any, Option | None]:
+    """The kind of a parameter and its option, with nothing heavy loaded."""
+    names = _Names({"Any": Any, "Mapping": Mapping, "PathLike": PathLike, "Sequence": Sequence})
+    names.update(vars(sys.modules[function.__module__]))
+    noted = eval(parameter.annotation, {}, names)
+    kind, *notes = typing.get_args(noted) if typing.get_origin(noted) is Annotated else (noted,)
+    if isinstance(kind, typing.ForwardRef):
+        kind = eval(kind.__forward_arg__, {}, names)
+    return kind, next((note for note in reversed(notes) if isinstance(note, Option)), None)
 
 
 @dataclasses.dataclass
@@ -202,7 +244,6 @@ class Command(Generic[T]):
     `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
     "file" if `output` is a single file; () if the body looks after its outputs itself. `random`: its seed matters.
     `jax`: it computes. `elements`: it takes kinds of elements of one's own, as commands with `effects` do anyway.
-    `given` may rearrange the arguments of a call in Python.
     """
 
     body: Callable[..., Outcome[T]]
@@ -211,15 +252,14 @@ class Command(Generic[T]):
     random: bool = False
     jax: bool = True
     elements: bool = False
-    given: Given | None = None
 
     def __post_init__(self) -> None:
         self.name = self.body.__name__
-        self.own = tuple(inspect.signature(self.body).parameters.values())[1:]
-        notes = {p.name: getattr(door.annotation(self.body, p), "__metadata__", ()) for p in self.own}
-        self.options = {
-            name: note for name, found in notes.items() for note in found if isinstance(note, Option)
-        }
+        self.own, self.options = [], {}
+        for p in list(inspect.signature(self.body).parameters.values())[1:]:
+            kind, option = _annotation(self.body, p)
+            self.own.append(p.replace(annotation=kind))
+            self.options |= {} if option is None else {p.name: option}
         self.elements |= "effects" in self.options
         if self.elements:
             self.options["elements"] = ELEMENTS
@@ -227,17 +267,39 @@ class Command(Generic[T]):
     @functools.cached_property
     def signature(self) -> inspect.Signature:
         """The signature of the Python function: its own arguments, then those that all commands share."""
-        own = [p.replace(annotation=door.kind_in_short(self.body, p)) for p in self.own]
+        shared: dict[str, tuple[Any, Any]] = {"elements": (None, PathLike | Sequence[type] | None)}
+        shared |= {
+            "overwrite": (False, bool),
+            "progress": (None, Callable[[str], None] | None),
+            "seed": (0, int),
+        }
+        absent = {"elements": not self.elements, "overwrite": self.writes is None}
         keyword = inspect.Parameter.KEYWORD_ONLY
-        kind = "PathLike | Sequence[type] | None"
-        elements = [inspect.Parameter("elements", keyword, default=None, annotation=kind)]
-        shared = [
+        added = (
             inspect.Parameter(name, keyword, default=default, annotation=kind)
-            for (name, (default, _)), kind in zip(COMMON.items(), ("bool", "Tell | None", "int"), strict=True)
-            if name != "overwrite" or self.writes is not None
-        ]
-        rest = [own.pop()] if own and own[-1].kind is inspect.Parameter.VAR_KEYWORD else []
-        return inspect.Signature([*own, *elements * self.elements, *shared, *rest])
+            for name, (default, kind) in shared.items()
+            if not absent.get(name)
+        )
+        return inspect.Signature([*self.own, *added])
+
+    def bound(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> dict[str, Any]:
+        """The arguments of a call by name, with defaults. Raises TypeError, in a sentence, for what does not fit."""
+        names = self.signature.parameters
+        for key in kwargs:
+            if key not in names:
+                from walop_jax.io.errors import nearest
+
+                advice = IN_THE_MODEL if key in OF_MODELS and "model" in names else nearest(key, names)
+                raise TypeError(f"{self.name}: there is no argument {key!r}; {advice}")
+        try:
+            call = self.signature.bind(*args, **kwargs)
+        except TypeError as error:
+            raise TypeError(f"{self.name}: {error}; the arguments are {', '.join(names)}") from None
+        for key, value in call.arguments.items():
+            if isinstance(value, str) and names[key].annotation in (bool, int, float, float | None):
+                raise TypeError(f"{self.name}: {key} is the text {value!r}; give a number")
+        call.apply_defaults()
+        return dict(call.arguments)
 
     @functools.cached_property
     def function(self) -> Callable[..., T]:
@@ -246,14 +308,7 @@ class Command(Generic[T]):
         def call(*args: Any, **kwargs: Any) -> T:
             from walop_jax.model.compiled import float64
 
-            if self.given is not None:
-                args, kwargs = self.given(args, kwargs)
-            names = self.signature.parameters
-            kwargs = {
-                OLDER[name] if name not in names and OLDER.get(name) in names else name: value
-                for name, value in kwargs.items()
-            }
-            arguments = door.bound(self.name, self.signature, self.body, args, kwargs)
+            arguments = self.bound(args, kwargs)
             shared = {name: arguments.pop(name) for name in COMMON if name in arguments}
             tell = shared["progress"] or _silent
 
@@ -263,12 +318,12 @@ class Command(Generic[T]):
 
             shared["progress"] = logged
             with float64():
-                found = self.run(Job(**shared), arguments)
-            for sentence in found.warnings:
+                outcome = self.run(Job(**shared), arguments)
+            for sentence in outcome.warnings:
                 LOG.warning("%s", sentence)
-            if found.failure:
-                LOG.error("%s", found.failure)
-            return found.value
+            if outcome.failure:
+                LOG.error("%s", outcome.failure)
+            return outcome.value
 
         functools.update_wrapper(call, self.body)
         del call.__dict__["__wrapped__"]
@@ -280,39 +335,19 @@ class Command(Generic[T]):
 
     def run(self, job: Job, arguments: dict[str, Any]) -> Outcome[T]:
         """Do the work, with results written as they are asked for."""
-        load_elements(arguments.pop("elements", None))
+        if (elements := arguments.pop("elements", None)) is not None:
+            from walop_jax.model.elements import load_elements
+
+            load_elements(elements)
         output = arguments.get("output")
         if self.writes == "file" and output is not None:
             from walop_jax.io.atomic import check_output
 
             check_output(output, overwrite=job.overwrite)
         names = () if self.writes is None or self.writes == "file" else self.writes
-        rest = [p.name for p in self.own if p.kind is inspect.Parameter.VAR_KEYWORD]
-        more = {name: value for key in rest for name, value in arguments.pop(key, {}).items()}
         with job.reserved(output if names else None, names) as reserved:
-            found = self.body(reserved, **arguments, **more)
-            return found if reserved.folder is None else found.save(reserved.folder)
-
-
-def load_elements(given: str | os.PathLike[str] | Sequence[type] | None) -> None:
-    """Run the file of kinds of elements of one's own: what is defined is known (`model.elements.defined_elements`).
-
-    Raises `DataError` for a file that defines none, TypeError for a class that is none.
-    """
-    if given is None:
-        return
-    from walop_jax.io.code import classes_of
-    from walop_jax.io.errors import fail
-    from walop_jax.model.elements import Element
-
-    if isinstance(given, str | os.PathLike):
-        advice = "give a Python file with subclasses of Element (walop-jax docs adding-an-instrument)"
-        if not any(vars(kind).get("kind") for kind in classes_of(given, Element, advice).values()):
-            raise fail("defines no kind of element", file=given, advice=advice)
-        return
-    for kind in given:
-        if not (isinstance(kind, type) and issubclass(kind, Element)):
-            raise TypeError(f"elements: {kind!r} is no class of elements, a subclass of Element")
+            outcome = self.body(reserved, **arguments)
+            return outcome if reserved.folder is None else outcome.save(reserved.folder)
 
 
 def command(**options: Any) -> Callable[[Callable[..., Outcome[T]]], Callable[..., T]]:
@@ -326,40 +361,3 @@ def command(**options: Any) -> Callable[[Callable[..., Outcome[T]]], Callable[..
 def command_of(function: Callable[..., T]) -> Command[T]:
     """The command that a Python function belongs to."""
     return vars(function)["command"]
-
-
-# --------------------------------------------------------------------------------------------- the compiled programs
-
-
-def cache_folder() -> Path | None:
-    """Folder of compiled code that is kept between runs; None when that is switched off or impossible.
-
-    WALOP_JAX_CACHE names the folder ("off": none), otherwise it is walop-jax/xla in the user's cache folder.
-    """
-    chosen = os.environ.get(CACHE_VARIABLE, "")
-    if chosen.lower() in ("off", "0", "none"):
-        return None
-    try:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = Path(chosen) if chosen else Path(base) / "walop-jax" / "xla"
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # no home
-        return None
-    return folder if os.access(folder, os.W_OK | os.X_OK) else None
-
-
-def switch_on_jax() -> None:
-    """Import JAX with float64 and with the cache of compiled code, which makes later runs start fast."""
-    import jax
-
-    from walop_jax.model import compiled
-
-    jax.config.update("jax_enable_x64", True)
-    folder = cache_folder()
-    if folder is not None:
-        with contextlib.suppress(OSError):
-            (folder / compiled.FOLDER).mkdir(exist_ok=True)
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-        jax.config.update("jax_raise_persistent_cache_errors", False)

@@ -91,23 +91,21 @@ def compare(
     else:
         joint, trusted, warnings = held, held.verdict.trusted, held.warnings
     job.tell("fitting and judging the polynomials", "judging")
-    found = comparison_of(calset, joint, truth, filter, job.seed)
+    compared = comparison_of(calset, joint, truth, filter, job.seed)
     lost = joint.left_behind
 
     def files() -> Writers:
-        drawn = {name: getattr(paper_figures, f"{name}_figure")(found) for name in FIGURES}
-        columns = {name: (values, "", about) for name, (values, about) in found.columns().items()}
+        drawn = {name: getattr(paper_figures, f"{name}_figure")(compared) for name in FIGURES}
+        columns = {name: (values, "", about) for name, (values, about) in compared.columns().items()}
         table = astropy_table(columns, left_out_cards(lost))
-        return {
-            TABLE: lambda path: write_table(path, table),
-            **{f"comparison_{name}.png": figure_file(figure) for name, figure in drawn.items()},
-        }
+        pictures = {f"comparison_{name}.png": figure_file(figure) for name, figure in drawn.items()}
+        return {TABLE: lambda path: write_table(path, table), **pictures}
 
     return Outcome(
-        found,
-        lambda: found.document() | {"trusted": trusted, NOT_CARRIED_OVER: list(lost)},
-        lambda: f"{found.display().text()}\n{output}",
-        files,
+        compared,
+        extra={"trusted": trusted, NOT_CARRIED_OVER: list(lost)},
+        below=str(output),
+        files=files,
         saved_as=DOCUMENT,
         trusted=trusted,
         warnings=(

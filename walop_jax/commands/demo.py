@@ -34,14 +34,14 @@ def demo(job: Job, *, output: Annotated[PathLike, FOLDER] = "walop-jax-demo") ->
     folder.mkdir(parents=True, exist_ok=True)
     calset, run = folder / SET, folder / "RUN"
     shutil.copyfile(_shipped(), calset)
-    found = command_of(refit).run(job, {"data": [calset], "output": run})
-    page = command_of(report).run(job, {"run": run})
+    fit = command_of(refit).run(job, {"data": [calset], "output": run})
+    page = command_of(report).run(job, {"run": run}).value.path
     return Outcome(
-        found.value,
-        lambda: {"run": str(run), "page": str(page.value.path), "summary": found.content},
-        lambda: f"{found.shown()}\nThe page about it: {page.value.path}",
-        warnings=found.warnings,
-        trusted=found.trusted,
+        fit.value,
+        {"run": str(run), "page": str(page), "summary": fit.content},
+        f"{fit.printed()}\nThe page about it: {page}",
+        warnings=fit.warnings,
+        trusted=fit.trusted,
         next=(
             f"walop-jax matrix {run} --x 0.1 --y 0.2",
             f"walop-jax diagnose {calset} -o {folder}/DIAGNOSIS",

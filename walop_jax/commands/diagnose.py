@@ -77,27 +77,24 @@ def diagnose(
 
     def files() -> Writers:
         job.tell("mapping the field", "mapping")
-        product = Calibration.from_fit(after)
+        product, drawn_from = Calibration.from_fit(after), figure_data(found)
         misfit = None if after.explains_data else describe(after)
         fitted = summary(after, seconds=job.seconds, misfit=misfit) | {"seed": job.seed}
-        drawn_from = figure_data(found)
         return {
             PRODUCT: lambda path: write_calibration(path, product),
-            SUMMARY: text_file(json_text(fitted)),
+            SUMMARY: text_file(json_text(fitted | {"shown": after.display().document()})),
             FIGURE_DATA: lambda path: write_figure_data(path, drawn_from),
             MODEL: text_file(render(after.model)),
         }
 
     return Outcome(
         found,
-        lambda: document(found),
-        lambda: (
-            f"{_with_answer(found, after).text()}\n"
-            f"The calibration can{'' if usable else 'not'} be trusted; written to {output}."
-        ),
-        files,
+        document(found),
+        display=_with_answer(found, after),
+        below=f"The calibration can{'' if usable else 'not'} be trusted; written to {output}.",
+        files=files,
         saved_as=DIAGNOSIS,
-        warnings=found.after.warnings,
+        warnings=after.warnings,
         trusted=usable,
         next=(f"walop-jax report {output}", *[f"walop-jax apply {output} STARS.fits -o OUT.fits"] * usable),
     )

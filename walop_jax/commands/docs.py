@@ -47,8 +47,8 @@ def docs(
         )
     return Outcome(
         text,
-        lambda: {"topic": topic, "name": name, "text": text},
-        lambda: text,
+        {"topic": topic, "name": name, "text": text},
+        text,
         markdown=topic is not None and (name is not None or topic not in SINGLE),
     )
 

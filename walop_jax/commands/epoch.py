@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import (
-    SETS,
-    Effects,
-    PathLike,
-    calibration_of,
-    catalogue_of,
-    set_of,
-)
+from walop_jax.commands.inputs import SETS, Effects, PathLike, calibration_of, catalogue_of, set_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
@@ -78,13 +72,11 @@ def epoch(
         if lacking is not None and lacking.after.trusted:
             result = lacking.after
             found = compared(held, result)
-
-    def text() -> str:
-        shown = found.display().text()
-        if lacking is None:
-            return shown
+    shown = found.display()
+    if lacking is not None:
         named = ", ".join(step.effect for step in lacking.steps) or "nothing that has a name"
-        return f"{shown}\nwhat the old model lacks: {named} ({lacking.verdict})"
+        lacks = f"what the old model lacks: {named} ({lacking.verdict})"
+        shown = dataclasses.replace(shown, notes=(*shown.notes, lacks))
 
     def files() -> Writers:
         product = Calibration.from_fit(result)
@@ -92,19 +84,17 @@ def epoch(
 
     return Outcome(
         found,
-        lambda: (
-            {
-                "old": held.content_hash(),
-                "old_file": held.path,
-                "old_date": held.date,
-                "new": [entry.sha256 for entry in calset.inputs],
-                "new_files": [str(entry.path) for entry in calset.inputs],
-            }
-            | found.document()
-            | {"diagnosis": None if lacking is None else document(lacking)}
-        ),
-        text,
-        files,
+        {
+            "old": held.content_hash(),
+            "old_file": held.path,
+            "old_date": held.date,
+            "new": [entry.sha256 for entry in calset.inputs],
+            "new_files": [str(entry.path) for entry in calset.inputs],
+            **found.document(),
+            "diagnosis": None if lacking is None else document(lacking),
+        },
+        display=shown,
+        files=files,
         saved_as=OUTPUTS[1],
         warnings=[f"the new fit: {w}" if w in result.warnings else w for w in found.warnings],
         trusted=found.holds,

@@ -71,12 +71,8 @@ def import_zemax(
         "rows": made.intensities.rows,
         "remarks": list(made.remarks),
     }
-    return Outcome(
-        made,
-        lambda: document,
-        lambda: (
-            f"{output}: {made.instrument}, {len(document['wavelengths'])} wavelengths, {document['exposures']} "
-            f"exposures of {document['points']} points, {document['rows']} rows to use"
-        ),
-        warnings=made.remarks,
+    text = (
+        f"{output}: {made.instrument}, {len(document['wavelengths'])} wavelengths, {document['exposures']} exposures "
+        f"of {document['points']} points, {document['rows']} rows to use"
     )
+    return Outcome(made, document, text, warnings=made.remarks)

@@ -1,19 +1,19 @@
 """Arguments that several commands take, on the command line and in Python, and their readers.
 
-Sets, models, calibrations and tables may be given in memory or as files; `read` is the door for whatever the program
-has written.
+Sets, models, calibrations and tables may be given in memory or as files; `read` reads whatever the program has written.
+What is given in place of one of them is a TypeError: what it is, and what to give.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+import reprlib
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, load_elements
-from walop_jax.commands.door import PathLike
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError
 from walop_jax.io.errors import DataError, errors_naming, fail
 from walop_jax.io.text import in_ascii, read_text
 
@@ -91,13 +91,13 @@ TableFile = Annotated[
 def read(
     *paths: PathLike,
     kinds: Collection[str] = (),
-    catalogue: Effects = None,
+    effects: Effects = None,
     elements: PathLike | Sequence[type] | None = None,
 ) -> CalibrationSet | Calibration | Run:
     """Read calibration sets (several become one), a calibration product, or the folder of a run.
 
-    `kinds` are kinds of exposures beyond those of the format, `catalogue` the effects that a fitted model may have,
-    `elements` kinds of elements of your own, or the file that defines them.
+    `kinds` are kinds of exposures beyond those of the format, `effects` and `elements` effects and kinds of elements of
+    your own that a fitted model may have, or the file that defines them.
     Raises `DataError`, naming file, extension, column and row, for what cannot be read or trusted.
 
     >>> walop.read("night.fits").instrument
@@ -108,18 +108,20 @@ def read(
     from walop_jax.data.calset import read_calibration_set
     from walop_jax.io.fits_reading import primary_keywords
     from walop_jax.io.names import DOCUMENTS, FAILED, PRODUCT
+    from walop_jax.model.elements import load_elements
 
-    load_elements(elements)
+    if elements is not None:
+        load_elements(elements)
     if not paths:
         raise fail("no file was given", advice="name a calibration set, a calibration product or a run")
-    first = Path(paths[0])
+    first = path_of(paths[0], "a file", "the path of a set, a product or a run")
     if len(paths) == 1 and first.is_dir():
         if not any((first / name).exists() for name in (*DOCUMENTS.values(), PRODUCT)):
             what = f"holds no results{', its fit did not converge' if (first / FAILED).exists() else ''}"
             raise fail(what, file=first, advice="give the RUN of a command, or a FITS file")
-        return Run(first, catalogue_of(catalogue))
+        return Run(first, catalogue_of(effects))
     if len(paths) == 1 and "PRODVERS" in primary_keywords(first):
-        return read_calibration(first, catalogue_of(catalogue))
+        return read_calibration(first, catalogue_of(effects))
     return read_calibration_set(*paths, kinds=kinds)
 
 
@@ -132,17 +134,24 @@ def catalogue_of(effects: Effects) -> tuple[EffectKind, ...]:
     return tuple(effects)
 
 
+def path_of(given: Any, what: str, advice: str) -> Path:
+    """A path. Raises TypeError for what is none and stands for `what`; `advice` says what to give."""
+    if not isinstance(given, str | os.PathLike):
+        raise TypeError(f"{reprlib.repr(given)} is not {what}; give {advice}")
+    return Path(given)
+
+
 def design_of(instrument: InstrumentLike) -> Instrument | None:
     """The instrument as designed: as given, or read, also from a run or a product; None if nothing was given."""
     from walop_jax import Instrument
     from walop_jax.model.elements import defined_elements
 
-    if isinstance(instrument, str | os.PathLike):
-        path = Path(instrument)
-        if path.is_dir() or path.suffix == ".fits":
-            return calibration_of(path).design
-        return Instrument.read(instrument, elements=defined_elements())
-    return instrument
+    if instrument is None or isinstance(instrument, Instrument):
+        return instrument
+    path = path_of(instrument, "an instrument", "its name, its description file, or an Instrument")
+    if path.is_dir() or path.suffix == ".fits":
+        return calibration_of(path).design
+    return Instrument.read(instrument, elements=defined_elements())
 
 
 def paths_of(data: Sets) -> tuple[PathLike, ...]:
@@ -154,7 +163,11 @@ def paths_of(data: Sets) -> tuple[PathLike, ...]:
         if not paths:
             raise ValueError("a run is made from files: write the set first, walop_jax.write_calibration_set")
         return paths
-    return (data,) if isinstance(data, str | os.PathLike) else tuple(data)
+    given: Any = data if isinstance(data, list | tuple) else (data,)
+    advice = "a set, the path of one (FITS), or several paths in a list"
+    for one in given:
+        path_of(one, "a calibration set", advice)
+    return tuple(given)
 
 
 def set_of(data: Sets, instrument: Instrument | None = None) -> CalibrationSet:
@@ -190,7 +203,9 @@ def set_and_model(
     from walop_jax import Instrument, Model
     from walop_jax.fit.model_file import model_for
 
-    text = read_text(model) if isinstance(model, str | os.PathLike) else ""
+    text = ""
+    if model is not None and not isinstance(model, Model):
+        text = read_text(path_of(model, "a model", "base_model(calset), or the path of a model file"))
     if output is not None:
         if isinstance(model, Model) or isinstance(instrument, Instrument):
             raise ValueError(
@@ -205,9 +220,9 @@ def set_and_model(
             "fit it in Python, without output"
         )
     if isinstance(model, Model):
-        known = model.catalogue if effects is None else catalogue_of(effects)
-        return calset, dataclasses.replace(model, catalogue=known)
-    with errors_naming(model):
+        catalogue = model.catalogue if effects is None else catalogue_of(effects)
+        return calset, dataclasses.replace(model, catalogue=catalogue)
+    with errors_naming(model):  # a path, or None
         return calset, model_for(calset, text, design, catalogue_of(effects))
 
 
@@ -248,7 +263,7 @@ def save(
     with output_folder(folder, names, overwrite=overwrite) as out, out.filled() as there:
         write_calibration(there / PRODUCT, product)
         if isinstance(held, FitResult):
-            content = summary(held, seconds=held.seconds)
+            content = summary(held, seconds=held.seconds) | {"shown": held.display().document()}
             (there / SUMMARY).write_text(json_text(content), encoding="utf-8")
 
 
@@ -256,7 +271,9 @@ def folder_of(run: Run | PathLike) -> Path:
     """The folder of a run, or whatever else a path names."""
     from walop_jax import Run
 
-    return run.folder if isinstance(run, Run) else Path(run)
+    if isinstance(run, Run):
+        return run.folder
+    return path_of(run, "a run or a calibration", "a fit, a Run, or the path of a folder or a product")
 
 
 def angles_of(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float]:
@@ -290,11 +307,6 @@ def table_of(given: Any, columns: Mapping[str, Any]) -> InputTable:
     return made
 
 
-def in_bytes(memory: float | None) -> float | None:
-    """Memory in bytes, of what is given in GB; numbers from a million on are bytes already."""
-    return memory if memory is None or memory >= 1e6 else memory * GIGABYTE
-
-
 def left_out_sentences(names: Sequence[str], source: PathLike | None = None) -> tuple[str, ...]:
     """A sentence for every effect that cannot be carried over; `source` is the file that the model comes from."""
     where = "" if source is None else f"{os.fspath(source)}: "
@@ -317,28 +329,23 @@ def table_outcome(
     cards: Mapping[str, Any],
     output: PathLike | None,
     *,
-    flag: Any,
-    told: Mapping[Quality, str],
-    untold: Sequence[Quality],
-    lost: Sequence[str],
-    text: Callable[[Mapping[Quality, int]], str],
-    more: Mapping[str, Any] | None = None,
+    counted: Mapping[Quality, str],
     warnings: Sequence[str] = (),
+    extra: Mapping[str, Any] | None = None,
 ) -> Outcome[Any]:
     """A table with what a calibration adds to it, written if it has an output.
 
-    `flag` are the bits of its rows: those `told` have a warning each, those `untold` are counted only. `lost` are the
-    effects that could not be carried over, `more` goes into the document, `text` is given the counts. Columns of the
-    table that are not used or are replaced are named.
+    The bits of FLAG that are `counted` have a warning each, unless it is empty; `extra` goes into the document. Columns
+    of the table that are not used or are replaced are named.
     """
     from walop_jax.data.user_tables import extended
     from walop_jax.io.plain_tables import write_table
 
-    cards = {**cards, **left_out_cards(lost)}
-    made = extended(table, columns, cards)
+    lost = held.left_behind
+    made = extended(table, columns, {**cards, **left_out_cards(lost)})
     if output is not None:
         write_table(output, made, overwrite=job.overwrite)
-    counts = {bit: int((flag & bit > 0).sum()) for bit in sorted((*told, *untold))}
+    counts = {bit: int((columns["FLAG"][0] & bit > 0).sum()) for bit in sorted(counted)}
     remarks = table.about(columns)
     document = {
         "output": output,
@@ -348,16 +355,15 @@ def table_outcome(
         "product": held.content_hash(),
         NOT_CARRIED_OVER: list(lost),
         "remarks": list(remarks),
-        **(more or {}),
+        **(extra or {}),
     }
+    about = (f"{counts[bit]} {sentence}" for bit, sentence in counted.items() if sentence and counts[bit])
     return Outcome(
         made,
-        lambda: document,
-        lambda: text(counts),
+        document,
         warnings=(
             *held.warnings,
             *left_out_sentences(lost, held.path),
-            *(f"{table.path}: {sentence}" for sentence in (*remarks, *warnings)),
-            *(f"{table.path}: {counts[bit]} {sentence}" for bit, sentence in told.items() if counts[bit]),
+            *(f"{table.path}: {sentence}" for sentence in (*remarks, *warnings, *about)),
         ),
     )

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Outcome, command
 from walop_jax.commands.inputs import IN_MEMORY, SETS, Sets, paths_of
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError
-from walop_jax.io.text import rounded
 
 if TYPE_CHECKING:
     from walop_jax.data.inspection import Inspection
@@ -48,58 +46,7 @@ class InspectedSets(Displayed):
 
     def displays(self) -> list[Display]:
         """Every inspection."""
-        return [_display(one) for one in self.inspections]
-
-
-def _display(found: Inspection) -> Display:
-    low_x, high_x, low_y, high_y = found.field
-    counted = math.isfinite(found.median_counts)
-    apart = "; standards are measured at places of their own" if found.sources else ""
-    some = f" at {found.looked_at} points looked at" if found.looked_at < found.points else ""
-    place = (found.instrument, found.telescope)
-    noise = f"{found.noise_ratio**0.5:.4g} × the photon noise √N (median)"
-    return Display(
-        title=", ".join(found.files) or IN_MEMORY,
-        facts=(
-            ("instrument", f"{', '.join(filter(None, place))} ({found.origin or 'origin not stated'})"),
-            (
-                "field points",
-                f"{found.points}, X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
-            ),
-            ("cameras", str(found.cameras)),
-            ("polariser angles", f"{len(found.angles)} modulo 180°, widest gap {found.widest_gap:.3g}°"),
-            *(
-                (f"element {use.prefix}", f"in {use.exposures} exposures, {len(use.angles)} angles")
-                for use in found.elements
-            ),
-            (
-                "used",
-                f"{found.rows} of {found.possible} (exposure, point) pairs{some}{apart}",
-            ),
-            ("flagged", ", ".join(f"{count} {name}" for name, count in found.flags.items()) or "none"),
-            (
-                "median counts",
-                f"{rounded(found.median_counts)} electrons" if counted else "none: all KIND flux",
-            ),
-            ("errors", noise if counted else "as stated"),
-            ("standards", ", ".join(found.sources) or "none"),
-            ("filters", ", ".join(found.filters)),
-        ),
-        head=("kind", "filter", "calibration plate", "source", ">exposures", ">angles", ">used"),
-        rows=tuple(
-            (
-                group.kind,
-                group.filter,
-                group.calibration_plate,
-                group.teff,
-                str(group.exposures),
-                str(group.angles) if group.angles else "",
-                f"{100 * group.used:.0f} %",
-            )
-            for group in found.groups
-        ),
-        notes=tuple(f"{finding.severity} {finding}" for finding in found.findings) or ("nothing is wrong",),
-    )
+        return [one.display() for one in self.inspections]
 
 
 @command(jax=False)
@@ -145,8 +92,7 @@ def inspect(
     found = InspectedSets(tuple(sets), joint, tuple(faults))
     return Outcome(
         found,
-        found.document,
-        lambda: "\n".join(one.text() for one in found.displays()),
+        text="\n".join(one.text() for one in found.displays()),
         failure="; ".join(faults),
         next=("walop-jax refit CALSET --instrument FILE.toml -o RUN",) if strange else (),
     )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command, figure_file
+from walop_jax.commands.command import Argument, Job, Option, Outcome, command, figure_file
 from walop_jax.commands.inputs import (
     Effects,
     InstrumentLike,
@@ -65,14 +65,11 @@ def limits(
     from walop_jax.simulation.simulate import as_planned
 
     job.begin("reading")
-    asked = None if effects is None else catalogue_of(effects)
     plan = data if isinstance(data, ObservingPlan) else None
-    if (
-        isinstance(data, str | os.PathLike | Sequence)
-        and len(paths_of(data)) == 1
-        and is_plan(paths_of(data)[0])
-    ):
-        plan = read_plan(paths_of(data)[0], instrument)  # pyright: ignore[reportArgumentType]
+    if isinstance(data, str | os.PathLike | Sequence):
+        paths = paths_of(data)
+        if len(paths) == 1 and is_plan(paths[0]):
+            plan = read_plan(paths[0], instrument)  # pyright: ignore[reportArgumentType]
     if isinstance(data, FitResult):
         result = data
     else:
@@ -82,34 +79,28 @@ def limits(
         result = examined(refit(calset, chosen, progress=job.progress), job.seed)
     if not result.converged:
         raise ValueError(f"the fit did not converge ({result.minimum.message})")
+    asked = None if effects is None else catalogue_of(effects)
     found = detection_limits(result, catalogue=asked, seed=job.seed, progress=job.progress)
-
-    def files() -> Writers:
-        return {
-            OUTPUTS[1]: figure_file(protection_figure(found)),
-            OUTPUTS[2]: figure_file(separation_figure(found)),
-        }
-
+    suggested = output is not None and (
+        f"walop-jax report {output}",
+        *_plan(data, output, instrument, result),
+    )
     return Outcome(
         found,
-        lambda: (
-            found.document()
-            | {
-                "instrument": result.model.name,
-                "effects_of_the_model": list(result.model.effect_names),
-                "inputs": [
-                    {"path": str(entry.path), "sha256": entry.sha256} for entry in result.calset.inputs
-                ],
-                "plan": None if plan is None else plan.document(),
-                "trusted": result.trusted,
-                "seed": job.seed,
-            }
-        ),
-        files=files,
+        extra={
+            "instrument": result.model.name,
+            "effects_of_the_model": list(result.model.effect_names),
+            "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in result.calset.inputs],
+            "plan": None if plan is None else plan.document(),
+            "trusted": result.trusted,
+            "seed": job.seed,
+        },
+        files=lambda: {
+            OUTPUTS[1]: figure_file(protection_figure(found)),
+            OUTPUTS[2]: figure_file(separation_figure(found)),
+        },
         saved_as=OUTPUTS[0],
-        next=()
-        if output is None
-        else (f"walop-jax report {output}", *_plan(data, output, instrument, result)),
+        next=suggested or (),
         warnings=tuple(f"the fit: {text}" for text in result.warnings),
     )
 

@@ -26,16 +26,7 @@ POINTS = Option("FITS, CSV, ECSV or VOTable with X, Y in degrees.", "TABLE", Pat
 OUT = Option("Table to write (.fits, .csv, .ecsv); needed with --points.", "OUT", Path, "-o")
 
 
-def _table_first(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """A table may stand in the place of x."""
-    x = args[1] if len(args) > 1 else kwargs.get("x")
-    alone = x is not None and len(args) < 3 and "y" not in kwargs and "points" not in kwargs
-    if alone and not isinstance(x, int | float):
-        args, kwargs = args[:1], {k: v for k, v in kwargs.items() if k != "x"} | {"points": x}
-    return args, kwargs
-
-
-@command(writes="file", given=_table_first)
+@command(writes="file")
 def matrix(
     job: Job,
     calibration: Product,
@@ -49,7 +40,6 @@ def matrix(
     at: Angles = None,
     teff: Annotated[Any, TEFF] = None,
     filter: Annotated[Any, FILTER] = None,
-    **columns: Any,
 ) -> Outcome[Any]:
     """Say what the instrument matrix is at a field point, or at every point of a table.
 
@@ -66,7 +56,7 @@ def matrix(
     Columns of a table that are not used are named.
 
     In Python: an astropy table, for `x`, `y` (degrees or quantities) or for the table `points`: a path, an astropy
-    table, columns by name. `columns` are others of those above, such as temp=5 or chwp_angle=45.
+    table, columns by name (the other quantities above among them).
 
     >>> print(walop.matrix(result, x=0.1, y=-0.05))
     field point X +0.100°, Y −0.050°
@@ -76,7 +66,7 @@ def matrix(
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.plain_tables import table_format
     from walop_jax.posterior.draws import with_draws
-    from walop_jax.science.catalogue import POINT_COLUMNS, field_points
+    from walop_jax.science.catalogue import field_points
 
     if (points is None) == (x is None):
         raise UsageError("give either x and y, or a table of points", "points")
@@ -90,50 +80,39 @@ def matrix(
         table_format(output)
     held = calibration_of(calibration, effects)
     instrument = held.model.template.patched()
-    moving = instrument.moving()
-    columns |= {name: value for name, value in (("teff", teff), ("filter", filter)) if value is not None}
+    moving, columns = instrument.moving(), {}
     for prefix, angle in angles_of(at).items():
         if prefix not in moving:
             raise UsageError(f"there is no moving element {prefix!r}; {nearest(prefix, moving)}", "at")
         columns |= {f"{prefix}_IN": True, f"{prefix}_ANGLE": angle}
-    known = (*POINT_COLUMNS, *(f"{prefix}{end}" for prefix in moving for end in ("_IN", "_ANGLE")))
-    for name in columns:
-        if name.upper() not in known:
-            what = f"there is no argument or column {name!r}; {nearest(name.upper(), known)}"
-            raise TypeError(f"matrix: {what}")
+    columns |= {name: value for name, value in (("TEFF", teff), ("FILTER", filter)) if value is not None}
     table = table_of({"X": x, "Y": y} if points is None else points, columns)
-    never = [prefix for prefix in held.never_in if f"{prefix}_ANGLE" not in map(str.upper, columns)]
+    never = [prefix for prefix in held.never_in if f"{prefix}_ANGLE" not in columns]
     wanted = field_points(table, instrument, held.always_in, never)
     if points is None and wanted.outside.all():
-        limit = instrument.field_limit
-        what = f"beyond the field of {instrument.name} (±{limit:g}°)"
+        what = f"beyond the field of {instrument.name} (±{instrument.field_limit:g}°)"
         raise fail(what, column="X, Y", advice="give degrees; are these arcmin?")
     job.tell("working out the matrix")
     used = held if posterior is None else with_draws(held, posterior)
     with errors_naming(table.path):
         added = used.matrix_columns(wanted.x, wanted.y, wanted.settings, wanted.outside)
-    crossed = Quality.HIGH_CROSSTALK
-    numbers = {"matrix": {name: column[0].tolist() for name, column in added.items()}}
-    found = table_outcome(
+    outcome = table_outcome(
         job,
         held,
         table,
         added,
         used.provenance(held.content_hash()),
         output,
-        flag=added["FLAG"][0],
-        told={
+        counted={
+            Quality.HIGH_CROSSTALK: "",
             Quality.BEYOND_FIELD: "point(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)",
             Quality.BEYOND_SETTINGS: "row(s) with a filter or temperature not in the calibration (FLAG 64)",
         },
-        untold=(crossed,),
-        lost=used.left_behind,
-        more={} if x is None else numbers,
-        text=lambda n: f"{output}: {table.rows} rows, {n[crossed]} of them in zones of high cross-talk",
+        extra={} if x is None else {"matrix": {name: column[0].tolist() for name, column in added.items()}},
     )
-    made = MatrixTable(found.value, copy=False)
+    made = MatrixTable(outcome.value, copy=False)
     made.meanings = {int(bit): bit.meaning for bit in Quality}
-    if output is not None:
-        return dataclasses.replace(found, value=made)
-    advice = ("walop-jax matrix RUN --points TABLE -o OUT.fits",)
-    return dataclasses.replace(found, value=made, text=lambda: str(made), next=advice)
+    crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
+    text = f"{output}: {table.rows} rows, {crossed} of them in zones of high cross-talk"
+    advice = ("walop-jax matrix RUN --points TABLE -o OUT.fits",) if output is None else ()
+    return dataclasses.replace(outcome, value=made, text=str(made) if output is None else text, next=advice)

@@ -83,4 +83,4 @@ def model(
         with atomic_path(output, overwrite=job.overwrite) as temporary:
             temporary.write_text(text, encoding="utf-8")
     found = ModelFile(made, text, None if output is None else Path(output))
-    return Outcome(found, text=(lambda: text) if output is None else None)
+    return Outcome(found, text=text if output is None else None)

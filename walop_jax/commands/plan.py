@@ -139,17 +139,12 @@ def plan(
             progress=say,
         )
 
-    def files() -> Writers:
-        described = found.observing_plan.design.description
-        text = plan_text(found.observing_plan, INSTRUMENT if described else None)
-        return {PLAN: text_file(text), INSTRUMENT: text_file(described) if described else None}
-
-    return Outcome(
-        found,
-        lambda: found.document() | {"seed": job.seed},
-        files=files,
-        saved_as=PLANNED,
-    )
+    described = found.observing_plan.design.description
+    files: Writers = {
+        PLAN: text_file(plan_text(found.observing_plan, INSTRUMENT if described else None)),
+        INSTRUMENT: text_file(described) if described else None,
+    }
+    return Outcome(found, extra={"seed": job.seed}, files=lambda: files, saved_as=PLANNED)
 
 
 def _stood_at(exposures: Exposures, prefix: str) -> tuple[float | None, ...]:

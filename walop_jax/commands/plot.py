@@ -76,7 +76,7 @@ def plot(
         listed = {key: entry.about for key, entry in found.items()}
         width = max(map(len, listed), default=0)
         lines = [f"{key:<{width}}  {about}" for key, about in listed.items()]
-        return Outcome(listed, lambda: listed, lambda: "\n".join(lines))
+        return Outcome(listed, listed, "\n".join(lines))
     chosen = f"{name}.png" if output is None and job.typed else output
     path = None if chosen is None else Path(chosen)
     if path is not None:
@@ -97,4 +97,4 @@ def plot(
     figure = draw(name, source)
     if path is not None:
         save_figure(path, figure, overwrite=job.overwrite)
-    return Outcome(figure, lambda: {"figure": name, "output": str(path)}, lambda: str(path))
+    return Outcome(figure, {"figure": name, "output": str(path)}, str(path))

@@ -27,7 +27,6 @@ from walop_jax.commands.command import (
     Outcome,
     UsageError,
     command_of,
-    switch_on_jax,
 )
 from walop_jax.io.progress import interrupts_answered
 
@@ -46,7 +45,6 @@ EXIT_CODES = (
 NEXT = {
     "inspect": ("walop-jax refit {data} -o RUN",),
     "simulate": ("walop-jax refit {output} -o RUN",),
-    "compress": ("walop-jax refit {output} -o RUN",),
     "clip": ("walop-jax refit {output} -o RUN",),
     "import_zemax": ("walop-jax refit {output} -o RUN",),
     "model": ("walop-jax refit {calsets} --instrument {instrument} --model {output} -o RUN",),
@@ -219,7 +217,9 @@ def _run(command: Command[Any], given: dict[str, Any]) -> None:
     quiet, json = given.pop("quiet"), given.pop("json")
     common = {name: given.pop(name) for name in COMMON if name in given}
     if command.jax:
-        switch_on_jax()
+        from walop_jax.model.compiled import switch_on
+
+        switch_on()
     with progress(quiet or json, command.stages) as tell:
         found = command.run(Job(progress=tell, typed=True, **common), given)
     _show(dataclasses.replace(found, next=found.next or _next_steps(command, given)), quiet, json)
@@ -244,7 +244,7 @@ def _show(found: Outcome[Any], quiet: bool, json: bool) -> None:
         from walop_jax.io.text import json_text
 
         typer.echo(json_text(found.content), nl=False)
-    elif not quiet and (text := found.shown()):
+    elif not quiet and (text := found.printed()):
         _print(text, found.markdown)
         if found.next and not found.failure:
             # On stderr: what is on stdout may be redirected into a file.

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Job, Outcome, Writers, command
+from walop_jax.commands.command import Job, Option, Outcome, command
 from walop_jax.commands.inputs import (
+    GIGABYTE,
+    IN_MEMORY,
     Effects,
     Folder,
     InstrumentLike,
@@ -15,14 +17,15 @@ from walop_jax.commands.inputs import (
     ModelLike,
     PathLike,
     Sets,
-    in_bytes,
     paths_of,
     set_and_model,
 )
+from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
-    from walop_jax import FitResult
+    from walop_jax import CalibrationSet, FitResult
 
+COMPRESS = Option("Write whole frames as a small set that says the same.", "SET.fits", Path)
 STAGES = ("reading", "fitting", "examining", "mapping")
 """Of the progress, also of the commands that fit and do more."""
 
@@ -37,6 +40,7 @@ def refit(
     instrument: InstrumentLike = None,
     effects: Effects = None,
     memory: Memory = 2.0,
+    compress: Annotated[PathLike | None, COMPRESS] = None,
 ) -> Outcome[FitResult]:
     """Fit all field points of calibration sets jointly: RUN/calibration.fits and RUN/summary.json.
 
@@ -49,7 +53,10 @@ def refit(
     code 3.
 
     Sets of more than 65536 points (whole frames) are read in slabs on every pass. The calibration then holds a map of
-    what the smooth model leaves.
+    what the smooth model leaves. --compress makes of them a set of some hundred field points, a megabyte: refit,
+    diagnose, limits, epoch and sample read it like any other set and answer in seconds as from all pixels, near the
+    values that were fitted; they say when these have moved too far. What is smaller than a twentieth of the field is
+    not in it.
 
     In Python: the fit. Raises `DataError` for data that cannot be trusted, ValueError for a model that does not fit.
 
@@ -61,61 +68,76 @@ def refit(
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.residual_map import residual_map
     from walop_jax.calibration.summary import summary
+    from walop_jax.data.write import write_calibration_set
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.refit import refit as fit
-    from walop_jax.io.atomic import atomic_path
+    from walop_jax.io.atomic import atomic_path, check_output
     from walop_jax.io.names import FAILED, PRODUCT, SUMMARY
     from walop_jax.io.progress import Stage
     from walop_jax.io.text import json_text
     from walop_jax.science.field_accuracy import answered
 
+    if compress is not None:
+        check_output(compress, overwrite=job.overwrite)
     with job.reserved(output, (PRODUCT, SUMMARY)) as job:
         job.begin("reading")
         calset, chosen = set_and_model(data, model, instrument, effects, output=output)
         with job.repeated() as say:
-            fitted = fit(calset, chosen, progress=say, memory=in_bytes(memory))
+            fitted = fit(calset, chosen, progress=say, memory=None if memory is None else memory * GIGABYTE)
             say(Stage("looking for patterns in the residuals", "examining"))
             result = answered(examined(fitted, job.seed))
+        if compress is not None:
+            write_calibration_set(compress, _compressed(result), overwrite=job.overwrite)
         wanted = output is not None
         mapped = wanted and result.likelihood.layout.large and result.converged
         residuals = residual_map(result) if mapped else None
         misfit = describe(result) if wanted and not result.explains_data else None
-        seconds = job.seconds
-
-        def files() -> Writers:
-            product = Calibration.from_fit(result, residuals)
-            return {PRODUCT: lambda path: write_calibration(path, product)}
-
-        found = Outcome(
+        outcome = Outcome(
             result,
-            lambda: summary(result, seconds=seconds, misfit=misfit, residuals=residuals) | {"seed": job.seed},
-            lambda: (
-                f"{dataclasses.replace(result.display(), notes=result.notes).text()}\n"
-                f"The calibration can{'' if result.trusted else 'not'} be trusted; written to {output}."
-            ),
-            files,
+            summary(result, seconds=job.seconds, misfit=misfit, residuals=residuals),
+            extra={"seed": job.seed},
+            display=dataclasses.replace(result.display(), notes=result.notes),
+            below=f"The calibration can{'' if result.trusted else 'not'} be trusted; written to {output}.",
+            files=lambda: {
+                PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result, residuals))
+            },
             saved_as=SUMMARY,
             next=next_steps(result.trusted, output, data, instrument=instrument, effects=effects),
             warnings=(*result.warnings, *(() if misfit is None else misfit.sentences())),
             trusted=result.trusted,
         )
         if not result.converged:
-            found = dataclasses.replace(
-                found,
-                text=str,
-                warnings=(),
-                failure=f"{output}: the fit did not converge ({result.minimum.message}); see {FAILED} there",
-            )
+            failure = f"{output}: the fit did not converge ({result.minimum.message}); see {FAILED} there"
+            outcome = dataclasses.replace(outcome, text="", warnings=(), failure=failure)
         if job.folder is None:
-            return found
+            return outcome
         job.tell("mapping the field", "mapping")
         if result.converged:
-            return found.save(job.folder, drop=(FAILED,))
+            return outcome.save(job.folder, drop=(FAILED,))
         job.folder.path.mkdir(exist_ok=True)
         with atomic_path(job.folder.path / FAILED, overwrite=True) as temporary:
-            temporary.write_text(json_text(found.content), encoding="utf-8")
-        return found
+            temporary.write_text(json_text(outcome.content), encoding="utf-8")
+        return outcome
+
+
+def _compressed(result: FitResult) -> CalibrationSet:
+    """The set of some hundred field points that stands for whole frames. Raises `DataError` for other data."""
+    from walop_jax.diagnosis.trust import pixel_structure
+    from walop_jax.fit.stand_in import with_pixel_structure
+    from walop_jax.likelihood.compressed import compressed
+    from walop_jax.likelihood.frames import PixelPosterior
+
+    if not isinstance(result.posterior, PixelPosterior):
+        raise fail(
+            "cannot be compressed",
+            file=result.calset.inputs[0].path if result.calset.inputs else IN_MEMORY,
+            advice="only whole frames of many pixels can, under a model that is smooth over the field, with detectors "
+            "that report counts as they are; tables and small frames are small enough as they are",
+        )
+    if not result.converged:
+        raise ValueError(f"the fit of the frames did not converge ({result.minimum.message})")
+    return with_pixel_structure(compressed(result.posterior), pixel_structure(result))
 
 
 def next_steps(trusted: bool, output: PathLike | None, data: Sets, **options: object) -> tuple[str, ...]:

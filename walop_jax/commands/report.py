@@ -52,8 +52,8 @@ def report(
     The verdict, the accuracy of p over the field, what the data were, what was found, residuals before and after, maps
     of the matrix and of its errors, pulls from the priors, all parameters, warnings, inputs and versions, as far as RUN
     holds them; the page says what is missing. What sample and limits have put into RUN is there as well; compare,
-    epoch, limits, plan, stack and watch have pages of their own. A page that exists is made anew; another file of that
-    name is left alone unless --overwrite is given.
+    epoch, limits, plan, stack, watch and certify have pages of their own. A page that exists is made anew; another file
+    of that name is left alone unless --overwrite is given.
 
     In Python: a `Page`; of a fit in memory, which needs an `output`.
 
@@ -78,15 +78,8 @@ def report(
     found = read_run(Run(folder, catalogue_of(effects), tuple(data or ()))) if kind == "fit" else None
     overwrite = job.overwrite or _is_page(target)
     check_output(target, overwrite=overwrite)
-    if found is None:
-        job.tell("drawing", "drawing")
-        text, missing = render_other(folder, kind)
-    else:
-        job.tell("working out the accuracy of p")
-        accuracy, lacking = _accuracy(found)
-        job.tell("drawing", "drawing")
-        missing = (*found.missing, *lacking)
-        text = render(dataclasses.replace(found, missing=missing), accuracy)
+    job.tell("drawing", "drawing")
+    text, missing = render_other(folder, kind) if found is None else render(found)
     text = encodable(text)
     with atomic_path(target, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -101,17 +94,3 @@ def _is_page(path: Path) -> bool:
             return GENERATOR in stream.read(1000)
     except (OSError, UnicodeDecodeError):
         return False
-
-
-def _accuracy(run: Any) -> tuple[Any, tuple[str, ...]]:
-    """The accuracy of p over the field, or in words why it is not known."""
-    from walop_jax.science.field_accuracy import field_accuracy
-
-    if run.product is None:
-        return None, ()
-    try:
-        found = field_accuracy(run.source.rebuilt)
-    except ValueError as error:
-        return None, (f"The accuracy of p over the field is not known: {error}.",)
-    lacking = ("The instrument has a single arm: the accuracy of p depends on how stars are observed.",)
-    return found, () if found is not None else lacking

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
+from walop_jax.commands.command import Argument, Job, Option, Outcome, command, text_file
 from walop_jax.commands.inputs import DataOf, Effects, ModelLike, PathLike, catalogue_of, folder_of
-from walop_jax.io.errors import fail, nearest
+from walop_jax.io.errors import fail
 from walop_jax.io.text import read_text
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Run
+    from walop_jax import Calibration, FitResult, Options, Run
     from walop_jax.posterior.result import PosteriorSample, Progress
 
 RUN = Argument("Folder of a `walop-jax refit`.", "RUN", Path)
 STEPS = Option("Stop there at the latest, converged or not; a multiple of --interval.", least=1)
 CHAINS = "sampling"
 """Folder, in that of the run, of the chain that is kept."""
+NOT_CONVERGED = "the posterior has not converged; calibration.fits keeps its covariance"
 OUTPUTS = (
     "posterior.nc", "posterior.fits", "posterior.ecsv", "posterior_corner.png", "posterior_trace.png", "sample.json",
 )  # fmt: skip
@@ -44,7 +45,7 @@ def sample(
     ] = 500,
     moves: Annotated[str, Option("Moves of emcee: laplace, de or stretch.")] = "laplace",
     parameters: Sequence[str] | None = None,
-    **more: Any,
+    options: Options | None = None,
 ) -> Outcome[PosteriorSample]:
     """Sample the posterior: RUN/posterior.nc, intervals and figures; the covariance goes into calibration.fits.
 
@@ -53,18 +54,16 @@ def sample(
     written and marked so, with exit code 1; the covariance of the fit then stays in calibration.fits.
 
     In Python: a `PosteriorSample`, of a fit in memory or of a run, which is then written. `parameters` names what is
-    sampled (None: the physics coefficients); other keywords are the fields of `walop.Options`. Raises `DataError` if
-    the run is no folder of a fit, holds a posterior already, or does not fit its data any more.
+    sampled (None: the physics coefficients); `options` (`walop.Options`) are all settings at once, with those that the
+    command line does not have, in place of the others and of `seed`.
+    Raises `DataError` if the run is no folder of a fit, holds a posterior already, or does not fit its data any more.
 
     >>> walop.sample(result, seed=1).to_arviz()  # doctest: +SKIP
     """
     from walop_jax import FitResult, Options, Run
     from walop_jax.posterior.sampling import sample as sample_fit
 
-    known = {field.name for field in dataclasses.fields(Options)}
-    if unknown := sorted(set(more) - known):
-        raise TypeError(f"sample: there is no argument {unknown[0]!r}; {nearest(unknown[0], known)}")
-    options = Options(
+    options = options or Options(
         sampler=sampler,
         seed=job.seed,
         inflate=inflate,
@@ -73,7 +72,6 @@ def sample(
         interval=interval,
         moves=moves,
         parameters=None if parameters is None else tuple(parameters),
-        **more,
     )
 
     def tell(progress: Progress) -> None:
@@ -96,9 +94,7 @@ def sample(
     return Outcome(
         posterior,
         warnings=(*anew, *posterior.warnings),
-        failure=""
-        if posterior.sampled_well
-        else f"{where}: the posterior has not converged; calibration.fits keeps its covariance",
+        failure="" if posterior.sampled_well else f"{where}: {NOT_CONVERGED}",
         trusted=posterior.trusted,
     )
 
@@ -134,12 +130,11 @@ def _sampled_run(
         posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)
         with out.filled(((PRODUCT,) if posterior.trusted else ()) + OUTPUTS) as temporary:
             for name, write in _writers(product, posterior).items():
-                if write is not None:
-                    write(temporary / name)
+                write(temporary / name)
     return posterior
 
 
-def _writers(product: Calibration, posterior: PosteriorSample) -> Writers:
+def _writers(product: Calibration, posterior: PosteriorSample) -> dict[str, Callable[[Path], object]]:
     """The files of a sampled run."""
     from walop_jax.calibration.product import write_calibration
     from walop_jax.io.names import PRODUCT
@@ -152,13 +147,13 @@ def _writers(product: Calibration, posterior: PosteriorSample) -> Writers:
 
     intervals = posterior.to_table()
     figures = FigureSource.of(posterior)
-    writers: dict[str, Any] = {
+    writers: dict[str, Callable[[Path], object]] = {
         "posterior.nc": lambda path: write_posterior(path, posterior),
         "posterior.fits": lambda path: write_table(path, intervals),
         "posterior.ecsv": lambda path: write_table(path, intervals),
         "posterior_corner.png": lambda path: save_figure(path, draw("corner", figures)),
         "posterior_trace.png": lambda path: save_figure(path, draw("trace", figures)),
-        "sample.json": lambda path: path.write_text(json_text(posterior.document()), encoding="utf-8"),
+        "sample.json": text_file(json_text(posterior.document() | {"shown": posterior.display().document()})),
     }
     if posterior.trusted:
         better = product.with_covariance(posterior.covariance, posterior.errors_from)

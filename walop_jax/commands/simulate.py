@@ -3,57 +3,30 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 from collections.abc import Mapping, Sequence
-from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import (
-    Effects,
-    InstrumentLike,
-    PathLike,
-    SetFile,
-    catalogue_of,
-    design_of,
-)
+from walop_jax.commands.inputs import Effects, InstrumentLike, PathLike, SetFile, catalogue_of, design_of
 from walop_jax.io.text import json_text, parse_toml, read_text, rounded
 
 if TYPE_CHECKING:
     from walop_jax import Effect, Instrument, ObservingPlan
+    from walop_jax.model.effects import EffectKind
     from walop_jax.simulation.simulate import Simulated
 
-PLAN = Argument("Observing plan (TOML), in place of the options that make one.", "[PLAN.toml]", Path)
+PLAN = Argument("Observing plan (TOML); default: the usual one of the instrument.", "[PLAN.toml]", Path)
 EFFECT = Option(
     "Effect to hide in the data; NAME=par:value,par:value for several parameters (a/b/c/d for one "
     "value per element), NAME alone where there is none to give. May be repeated.",
     "NAME=VALUE",
     list[str],
 )
-OF_A_PLAN = (
-    "grid", "standard_grid", "angles", "full_turn", "moon_patches", "standards", "electrons", "plate", "narrow_bands",
-)  # fmt: skip
 
 
-def _older(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """The arguments with the seed by its name, and with what is hidden in the data as `effect`."""
-    if len(args) > 1:
-        args, kwargs = (args[0], *args[2:]), {"seed": args[1]} | kwargs
-    given = kwargs.get("effects")
-    classes = isinstance(given, Sequence) and given and all(isinstance(one, type) for one in given)
-    if (
-        given is not None
-        and "effect" not in kwargs
-        and not isinstance(given, str | os.PathLike)
-        and not classes
-    ):
-        kwargs = kwargs | {"effect": kwargs.pop("effects")}
-    return args, kwargs
-
-
-@command(stages=("following", "writing"), writes="file", random=True, given=_older)
+@command(stages=("following", "writing"), writes="file", random=True)
 def simulate(
     job: Job,
     plan: Annotated[ObservingPlan | PathLike | None, PLAN] = None,
@@ -62,63 +35,37 @@ def simulate(
     instrument: InstrumentLike = None,
     effect: Annotated[str | Sequence[str | Effect] | Mapping[str, Any] | None, EFFECT] = None,
     effects: Effects = None,
-    grid: Annotated[int, Option("Field points along each axis.", least=1)] = 12,
-    standard_grid: Annotated[int, Option("Places of a standard along each axis.", least=1)] = 5,
-    angles: Annotated[int, Option("Polariser angles.", least=1)] = 15,
-    full_turn: Annotated[bool, Option("Spread them over 360 degrees, not 180.")] = False,
-    moon_patches: Annotated[int, Option("Patches of the full-Moon sky.", least=0)] = 8,
-    standards: Annotated[int, Option("Standard stars, the first two unpolarised.", least=0)] = 8,
-    electrons: Annotated[float, Option("Level of a camera in unpolarised light.")] = 1e6,
-    plate: Annotated[bool, Option("Calibration half-wave plate out, at 0 and at 45 degrees.")] = False,
-    narrow_bands: Annotated[bool, Option("Polariser in two narrow bands as well.")] = False,
     truth: Annotated[PathLike | None, Option("Write the true parameters here.", "FILE.json", Path)] = None,
     noiseless: bool = False,
     catalogue_seed: int | None = None,
 ) -> Outcome[Simulated]:
     """Make a calibration set of an instrument whose as-built values are drawn from their priors.
 
-    The light path is the one that a fit uses; noise is that of photons and of the detectors (30 electrons).
+    The light path is the one that a fit uses; noise is that of photons and of the detectors (30 electrons). What is
+    observed is said by a plan file (see walop-jax docs files): field points, angles, Moon patches, standards, filters.
 
     In Python: the set and the true instrument. `effect` may be a dict, {"hwp1_axis": 0.3}, or `Effect` objects; with a
     plan, an `Instrument` as `instrument` is the true one, not drawn. `noiseless`: expected counts, with the errors that
     they would have. The same plan, seed and effects give the same set, bit for bit. `catalogue_seed` draws the
     standards apart from the rest: nights of one survey have theirs in common.
 
-    >>> calset, truth = walop.simulate(grid=4, effects={"hwp1_axis": 0.3}, seed=1)  # doctest: +SKIP
+    >>> calset, truth = walop.simulate(walop.ObservingPlan(grid=4), effect={"hwp1_axis": 0.3})  # doctest: +SKIP
     """
-    from walop_jax import Instrument
+    from walop_jax import Instrument, ObservingPlan
     from walop_jax.data.write import write_calibration_set
     from walop_jax.io.atomic import atomic_path, check_output
-    from walop_jax.model.instrument import NoSuchPlaceError
+    from walop_jax.model.instrument import nominal_instrument
     from walop_jax.simulation.observing_plan import instrument_named, read_plan
-    from walop_jax.simulation.simulate import effect_from_text
     from walop_jax.simulation.simulate import simulate as simulated
 
-    asked = {name: value for name, value in locals().items() if name in OF_A_PLAN}
-    catalogue = catalogue_of(effects)
-    true = instrument if isinstance(instrument, Instrument) else None
+    true = instrument if isinstance(instrument, Instrument) and plan is not None else None
     file = instrument
     if isinstance(plan, str | os.PathLike):
         file = file or instrument_named(parse_toml(read_text(plan)), Path(plan).parent)
         plan = read_plan(plan, None if true else instrument)  # pyright: ignore[reportArgumentType]
     try:
-        if plan is None:
-            plan, true = _plan(design_of(instrument), **asked), None
-        else:
-            defaults = {p.name: p.default for p in signature(simulate).parameters.values()}
-            idle = [name for name, value in asked.items() if value != defaults[name]]
-            if idle:
-                raise UsageError(f"the plan says all of that: leave {', '.join(idle)} out", idle[0])
-        context = plan.context()
-        hidden = [
-            effect_from_text(one, context, catalogue) if isinstance(one, str) else one
-            for one in _texts(effect)
-        ]
-        for one in hidden:
-            try:
-                one.patch(plan.design)
-            except NoSuchPlaceError as error:
-                raise ValueError(f"effect {one.name!r}: {error}") from None
+        plan = plan or ObservingPlan.usual(design_of(instrument) or nominal_instrument())
+        hidden = _hidden(effect, plan, catalogue_of(effects))
     except ValueError as error:
         raise UsageError(str(error)) from None
     if truth is not None:
@@ -149,39 +96,25 @@ def simulate(
         "effects": [one.name for one in hidden],
         "truth": truth,
     }
-    return Outcome(
-        made,
-        lambda: document,
-        lambda: (
-            f"{output}: {plan.name}, {document['exposures']} exposures of {document['points']} points; "
-            f"{'; '.join(map(_sized, hidden)) or 'nothing'} beyond the base model"
-        ),
-        next=(f"walop-jax refit {output} --instrument {file} -o RUN",) if plan.design.description else (),
-    )
+    text = f"{output}: {plan.name}, {document['exposures']} exposures of {document['points']} points; "
+    text += f"{'; '.join(map(_sized, hidden)) or 'nothing'} beyond the base model"
+    suggested = f"walop-jax refit {output} --instrument {file} -o RUN"
+    return Outcome(made, document, text, next=(suggested,) if plan.design.description else ())
 
 
-def _plan(
-    design: Instrument | None, *, angles: int, full_turn: bool, plate: bool, narrow_bands: bool, **more: Any
-) -> ObservingPlan:
-    """The plan that the options ask for."""
-    from walop_jax import ObservingPlan
-    from walop_jax.model.instrument import nominal_instrument
-    from walop_jax.simulation.observing_plan import NARROW_BANDS, polariser_turn
+def _hidden(given: Any, plan: ObservingPlan, catalogue: Sequence[EffectKind]) -> list[Effect]:
+    """The effects that a set holds. Raises ValueError for one that the instrument has no place for."""
+    from walop_jax.model.instrument import NoSuchPlaceError
+    from walop_jax.simulation.simulate import effect_from_text
 
-    design = design or nominal_instrument()
-    turn = polariser_turn(angles, full_turn=full_turn)
-    if design.raster[0] == "line":
-        bench = ObservingPlan.bench(more["grid"])
-        return dataclasses.replace(
-            bench, instrument=design, polariser_angles=turn, electrons=more["electrons"]
-        )
-    return ObservingPlan(
-        design,
-        polariser_angles=turn,
-        plate=(None, 0.0, 45.0) if plate else (None,),
-        filters=("SDSS-r", *NARROW_BANDS) if narrow_bands else ("SDSS-r",),
-        **more,
-    )
+    context, hidden = plan.context(), []
+    for one in _texts(given):
+        hidden.append(effect_from_text(one, context, catalogue) if isinstance(one, str) else one)
+        try:
+            hidden[-1].patch(plan.design)
+        except NoSuchPlaceError as error:
+            raise ValueError(f"effect {hidden[-1].name!r}: {error}") from None
+    return hidden
 
 
 def _texts(effect: str | Sequence[str | Effect] | Mapping[str, Any] | None) -> Sequence[str | Effect]:

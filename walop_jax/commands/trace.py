@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import numbers
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
 from walop_jax.commands.inputs import (
@@ -25,27 +23,13 @@ from walop_jax.commands.inputs import (
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Instrument, Run
-    from walop_jax.model.trace import LightStage
+    from walop_jax.model.trace import Traced
 
 PRODUCT = Argument("An instrument as fitted; without it, as designed.", "[RUN/calibration.fits]", Path)
 ANGLE = Option("Polariser in, with its axis here (deg).", kind=float)
 
 
-class Traced(tuple["LightStage", ...]):
-    """The stages of a sightline; prints as the table of the command."""
-
-    def __repr__(self) -> str:
-        return "\n".join(table(self))
-
-
-def _numbers_first(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Numbers by their position are x, y, q and u; other keywords are elements, by the prefix of their columns."""
-    if args and isinstance(args[0], numbers.Real):
-        args, kwargs = (), dict(zip(("x", "y", "q", "u"), args, strict=False)) | kwargs
-    return args, kwargs
-
-
-@command(given=_numbers_first)
+@command()
 def trace(
     job: Job,
     calibration: Annotated[Calibration | FitResult | Run | Instrument | PathLike | None, PRODUCT] = None,
@@ -60,29 +44,27 @@ def trace(
     at: Angles = None,
     teff: Annotated[float | None, TEFF] = None,
     filter: Annotated[str, FILTER] = "SDSS-r",
-    **positions: float,
 ) -> Outcome[Traced]:
     """Follow the light of one source through the instrument.
 
     Every line is the light at one place: Stokes vectors averaged over the band, then the cameras. The
     last line is what a fit works with.
 
-    In Python: the stages. Angles of moving elements are keywords, chwp=45, or `at`. Raises ValueError, with the nearest
-    names, for an unknown instrument, filter or moving element.
+    In Python: the stages; `at` is a dict, {"CHWP": 45}. Raises ValueError, with the nearest names, for an unknown
+    instrument, filter or moving element.
 
     >>> print(walop.trace(result, x=0.1, y=0.0, q=0.05))  # doctest: +SKIP
     """
     from walop_jax import Instrument, Settings
     from walop_jax.data.settings import builtin_filter
     from walop_jax.model.instrument import nominal_instrument
-    from walop_jax.model.trace import Sightline
+    from walop_jax.model.trace import Sightline, Traced
     from walop_jax.model.trace import trace as traced
 
     if isinstance(calibration, Instrument):
         calibration, instrument = None, calibration
-    there = {name.upper(): value for name, value in positions.items()} | angles_of(at)
     try:
-        setting = Settings.default(1, filter).at(**there)
+        setting = Settings.default(1, filter).at(**angles_of(at))
         setting.teff[0] = math.nan if teff is None else teff
         polariser = math.nan if angle is None else angle
         line = Sightline(x=x, y=y, q=q, u=u, clp_angle=polariser, setting=setting)
@@ -99,7 +81,7 @@ def trace(
         warnings = (*held.warnings, *left_out_sentences(lost, held.path))
     return Outcome(
         Traced(stages),
-        lambda: {
+        {
             "stages": [
                 {
                     "stage": stage.name,
@@ -112,22 +94,6 @@ def trace(
             ],
             NOT_CARRIED_OVER: list(lost),
         },
-        lambda: "\n".join(table(stages)),
+        repr(Traced(stages)),
         warnings=warnings,
     )
-
-
-def table(stages: Sequence[LightStage]) -> list[str]:
-    """The stages as lines of text; column names appear where they change."""
-    width = max(len(f"{stage.name} {row}") for stage in stages for row in stage.rows)
-    lines: list[str] = []
-    columns: tuple[str, ...] = ()
-    for stage in stages:
-        if stage.columns != columns:
-            columns = stage.columns
-            lines.append(" " * width + "".join(f"{column:>13}" for column in columns))
-        for i, (row, values) in enumerate(zip(stage.rows, stage.value, strict=True)):
-            name = f"{stage.name} {row}".strip()
-            about = f"   {stage.about}" if i == 0 else ""
-            lines.append(f"{name:<{width}}" + "".join(f"{value:13.6f}" for value in values) + about)
-    return lines

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command, figure_file
+from walop_jax.commands.command import Argument, Job, Option, Outcome, command, figure_file
 from walop_jax.commands.inputs import Effects, PathLike, Product, calibration_of, table_of
 
 if TYPE_CHECKING:
@@ -61,17 +61,13 @@ def watch(
     with errors_naming(", ".join(files) or None):
         found = watched(held, rows, names=names, force=force)
 
-    def written() -> Writers:
-        table = found.to_table()
-        return {
-            OUTPUTS[1]: lambda path: table.write(path, format="fits"),
-            OUTPUTS[2]: figure_file(watch_figure(found)),
-        }
-
     return Outcome(
         found,
-        lambda: {"product": held.content_hash()} | found.document(),
-        files=written,
+        extra={"product": held.content_hash()},
+        files=lambda: {
+            OUTPUTS[1]: lambda path: found.to_table().write(path, format="fits"),
+            OUTPUTS[2]: figure_file(watch_figure(found)),
+        },
         saved_as=OUTPUTS[0],
         warnings=held.warnings,
         trusted=found.holds,

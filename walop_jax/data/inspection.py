@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter
 from collections.abc import Iterator
 from typing import Literal
@@ -13,6 +14,8 @@ from walop_jax.data.checks import like_radians
 from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet, DataFlag, Exposures
 from walop_jax.data.table_intensities import TableIntensities, sampled
 from walop_jax.instruments.description import shipped
+from walop_jax.io.display import Display, Displayed
+from walop_jax.io.text import rounded
 
 Severity = Literal["fault", "doubt", "note"]
 
@@ -63,8 +66,8 @@ class ElementUse:
     angles: tuple[float, ...]
 
 
-@dataclasses.dataclass(frozen=True)
-class Inspection:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Inspection(Displayed):
     """A calibration set at a glance.
 
     `kinds` counts the exposures of each KIND. `angles` are the distinct polariser angles modulo 180° of exposures
@@ -95,6 +98,58 @@ class Inspection:
     sources: tuple[str, ...]
     filters: tuple[str, ...]
     findings: tuple[Finding, ...]
+
+    def display(self) -> Display:
+        """Contents of the set, and findings."""
+        low_x, high_x, low_y, high_y = self.field
+        counted = math.isfinite(self.median_counts)
+        apart = "; standards are measured at places of their own" if self.sources else ""
+        some = f" at {self.looked_at} points looked at" if self.looked_at < self.points else ""
+        place = (self.instrument, self.telescope)
+        noise = f"{self.noise_ratio**0.5:.4g} × the photon noise √N (median)"
+        return Display(
+            title=", ".join(self.files) or "in memory",
+            facts=(
+                ("instrument", f"{', '.join(filter(None, place))} ({self.origin or 'origin not stated'})"),
+                (
+                    "field points",
+                    f"{self.points}, X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
+                ),
+                ("cameras", str(self.cameras)),
+                ("polariser angles", f"{len(self.angles)} modulo 180°, widest gap {self.widest_gap:.3g}°"),
+                *(
+                    (f"element {use.prefix}", f"in {use.exposures} exposures, {len(use.angles)} angles")
+                    for use in self.elements
+                ),
+                (
+                    "used",
+                    f"{self.rows} of {self.possible} (exposure, point) pairs{some}{apart}",
+                ),
+                ("flagged", ", ".join(f"{count} {name}" for name, count in self.flags.items()) or "none"),
+                (
+                    "median counts",
+                    f"{rounded(self.median_counts)} electrons" if counted else "none: all KIND flux",
+                ),
+                ("errors", noise if counted else "as stated"),
+                ("standards", ", ".join(self.sources) or "none"),
+                ("filters", ", ".join(self.filters)),
+            ),
+            head=("kind", "filter", "calibration plate", "source", ">exposures", ">angles", ">used"),
+            rows=tuple(
+                (
+                    group.kind,
+                    group.filter,
+                    group.calibration_plate,
+                    group.teff,
+                    str(group.exposures),
+                    str(group.angles) if group.angles else "",
+                    f"{100 * group.used:.0f} %",
+                )
+                for group in self.groups
+            ),
+            notes=tuple(f"{finding.severity} {finding}" for finding in self.findings)
+            or ("nothing is wrong",),
+        )
 
 
 @dataclasses.dataclass(frozen=True)

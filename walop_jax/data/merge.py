@@ -144,9 +144,8 @@ def _joined_record(sets: tuple[CalibrationSet, ...], exposures: Exposures) -> Co
         others = [one for one in sets if one is not entry]
         if any(one.compression is not None or frames_among(one) for one in others):
             what = "stands for pixels that were summed at one set of values; so do other sets here, or there are frames"
-            raise _conflict(
-                what, entry, "", "compress the frames of all together: walop-jax compress A.fits B.fits"
-            )
+            again = "walop-jax refit A.fits B.fits --compress SET.fits -o RUN"
+            raise _conflict(what, entry, "", f"compress the frames of all together: {again}")
         numbers = exposures.exposure[here][entry.compression.covers(entry.exposures)]
         record = dataclasses.replace(
             entry.compression, exposures=tuple(numbers.tolist()) if others else entry.compression.exposures

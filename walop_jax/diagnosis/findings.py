@@ -321,6 +321,13 @@ class Diagnosis(Drawn):
             {"VERDICT": self.verdict},
         )
 
+    def _found(self) -> str:
+        """Names of what was added to the starting model, and whether something without a name is left."""
+        names = [step.effect for step in self.steps] + ["something without a name"] * (
+            self.unexplained is not None
+        )
+        return ", ".join(names) or "nothing beyond the starting model"
+
     def display(self) -> Display:
         """The verdict, and what was found."""
         rows = []
@@ -334,6 +341,7 @@ class Diagnosis(Drawn):
         return Display(
             title=f"Diagnosis: {self.verdict}; fit {verdict}",
             facts=(
+                ("found", self._found()),
                 ("χ²/dof", f"{before:.4g} → {after:.4g}"),
                 ("p of the starting model", probability(self.p_value).removeprefix("= ")),
                 ("field points", str(self.points)),

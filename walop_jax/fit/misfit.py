@@ -47,7 +47,8 @@ class Misfit:
         """The entry of `summary.json` (docs: files)."""
         entries = dataclasses.asdict(self)
         elements = entries.pop("positions")
-        return entries | {"calibration_plate": elements.pop(CALIBRATION_PLATE), "elements": elements}
+        plate = elements.pop(CALIBRATION_PLATE)
+        return entries | {"calibration_plate": plate, "elements": elements, "sentences": self.sentences()}
 
     def sentences(self) -> tuple[str, ...]:
         """The disagreement in words, the largest of each kind first."""

@@ -8,7 +8,7 @@ import html
 import importlib
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 from walop_jax.io.code import blank
@@ -38,17 +38,32 @@ class Display:
         yield self.title
         width = max((len(name) for name, _ in self.facts), default=0)
         for name, value in self.facts:
-            yield f"  {name:<{width}}  {_signed(value)}"
+            yield f"  {name:<{width}}  {signed(value)}"
         if self.rows:
             table = [tuple(name.removeprefix(">") for name in self.head), *self.rows]
             widths = [max(len(row[k]) for row in table) for k in range(len(self.head))]
             for row in table:
                 cells = (
-                    f"{_signed(cell):>{w}}" if name.startswith(">") else f"{_signed(cell):<{w}}"
+                    f"{signed(cell):>{w}}" if name.startswith(">") else f"{signed(cell):<{w}}"
                     for cell, w, name in zip(row, widths, self.head, strict=True)
                 )
                 yield ("  " + "  ".join(cells)).rstrip()
         yield from (f"  {note}" for note in self.notes)
+
+    def document(self) -> dict[str, Any]:
+        """The same as plain data."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Display:
+        """The display that such a document was made of. Raises KeyError or TypeError for one that is none."""
+        return cls(
+            str(document["title"]),
+            tuple((str(name), str(words)) for name, words in document["facts"]),
+            tuple(map(str, document["head"])),
+            tuple(tuple(map(str, row)) for row in document["rows"]),
+            tuple(map(str, document["notes"])),
+        )
 
     def shortened(self, most: int) -> Display:
         """The same in at most `most` lines: rows of the table go, and it is said how many."""
@@ -67,7 +82,7 @@ class Display:
         yield f"<div><p><strong>{html.escape(self.title)}</strong></p>"
         if self.facts:
             rows = (
-                f"<tr><th {_LEFT}>{html.escape(name)}</th><td {_LEFT}>{html.escape(_signed(value))}</td></tr>"
+                f"<tr><th {_LEFT}>{html.escape(name)}</th><td {_LEFT}>{html.escape(signed(value))}</td></tr>"
                 for name, value in self.facts
             )
             yield f"<table>{''.join(rows)}</table>"
@@ -80,7 +95,7 @@ class Display:
             body = "".join(
                 "<tr>"
                 + "".join(
-                    f"<td {side}>{html.escape(_signed(cell))}</td>"
+                    f"<td {side}>{html.escape(signed(cell))}</td>"
                     for cell, side in zip(row, sides, strict=True)
                 )
                 + "</tr>"
@@ -91,7 +106,7 @@ class Display:
         yield "</div>"
 
 
-def _signed(text: str) -> str:
+def signed(text: str) -> str:
     """A fact or a cell with true minus signs; hyphens of names, dates and options stay."""
     return re.sub(r"(?<![^\s(])-(?=\.?\d)", "−", text)
 

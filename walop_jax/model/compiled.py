@@ -38,6 +38,7 @@ import numpy as np
 from jax import export
 
 FOLDER = "programs"
+CACHE_VARIABLE = "WALOP_JAX_CACHE"
 _DIGEST = hashlib.sha256().digest_size
 _PACKAGES = ("jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy")
 _KNOWN = ("walop_jax", "builtins", "types", "functools", "operator", "_operator", *_PACKAGES)
@@ -286,6 +287,48 @@ def float64() -> contextlib.AbstractContextManager[Any]:
         return contextlib.nullcontext()
     here = jax if hasattr(jax, "enable_x64") else importlib.import_module("jax.experimental")  # jax < 0.8
     return here.enable_x64(True)
+
+
+def cache_folder() -> Path | None:
+    """Folder of compiled code that is kept between runs; None when that is switched off or impossible.
+
+    WALOP_JAX_CACHE names the folder ("off": none), otherwise it is walop-jax/xla in the user's cache folder.
+    """
+    chosen = os.environ.get(CACHE_VARIABLE, "")
+    if chosen.lower() in ("off", "0", "none"):
+        return None
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        kept = Path(chosen) if chosen else Path(base) / "walop-jax" / "xla"
+        kept.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # no home
+        return None
+    return kept if os.access(kept, os.W_OK | os.X_OK) else None
+
+
+def switch_on() -> None:
+    """Switch JAX on for a program: float64, and the cache of compiled code, which makes later runs start fast."""
+    jax.config.update("jax_enable_x64", True)
+    kept = cache_folder()
+    if kept is not None:
+        with contextlib.suppress(OSError):
+            (kept / FOLDER).mkdir(exist_ok=True)
+        jax.config.update("jax_compilation_cache_dir", str(kept))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+        jax.config.update("jax_raise_persistent_cache_errors", False)
+
+
+def in_float64(function: Callable[..., Any], name: str) -> Callable[..., Any]:
+    """The function as the public one of a name, which computes in float64."""
+
+    @functools.wraps(function)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        with float64():
+            return function(*args, **kwargs)
+
+    run.__module__, run.__qualname__ = "walop_jax", name  # where it is found again, by pickle as well
+    return run
 
 
 def need_float64(what: str) -> None:

@@ -135,3 +135,21 @@ def _with_source(instrument: Instrument, sightline: Sightline) -> Instrument:
 
 def _one(name: str, about: str, beam: Float[Array, " 4"]) -> LightStage:
     return LightStage(name, about.splitlines()[0].rstrip("."), ("",), STOKES, np.asarray(beam)[None])
+
+
+class Traced(tuple[LightStage, ...]):
+    """The stages of a sightline; prints as a table, with column names where they change."""
+
+    def __repr__(self) -> str:
+        width = max(len(f"{stage.name} {row}") for stage in self for row in stage.rows)
+        lines: list[str] = []
+        columns: tuple[str, ...] = ()
+        for stage in self:
+            if stage.columns != columns:
+                columns = stage.columns
+                lines.append(" " * width + "".join(f"{column:>13}" for column in columns))
+            for i, (row, values) in enumerate(zip(stage.rows, stage.value, strict=True)):
+                name = f"{stage.name} {row}".strip()
+                about = f"   {stage.about}" if i == 0 else ""
+                lines.append(f"{name:<{width}}" + "".join(f"{value:13.6f}" for value in values) + about)
+        return "\n".join(lines)

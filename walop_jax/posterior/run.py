@@ -129,7 +129,7 @@ class Run(RunFolder, Result):
                 f"has {len(calset.points)} field points: the posterior of so many is as good as normal, and "
                 "calibration.fits holds its covariance",
                 file=calibration.inputs[0].path,
-                advice=f"sample sets of up to {limits.LARGE_ABOVE} points; walop-jax compress makes one of frames",
+                advice=f"sample a set of up to {limits.LARGE_ABOVE} points; walop-jax refit --compress makes one",
             )
         result = fit(likelihood, start=calibration.values)
         away = np.abs(result.values - calibration.values) / np.where(result.sigma > 0, result.sigma, 1.0)

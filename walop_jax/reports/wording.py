@@ -1,7 +1,4 @@
-"""Numbers and verdicts in words: what a page says is decided here, how it looks is not.
-
-An agreement is "consistent with" a cause, never proof of one.
-"""
+"""Words of pages beside those that results display of themselves: captions, effects, the data of a run, symbols."""
 
 from __future__ import annotations
 
@@ -16,23 +13,20 @@ from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration, Product
 from walop_jax.data.records import CALIBRATION_PLATE, POLARISER
-from walop_jax.fit.parameter_table import PRIOR_ONLY
-from walop_jax.fit.verdict import Quality
-from walop_jax.io.text import probability, rounded, some, value_and_error, with_error, with_minus_sign
-from walop_jax.model.effects import EFFECTS
+from walop_jax.io.text import rounded, some, with_minus_sign
+from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.effects.free_form import FreeForm
 from walop_jax.reports.posterior_figures import LABELS
 from walop_jax.sky.nights import night_of
 
-MOST_PARAMETERS = 6  # of an effect, in a sentence
 _PROPER = ("Wollaston", "Moon", "Stokes")
 
 
-def effect_in_words(effect: str) -> str:
-    """A few words on an effect that may stand inside a sentence; empty for a name that is not known."""
-    if effect == FreeForm.name:
+def effect_in_words(name: str, catalogue: Iterable[EffectKind] = EFFECTS) -> str:
+    """A few words on an effect that may stand inside a sentence; empty for a name that is not in the catalogue."""
+    if name == FreeForm.name:
         return "unidentified patterns"
-    known = next((entry for entry in EFFECTS if entry.name == effect), None)
+    known = next((entry for entry in catalogue if entry.name == name), None)
     if known is None:
         return ""
     text = (known.__doc__ or "").strip().splitlines()[0].rstrip(".")
@@ -42,24 +36,6 @@ def effect_in_words(effect: str) -> str:
 def listed(items: Sequence[str]) -> str:
     """`a`, `a and b`, `a, b and c`."""
     return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
-
-
-def verdict_of_fit(summary: Mapping[str, Any]) -> tuple[str, str]:
-    """The verdict on a fit, as a label and a sentence with the reason."""
-    ratio = summary["chi2"] / max(summary["dof"], 1)
-    numbers = f"χ²/dof = {ratio:.4g} for {summary['dof']} degrees of freedom"
-    if not summary["converged"]:
-        return "Not trusted", f"The fit did not converge ({summary['message']}); {numbers}."
-    if Quality.UNEXPLAINED & int(summary.get("quality", 0)):
-        return "Not trusted", (
-            f"The model does not explain the data: χ²/dof = {ratio:.3g}, where 1 is expected. Do not use this "
-            "calibration. To find out what is missing, run walop-jax diagnose."
-        )
-    if not summary.get("trusted", True):
-        doubts = summary.get("doubts") or summary.get("warnings") or ["the model does not explain the data"]
-        told = "" if "χ²/dof" in doubts[0] else f" ({numbers})"
-        return "Not trusted", f"{doubts[0][:1].upper()}{doubts[0][1:]}{told}."
-    return "Trusted", f"The data are consistent with the model: {numbers}."
 
 
 def hidden_in_words(summary: Mapping[str, Any]) -> str:
@@ -73,66 +49,12 @@ def hidden_in_words(summary: Mapping[str, Any]) -> str:
     return f"{told}: {listed(sizes)}." if sizes else ""
 
 
-def verdict_of_diagnosis(diagnosis: Mapping[str, Any]) -> tuple[str, str]:
-    """The findings of a diagnosis, as a label and the sentences that a scientist would say."""
-    steps, p = diagnosis["steps"], probability(diagnosis.get("p_value"))
-    before, after = (rounded(diagnosis.get(f"chi2_per_dof_{when}")) for when in ("before", "after"))
-    if diagnosis["verdict"] == "consistent":
-        return "Consistent", (
-            f"These data are consistent with the starting model (χ²/dof = {before}): noise alone gives a pattern at "
-            f"least as strong as the strongest one found with p {p}."
-        )
-    base = f"The starting model does not explain these data (χ²/dof = {before}, p {p})"
-    found = listed([_found(step) for step in steps])
-    if diagnosis["verdict"] == "effect_found":
-        return ("Effects found" if len(steps) > 1 else "Effect found"), " ".join(
-            [f"{base}. They are consistent with {found}, with which χ²/dof is {after}.", *_confusions(steps)]
-        )
-    term = ""
-    if diagnosis["unexplained"] and diagnosis["unexplained"].get("free_form"):
-        term = f"A free-form term stands for it in this calibration, with which χ²/dof is {after}."
-    if not steps:
-        text = f"{base}, and no effect of the catalogue does: something unidentified is missing."
-    else:
-        text = f"{base}. They agree better with {found}{'' if term else f': χ²/dof is {after}'}, but an "
-        text += "unidentified residual remains."
-    return "Unexplained", " ".join(part for part in (text, term, *_confusions(steps)) if part)
-
-
-def _found(step: Mapping[str, Any]) -> str:
-    if step.get("sentences"):
-        return f"an effect that is not in the catalogue ({'; '.join(told['words'] for told in step['sentences'])})"
-    words, values = effect_in_words(step["effect"]), []
-    for name, entry in step["parameters"].items():
-        value, sigma = value_and_error(entry["value"], entry["sigma"])
-        unit = f" {entry['unit']}" if entry["unit"] else ""
-        values.append(f"{name} = {value}{f' ± {sigma}' if sigma else ''}{unit}")
-    if len(values) > MOST_PARAMETERS:
-        values = [f"{len(values)} parameters"]
-    inside = ": ".join(part for part in (words, ", ".join(values)) if part)
-    return f"{step['effect']} ({inside})" if inside else str(step["effect"])
-
-
-def _confusions(steps: Sequence[Mapping[str, Any]]) -> list[str]:
-    names = [
-        f"They cannot distinguish {step['effect']} from {listed(step['equivalent'])}."
-        for step in steps
-        if step["equivalent"]
-    ]
-    sentences = [
-        f"Equally consistent with {step['effect']}: {'; or '.join(step['nameless'])}."
-        for step in steps
-        if step.get("nameless")
-    ]
-    return names + sentences
-
-
 _MJD_0 = datetime.datetime(1858, 11, 17)
 _MANY = 12
 _KINDS = {"clp": "through the polariser", "moon": "of the Moon sky", "standard": "of standard stars"}
 
 
-def data_in_words(product: Calibration | Product) -> list[tuple[str, str]]:
+def data_in_words(product: Calibration | Product) -> tuple[tuple[str, str], ...]:
     """Nights, exposures, polariser angles, plate settings, Moon patches, standards, temperatures, filters."""
     e = product.exposures
     kinds = ", ".join(
@@ -162,7 +84,7 @@ def data_in_words(product: Calibration | Product) -> list[tuple[str, str]]:
         ("Temperature", _range(e.temp, "°C")),
         ("Filters", ", ".join(sorted({str(name) for name in e.filter}))),
     ]
-    return rows
+    return tuple(rows)
 
 
 def _nights(mjd: Float[np.ndarray, " e"], longitude: float) -> str:
@@ -195,24 +117,6 @@ def _range(values: Float[np.ndarray, " e"], unit: str) -> str:
     return with_minus_sign(f"{low} {unit}" if low == high else f"{low} to {high} {unit}")
 
 
-def model_entries(product: Calibration | Product) -> dict[str, dict[str, str]]:
-    """Start, prior, and state (fixed, tied to another, known from its prior only) of every parameter, by name."""
-    found = {}
-    for p, sigma in zip(product.parameters, product.sigma, strict=True):
-        state = "" if p.free else "fixed"
-        if p.tie is not None:
-            state = f"tied to {p.tie}"
-        elif p.free and p.prior is not None and sigma > PRIOR_ONLY * p.prior[1]:
-            state = "prior only"
-        same = (p.prior is not None and p.start == p.prior[0]) or not np.isfinite(p.start)
-        found[p.name] = {
-            "start": "" if same else rounded(p.start, ".6g"),
-            "prior": "" if p.prior is None else with_error(p.prior[0] + 0.0, p.prior[1]),
-            "state": state,
-        }
-    return found
-
-
 PLACES = {
     "half1": "half1 for the half of the pupil with HWP1",
     "half2": "half2 for that with HWP2",
@@ -237,4 +141,52 @@ def symbols_in_words(names: Sequence[str]) -> str:
         for code, letter in greek.items():
             symbol = symbol.replace(code, letter)
         found += [f"{symbol} {name}"] if symbol else []
-    return f"Symbols: {', '.join(found)}." if found else ""
+    return f" Symbols: {', '.join(found)}." if found else ""
+
+
+_RESIDUALS = "Residuals (data − model) over the field in the cameras"
+_NOISE = "noise alone has a standard deviation of about 1 σ. Tiles beyond 3 σ carry their sign."
+CAPTIONS: Mapping[str, str] = {
+    "accuracy": "Standard error of p for one exposure through {filter}, photon noise left out; the white line and the "
+    "dashed line are at 0.1 %. Values above 3 % are shown as 3 %.",
+    "protection": "Protection level: the largest error of q and u that a single mistake can make at each field point "
+    "without being detected (99 %).",
+    "separation": "Standard deviations between an effect at its detection limit (row) and another fitted to imitate it "
+    "(column).",
+    "effect": f"{_RESIDUALS}, all with one colour scale: without {{effect}}, what {{effect}} makes of them once all "
+    f"other parameters have followed, and with it. Combination of exposures: {{combination}}; {_NOISE}",
+    "signature": "Signature of {effect}. Dots: residuals averaged over the field, with the field pattern of the effect "
+    "in that camera as weight; errors from the scatter over the field. Line: what {effect} explains. Below: the "
+    "remaining residuals.",
+    "whole": f"{_RESIDUALS}. Combination of exposures: {{combination}}; {_NOISE}",
+    "ladder": "χ² per degree of freedom from the starting model to the last. In the grey band (5 standard deviations) "
+    "a model explains the data.",
+    "rms": "Rms residual of every field point over all exposures, with the starting and with the final model, one "
+    "colour scale. Noise alone gives 0.87 with four cameras, 0.71 with two (1 where the flux is known).",
+    "shares": "Where χ² sits: mean squared residual by group, divided by what noise alone gives, with the starting "
+    "model (open circles) and the final model (squares).",
+    "residuals": "Rms residual of every field point over all exposures, with the instrument as designed and as fitted "
+    "(1 is what noise alone gives), and the residuals of the fit with what noise alone would give.",
+    "matrix": "Zero offset, efficiency and cross-talk over the field in per cent: q_m = m21 + m22 q + m23 u and "
+    "u_m = m31 + m32 q + m33 u, through {filter}, flat photon spectrum, calibration plate out. Their ranges stand "
+    "above the maps; the ends of the scales go in steps of 1, 2, 5, so that runs can be compared. The lines bound the "
+    "zone in which a single exposure carries almost no information on u.",
+    "matrix-errors": "Standard errors of the same, one scale; covariance of the {covariance}.",
+    "residual-map": "Residuals of the smooth model in cells of the field, of the matrix through {filter} and of the "
+    "throughput of the cameras relative to each other; χ² per degree of freedom before that correction. All of them "
+    "lie {significance} standard deviations above what noise alone makes of them.",
+    "corner": "Posterior of the coefficients that are most correlated among those that the data constrain: contours "
+    "of 39 and 86 %, 1 and 2 σ of two coefficients together.",
+    "planned": "Error of p (%) before and after the plan: median over the instruments drawn, largest of all filters "
+    "and colours. Crosses: one exposure holds no u there.",
+    "change": "Change of the instrument matrix over the field, new − old, in per cent.",
+    "tracks": "Parameters that change: value under the law and its error (band), what each night would have by itself "
+    "(dots), breaks (dashed) and what was done (dotted).",
+    "nights": "χ² of every night against its expectation, in standard deviations; the band is ±2.",
+    "comparison_histogram.png": "Errors of q, u and p over the field, on the grid points and between them.",
+    "comparison_map.png": "Maps of the errors of q and u of both methods.",
+    "comparison_offset.png": "Where the offsets Δq and Δu of Paper II come from.",
+    "comparison_spectral.png": "Efficiencies across the filter, and what the colour of a star changes.",
+    "watch.png": "Gain of every camera since the calibration, group by group.",
+}
+"""Captions of figures by name, and of pictures by file."""

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 from walop_jax.calibration.could_hide import off_by, unmeasured
 from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.inspection import inspect
-from walop_jax.fit.refit import FitResult
-from walop_jax.io.display import Display, Displayed
+from walop_jax.data.records import CalibrationSet
+from walop_jax.fit.verdict import Verdict
 from walop_jax.io.text import two_digits
 from walop_jax.science.field_accuracy import SHARE, FieldAccuracy
 
@@ -30,51 +29,18 @@ class Requirement:
     needed: bool = True
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
-class Commissioning(Displayed):
-    """A fit with what is asked of it."""
-
-    fit: FitResult
-    requirements: tuple[Requirement, ...]
-
-    @property
-    def go(self) -> bool:
-        """True if everything that is needed is met."""
-        return all(one.met for one in self.requirements if one.needed)
-
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """Advice on requirements that are not met, what is needed first."""
-        ordered = sorted(self.requirements, key=lambda one: not one.needed)
-        return tuple(f"{one.found}: {one.advice}" for one in ordered if not one.met)
-
-    def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
-        return {"go": self.go, "requirements": [dataclasses.asdict(one) for one in self.requirements]}
-
-    def display(self) -> Display:
-        """Go or no-go, a line for each requirement, and what is missing."""
-        rows = tuple(
-            (
-                "yes" if one.met else "NO" if one.needed else "no",
-                f"{one.what} (required)" if one.needed else one.what,
-                one.found,
-            )
-            for one in self.requirements
-        )
-        title = f"Commissioning of {self.fit.model.name}: {'go' if self.go else 'NO GO'}"
-        return Display(title, head=("met", "asked", "found"), rows=rows, notes=self.missing)
-
-
-def commissioning(result: FitResult, accuracy: FieldAccuracy | None) -> Commissioning:
-    """Requirements on an examined fit; `accuracy` is that of p over the field, None where nobody knows it."""
+def requirements(
+    verdict: Verdict, message: str, accuracy: FieldAccuracy | None, calset: CalibrationSet | None
+) -> tuple[Requirement, ...]:
+    """Requirements on a fit with its verdict; `accuracy` is that of p over the field, `calset` its data, if known."""
     found = [
         Requirement(
-            "the fit has reached its minimum", result.converged, result.minimum.message or "converged",
+            "the fit has reached its minimum", verdict.converged, message or "converged",
             "look at the data with walop-jax inspect",
         ),
         Requirement(
-            "the model explains the data", result.trusted, "trusted" if result.trusted else "; ".join(result.warnings),
+            "the model explains the data", verdict.trusted,
+            "trusted" if verdict.trusted else "; ".join(verdict.warnings) or "not trusted",
             "walop-jax diagnose says what is missing",
         ),
     ]  # fmt: skip
@@ -110,8 +76,8 @@ def commissioning(result: FitResult, accuracy: FieldAccuracy | None) -> Commissi
                     needed=False,
                 )
             )
-    for one in inspect(result.calset).findings:
+    for one in () if calset is None else inspect(calset).findings:
         found.append(
             Requirement("exposures and errors", False, one.what, one.advice, needed=one.severity == "fault")
         )
-    return Commissioning(result, tuple(found))
+    return tuple(found)

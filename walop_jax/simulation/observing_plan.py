@@ -54,6 +54,10 @@ EXPOSED: Mapping[str, float] = {
 _MOON_ROTATOR, _STAR_ROTATOR = (0.0, 40.0, 90.0, 135.0), (0.0, 30.0, 75.0, 120.0)
 
 
+NO_SKY: Mapping[str, Any] = {"moon_patches": 0, "standards": 0, "unpolarised": 0, "throughput_degree": 0}
+"""Of a plan on a bench."""
+
+
 def polariser_turn(count: int = 15, *, full_turn: bool = False) -> tuple[float, ...]:
     """Evenly spread angles (deg) of the calibration polariser, over half a turn or a full one."""
     return tuple(float(a) for a in np.arange(count) * ((360.0 if full_turn else 180.0) / count))
@@ -214,7 +218,12 @@ class ObservingPlan:
     def bench(cls, tilts: int = 11) -> ObservingPlan:
         """The laboratory bench: plate tilts from 0 to 20°, no sky."""
         bench = next(name for name in shipped() if described(name).raster == "line")
-        return cls(bench, tilts, moon_patches=0, standards=0, unpolarised=0, throughput_degree=0)
+        return cls(bench, tilts, **NO_SKY)
+
+    @classmethod
+    def usual(cls, instrument: Instrument) -> ObservingPlan:
+        """The plan of an instrument that goes without saying: where field points lie on a line there is no sky."""
+        return cls(instrument, **(NO_SKY if instrument.raster[0] == "line" else {}))
 
     @functools.cached_property
     def design(self) -> Instrument:
