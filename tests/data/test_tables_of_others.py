@@ -141,6 +141,7 @@ GAIA = 4658219876543210000 + np.array([0, 64, 128, 192, 256])
         [-1.0, np.nan, -99.0, 7.0, 8.0],
         ["", " ", "nan", "a", "b"],
         ["-1", "N/A", "None", "a", "b"],
+        ["-5", "-5", "-5", "007", "7"],
         MaskedColumn([5, 5, 5, 5, 6], mask=[1, 1, 1, 0, 0]),
         np.array([np.iinfo(np.uint64).max] * 3 + [1, 2], np.uint64),
         np.array([None, None, None, "a", "b"], object),

@@ -331,7 +331,8 @@ def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndar
     else:
         values = np.char.strip(values.astype(str))
         missing = missing | (values == "")
-        unknown = ~missing & np.isin(np.char.lower(values), _NO_ID)
+        negative = np.char.startswith(values, "-") & np.char.isdigit(np.char.lstrip(values, "-"))
+        unknown = ~missing & (negative | np.isin(np.char.lower(values), _NO_ID))
     if unknown.any():
         which = rows_text(np.flatnonzero(unknown))
         source.remarks.append(
