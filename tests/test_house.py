@@ -190,7 +190,7 @@ MOST_LINES = {
     "likelihood": 3600,
     "simulation": 900,
     "fit": 2200,
-    "calibration": 2700,
+    "calibration": 2750,
     "posterior": 2400,
     "science": 4950,
     "diagnosis": 7500,
