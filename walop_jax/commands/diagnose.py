@@ -56,7 +56,6 @@ def diagnose(
 
     >>> walop.diagnose("night.fits", progress=print).verdict  # doctest: +SKIP
     """
-    from walop_jax import Calibration
     from walop_jax.calibration import PRODUCT, SUMMARY, summary, write_calibration
     from walop_jax.diagnosis.figure_data import FIGURE_DATA, figure_data, write_figure_data
     from walop_jax.diagnosis.findings import DIAGNOSIS, document
@@ -70,12 +69,12 @@ def diagnose(
     with job.repeated() as say:
         found = diagnosis_of(calset, chosen, seed=job.seed, minutes=minutes, progress=say)
 
-    after = answered(found.after)
+    product = found.calibration()
+    after = answered(found.after, product)
     usable = after.trusted and found.verdict != "unexplained"
 
     def files() -> Writers:
         job.tell("mapping the field", "mapping")
-        product = Calibration.from_fit(after)
         misfit = None if after.explains_data else describe(after)
         fitted = summary(after, seconds=job.seconds, misfit=misfit) | {"seed": job.seed}
         drawn_from = figure_data(found)

@@ -38,7 +38,7 @@ from walop_jax.fit.robust import field_cells, states
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.parameters import leaves, values_of
-from walop_jax.model.specification import Model, with_effects
+from walop_jax.model.specification import Model, model_without, with_effects
 
 
 @dataclasses.dataclass(frozen=True)
@@ -229,15 +229,6 @@ def evidence_of_presence(result: FitResult, name: str) -> float:
     """
     at = amplitude_positions(result.model, name)
     return _of_amplitudes(result, at) if at else float("inf")
-
-
-def model_without(model: Model, name: str) -> Model:
-    """The model with one effect taken out."""
-    rest = tuple(effect for effect in model.template.effects if effect.name != name)
-    own = model.positions(name)
-    parameters = tuple(p for i, p in enumerate(model.parameters) if i not in own)
-    template = dataclasses.replace(model.template, effects=rest)
-    return dataclasses.replace(model, template=template, parameters=parameters)
 
 
 def refit_without(result: FitResult, name: str) -> FitResult:

@@ -27,6 +27,8 @@ from walop_jax.diagnosis import candidates
 from walop_jax.diagnosis.alternatives import mixups_of, other_descriptions, refusal
 from walop_jax.diagnosis.candidates import Probe, applicable
 from walop_jax.diagnosis.candidates import probes as all_probes
+from walop_jax.diagnosis.class_members import classes_of
+from walop_jax.diagnosis.class_product import only_a_class
 from walop_jax.diagnosis.design import Design, strata
 from walop_jax.diagnosis.examination import (
     Examination,
@@ -59,6 +61,7 @@ from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.stand_in import in_field_points
+from walop_jax.fit.verdict import Quality
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.columns import columns
@@ -124,6 +127,8 @@ def diagnose(
     steps = tuple(judge.finished(step, last) for step in judge.steps)
     verdict: Outcome = "unexplained" if nameless else "effect_found" if steps else "consistent"
     tell("examining what is left")
+    names = {step.effect for step in steps}
+    members = classes_of(last, judge.context, names, judge.said) if last.result is judge.fit else ()
     found = Diagnosis(
         verdict=verdict,
         steps=steps,
@@ -143,6 +148,7 @@ def diagnose(
         classes=tuple(first.classes()),
         policy=policy,
         ended=judge.ended,
+        members=members,
     )
     del first, last  # the columns of all candidates, gigabytes of a large set
     return _examined(found, seed)
@@ -159,6 +165,8 @@ def _left(first: Examination, judge: Refit, policy: Policy) -> Examination:
 def _examined(found: Diagnosis, seed: int) -> Diagnosis:
     """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked."""
     after = examined(with_honest_errors(found.after), seed, as_written=True, policy=found.policy)
+    for sentence in only_a_class(found.members):
+        after = after.doubted(Quality.CLASS_ONLY, sentence)
     if found.before is found.after:
         return dataclasses.replace(found, before=after, after=after)
     for sentence in rival_conditions(Design.of(found.before), found.after.chi2, found.policy):

@@ -265,3 +265,12 @@ def with_effects(model: Model, effects: Sequence[str | type[Effect] | Effect], c
             known[p.name] = dataclasses.replace(p, start=start, prior=prior)
         parameters.append(known[p.name])
     return dataclasses.replace(model, template=jax.tree.map(array, instrument), parameters=tuple(parameters))
+
+
+def model_without(model: Model, name: str) -> Model:
+    """The model with one effect taken out."""
+    rest = tuple(effect for effect in model.template.effects if effect.name != name)
+    own = model.positions(name)
+    parameters = tuple(p for i, p in enumerate(model.parameters) if i not in own)
+    template = dataclasses.replace(model.template, effects=rest)
+    return dataclasses.replace(model, template=template, parameters=parameters)
