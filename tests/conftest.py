@@ -23,7 +23,7 @@ from south_sets import ABSENT, CUTS, SHARED, SouthSet
 jax.config.update("jax_enable_x64", True)  # the package itself never switches it on
 # Every annotated shape and type of the package is checked, under pytest only. Must precede its import.
 jaxtyping.install_import_hook("walop_jax", "shapes.checked")
-from walop_jax.data import read_calibration_set  # noqa: E402
+from walop_jax.data.calset import read_calibration_set  # noqa: E402
 from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 
 LEAST_COMPILED = 0.1  # seconds: what compiles faster is not worth a file

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from builders import NAN, exposures, monochromatic
 
-from walop_jax.calibration import Calibration, ListedModel, MatrixMaps, write_calibration
-from walop_jax.data import empty_sources
+from walop_jax.calibration.calibration import Calibration, ListedModel
+from walop_jax.calibration.matrix import MatrixMaps
+from walop_jax.calibration.product import write_calibration
+from walop_jax.data.calset import empty_sources
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import InputFile, Points, Site
 from walop_jax.diagnosis.figure_data import (

@@ -131,7 +131,8 @@ class Handmade:
 
     def refused(self, *fragments: str) -> None:
         """Write it and have it read: the error names the file and `fragments`, in one line."""
-        from walop_jax.data import DataError, read_calibration_set  # behind the checks of shapes
+        from walop_jax.data.calset import read_calibration_set  # behind the checks of shapes
+        from walop_jax.io.errors import DataError  # behind the checks of shapes
 
         path = self.write()
         with pytest.raises(DataError) as caught:

@@ -12,7 +12,7 @@ from quick import quick
 from small_run import SEED, SMALL
 
 from walop_jax.commands.docs import pages
-from walop_jax.data import write_calibration_set
+from walop_jax.data.write import write_calibration_set
 from walop_jax.simulation.simulate import simulate
 
 

@@ -13,7 +13,7 @@ from quick import quick
 from small_run import SEED, SMALL
 
 from walop_jax.commands.docs import pages
-from walop_jax.data import write_calibration_set
+from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.refit import refit
 from walop_jax.simulation.simulate import simulate
 
@@ -39,7 +39,8 @@ SAID = {
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """What the scripts find beside them."""
-    from walop_jax.calibration import Calibration, write_calibration
+    from walop_jax.calibration.calibration import Calibration
+    from walop_jax.calibration.product import write_calibration
 
     path = tmp_path_factory.mktemp("recipes")
     calset = simulate(SMALL, seed=SEED).calset

@@ -22,7 +22,10 @@ __version__ = "0.1.0"
 
 @functools.cache
 def _homes() -> dict[str, tuple[str, str]]:
-    """Module and name there of every public name: the imports of `__init__.pyi`, which type checkers read as well."""
+    """Module and name there of every name: the imports of `__init__.pyi`, which type checkers read as well.
+
+    Those with an underscore are no public names, but what methods of results in the rooms below come to.
+    """
     import ast
     from importlib.resources import files
 
@@ -34,7 +37,7 @@ def _homes() -> dict[str, tuple[str, str]]:
 def __getattr__(name: str) -> Any:
     """Load a public name when it is first asked for; functions look at what they are given."""
     if name == "__all__":
-        return sorted(_homes())
+        return _public()
     if name.startswith("__") or name not in _homes():
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, attribute = _homes()[name]
@@ -56,8 +59,12 @@ def _switch_on_float64() -> None:
         jax.config.update("jax_enable_x64", True)
 
 
+def _public() -> list[str]:
+    return sorted(name for name in _homes() if not name.startswith("_"))
+
+
 def __dir__() -> list[str]:
-    return [*sorted(_homes()), "__version__"]
+    return [*_public(), "__version__"]
 
 
 class _Package(types.ModuleType):

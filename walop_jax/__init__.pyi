@@ -16,6 +16,9 @@ from walop_jax.commands.docs import docs as docs
 from walop_jax.commands.epoch import epoch as epoch
 from walop_jax.commands.import_zemax import import_zemax as import_zemax
 from walop_jax.commands.inputs import read as read
+
+# Methods of results in rooms below: not public by themselves.
+from walop_jax.commands.inputs import save as _save  # noqa: F401
 from walop_jax.commands.inspect import inspect as inspect
 from walop_jax.commands.instrument import instrument as instrument
 from walop_jax.commands.limits import limits as limits
@@ -49,8 +52,9 @@ from walop_jax.model.instrument import Instrument as Instrument
 from walop_jax.model.parameters import param as param
 from walop_jax.model.specification import Model as Model
 from walop_jax.model.specification import with_effects as with_effects
-from walop_jax.posterior import Options as Options
 from walop_jax.posterior.files import Run as Run
+from walop_jax.posterior.result import Options as Options
+from walop_jax.posterior.result import arviz_of_fit as _to_arviz  # noqa: F401
 from walop_jax.simulation.observing_plan import ObservingPlan as ObservingPlan
 
 __version__: str

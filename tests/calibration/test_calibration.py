@@ -12,14 +12,15 @@ from handmade_run import listed
 from science.truth import TrueInstrument, chance
 from small_run import WITH_PLATE, small_fit_with_plate
 
-from walop_jax.calibration import Calibration, read_calibration, write_calibration
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import of_structure
-from walop_jax.data import DataError
+from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.data.settings import Settings
 from walop_jax.fit.minimise import RESULTS
 from walop_jax.fit.model_file import model_for, model_without_data, render
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import Structure
+from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import light
 from walop_jax.model.references import references

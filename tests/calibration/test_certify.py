@@ -9,9 +9,9 @@ import pytest
 from handmade_run import parameters
 from test_other_products import maps, product_of
 
-from walop_jax.calibration import ListedModel
+from walop_jax.calibration.calibration import ListedModel
 from walop_jax.calibration.certify import certify
-from walop_jax.data import read_calibration_set
+from walop_jax.data.calset import read_calibration_set
 
 NAN = float("nan")
 

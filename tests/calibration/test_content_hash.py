@@ -13,12 +13,12 @@ from astropy.io import fits
 from same_record import assert_same
 from test_other_products import product_of
 
-from walop_jax.calibration import read_calibration, write_calibration
 from walop_jax.calibration.calibration import UNCHECKED
 from walop_jax.calibration.certify import certify
-from walop_jax.calibration.product import content_of
-from walop_jax.data import DataError, read_calibration_set
+from walop_jax.calibration.product import content_of, read_calibration, write_calibration
+from walop_jax.data.calset import read_calibration_set
 from walop_jax.fit.verdict import Hidden, Structure
+from walop_jax.io.errors import DataError
 
 OF_FITS = re.compile(
     "SIMPLE|BITPIX|NAXIS|EXTEND|XTENSION|PCOUNT|GCOUNT|TFIELDS|EXTNAME|CHECKSUM|DATASUM|BSCALE|BZERO|BLANK|"

@@ -10,7 +10,8 @@ from importlib.resources import files
 import numpy as np
 from small_run import small_fit
 
-from walop_jax.calibration import Calibration, write_calibration
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import write_calibration
 
 CALL = """
 import sys

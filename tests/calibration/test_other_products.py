@@ -10,19 +10,13 @@ from astropy.io import fits
 from handmade_run import parameters
 from test_product import assert_equal, rewrite
 
-from walop_jax.calibration import (
-    Calibration,
-    ListedModel,
-    MatrixMaps,
-    ResidualMap,
-    matrix_names,
-    read_calibration,
-    residual_names,
-    write_calibration,
-)
-from walop_jax.data import DataError, read_calibration_set
+from walop_jax.calibration.calibration import Calibration, ListedModel
+from walop_jax.calibration.matrix import MatrixMaps, ResidualMap, matrix_names, residual_names
+from walop_jax.calibration.product import read_calibration, write_calibration
+from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.frames import Grid
 from walop_jax.fit.verdict import Quality, Verdict
+from walop_jax.io.errors import DataError
 
 NAN = float("nan")
 GRID = Grid(4, 3, (2.5, 2.0), (0.0, 0.0), ((10.0, 0.0), (0.0, 20.0)))

@@ -12,17 +12,14 @@ from handmade_run import parameters
 from same_record import assert_same
 
 import walop_jax.calibration.product
-from walop_jax.calibration import (
-    Calibration,
-    ListedModel,
-    MatrixMaps,
-    read_calibration,
-    write_calibration,
-)
-from walop_jax.data import DataError, read_calibration_set
+from walop_jax.calibration.calibration import Calibration, ListedModel
+from walop_jax.calibration.matrix import MatrixMaps
+from walop_jax.calibration.product import read_calibration, write_calibration
+from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.frames import Grid
 from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.fit.verdict import Verdict
+from walop_jax.io.errors import DataError
 from walop_jax.io.text import in_ascii
 from walop_jax.model.effects import Context, Described
 from walop_jax.model.effects.optics import AXES

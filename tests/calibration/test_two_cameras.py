@@ -17,13 +17,13 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import _physics
 from walop_jax.calibration.matrix import analysis_vectors, matrices
-from walop_jax.data import DataError
 from walop_jax.data.calset import empty_sources
 from walop_jax.data.catalogue import field_points, read_catalogue
 from walop_jax.data.records import Exposures, FilterCurve, Position, Site
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Verdict
+from walop_jax.io.errors import DataError
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import values_of
 from walop_jax.model.planning import plan_for, plan_for_settings

@@ -15,9 +15,11 @@ from astropy.io import fits
 from command import call, no_cache
 from small_run import SEED, SMALL
 
-from walop_jax.calibration import summary, write_calibration
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data import read_calibration_set, write_calibration_set
+from walop_jax.calibration.product import write_calibration
+from walop_jax.calibration.summary import summary
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.refit import refit
 from walop_jax.model.effects import effect_by_name
 from walop_jax.simulation.simulate import simulate

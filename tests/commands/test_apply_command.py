@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from walop_jax.calibration import read_calibration
+from walop_jax.calibration.product import read_calibration
 
 ADDED = ["Q", "U", "Q_ERR", "U_ERR", "QU_COV", "P", "P_DEBIASED", "P_ERR", "EVPA", "EVPA_ERR", "FLAG"]
 

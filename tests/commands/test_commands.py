@@ -13,8 +13,8 @@ from astropy.io import fits
 from astropy.table import Table
 
 import walop_jax as walop
-from walop_jax.calibration import read_calibration
 from walop_jax.calibration.matrix import p_errors, sample_stars
+from walop_jax.calibration.product import read_calibration
 from walop_jax.data.settings import Settings
 
 SUMMARY_KEYS = (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import walop_jax as walop
-from walop_jax.calibration import read_calibration
+from walop_jax.calibration.product import read_calibration
 from walop_jax.commands import compare, diagnose
 from walop_jax.io.errors import DataError
 from walop_jax.reports.run import read_run

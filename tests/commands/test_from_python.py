@@ -18,8 +18,8 @@ from astropy.table import QTable, Table
 from small_run import small_fit
 
 import walop_jax as walop
-from walop_jax.calibration import write_calibration
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import write_calibration
 from walop_jax.data.records import CalibrationSet
 from walop_jax.io.errors import DataError
 

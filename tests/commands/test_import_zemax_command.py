@@ -7,7 +7,7 @@ import json
 import pytest
 from zemax_exports import write_folder
 
-from walop_jax.data import read_calibration_set
+from walop_jax.data.calset import read_calibration_set
 
 
 @pytest.fixture

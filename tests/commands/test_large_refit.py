@@ -13,9 +13,9 @@ import pytest
 from astropy.io import fits
 from frames_file import write_frames
 
-from walop_jax.calibration import read_calibration, write_calibration
 from walop_jax.calibration.matrix import residual_names
-from walop_jax.data import Grid
+from walop_jax.calibration.product import read_calibration, write_calibration
+from walop_jax.data.frames import Grid
 from walop_jax.likelihood import limits
 from walop_jax.reports import figures
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn

@@ -11,9 +11,8 @@ import pytest
 from handmade_run import listed
 
 import walop_jax as walop
-from walop_jax.calibration import read_calibration, write_calibration
-from walop_jax.data import builtin_filter
-from walop_jax.data.settings import Settings
+from walop_jax.calibration.product import read_calibration, write_calibration
+from walop_jax.data.settings import Settings, builtin_filter
 from walop_jax.io.errors import DataError
 from walop_jax.model.trace import Sightline, trace
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from frames_file import write_frames
 
-from walop_jax.calibration import read_calibration
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import read_calibration
 from walop_jax.calibration.residual_map import residual_map
 from walop_jax.commands.refit import refit
-from walop_jax.data import Grid
+from walop_jax.data.frames import Grid
 from walop_jax.fit import search
 from walop_jax.likelihood import limits, runner
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn

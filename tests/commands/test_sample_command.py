@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from walop_jax.calibration import read_calibration
+from walop_jax.calibration.product import read_calibration
 from walop_jax.data.user_tables import read_input_table
-from walop_jax.posterior import read_draws
+from walop_jax.posterior.files import read_draws
 
 OWN = f"{Path(__file__).resolve().parents[1] / 'posterior' / 'random_walk.py'}:Metropolis"
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from walop_jax.calibration import read_calibration
+from walop_jax.calibration.product import read_calibration
 from walop_jax.commands.refit import refit
 from walop_jax.commands.sample import OUTPUTS, sample
 from walop_jax.fit.refit import FitResult, covariance
 from walop_jax.io.errors import DataError
-from walop_jax.posterior import Run
+from walop_jax.posterior.files import Run
 
 from .conftest import FittedSet, assert_same_files
 

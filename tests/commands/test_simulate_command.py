@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from walop_jax.data import read_calibration_set
+from walop_jax.data.calset import read_calibration_set
 
 SMALL = ("--grid", 3, "--standard-grid", 1, "--angles", 4, "--moon-patches", 2, "--standards", 3)
 

@@ -20,7 +20,7 @@ from walop_jax.data.settings import DEFAULT_FILTER
 from walop_jax.data.zemax import CAMERA_CONFIGURATIONS, RELATIVE_ERROR
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.fit import outliers
-from walop_jax.posterior import Options
+from walop_jax.posterior.result import Options
 from walop_jax.science.polarisation import ESTIMATORS
 
 from .conftest import FittedSet, assert_same_files, without_times

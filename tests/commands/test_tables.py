@@ -11,7 +11,7 @@ import pytest
 from astropy.table import Table
 
 import walop_jax as walop
-from walop_jax.calibration import write_calibration
+from walop_jax.calibration.product import write_calibration
 from walop_jax.data.catalogue import field_points
 from walop_jax.data.user_tables import in_memory
 from walop_jax.fit.verdict import Quality

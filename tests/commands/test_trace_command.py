@@ -10,9 +10,8 @@ import pytest
 from own_instrument import OWN
 
 import walop_jax as walop
-from walop_jax.calibration import read_calibration
-from walop_jax.data import builtin_filter
-from walop_jax.data.settings import Settings
+from walop_jax.calibration.product import read_calibration
+from walop_jax.data.settings import Settings, builtin_filter
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.trace import Sightline, trace
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from walop_jax.data import DataError, read_calibration_set
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.io.errors import DataError
 
 NAN = float("nan")
 

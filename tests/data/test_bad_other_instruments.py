@@ -11,7 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_bad_inputs import column, header, put
 
-from walop_jax.data import DataError, read_calibration_set
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.io.errors import DataError
 
 NAN = float("nan")
 E, I = "EXPOSURES", "INTENSITIES"  # noqa: E741 - as in the tables

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from walop_jax.data import BUILTIN_FILTERS, DataError, builtin_filter
+from walop_jax.data.settings import BUILTIN_FILTERS, builtin_filter
+from walop_jax.io.errors import DataError
 
 # Doi et al. 2010, AJ 139, 1628, Table 4: wavelength (Å), r without atmosphere, atmospheric transmission.
 TABLE_4 = np.array(

@@ -11,15 +11,12 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from frames_file import write_frames
 
-from walop_jax.data import (
-    Block,
-    DataError,
-    FrameIntensities,
-    Grid,
-    TableIntensities,
-    read_calibration_set,
-    write_calibration_set,
-)
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.frames import FrameIntensities, Grid
+from walop_jax.data.records import Block
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.data.write import write_calibration_set
+from walop_jax.io.errors import DataError
 
 GRID = Grid(7, 5, (4.0, 3.0), (0.01, -0.02), ((0.05, 0.004), (-0.003, 0.06)))
 

@@ -13,7 +13,8 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from walop_jax.data import DataError, read_calibration_set
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.io.errors import DataError
 
 
 def same(one, other):

@@ -10,7 +10,8 @@ import socket
 import pytest
 
 from walop_jax.commands.inputs import read
-from walop_jax.data import DataError, read_calibration_set
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.io.errors import DataError
 from walop_jax.io.text import read_text
 
 HUGE = 2**63

@@ -11,17 +11,13 @@ from frames_file import write_frames
 from test_writing import columns as all_columns
 from test_writing import equal
 
-from walop_jax.data import (
-    Block,
-    DataError,
-    FrameIntensities,
-    Grid,
-    Position,
-    TableIntensities,
-    read_calibration_set,
-    write_calibration_set,
-)
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.frames import FrameIntensities, Grid
 from walop_jax.data.inspection import inspect
+from walop_jax.data.records import Block, Position
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.data.write import write_calibration_set
+from walop_jax.io.errors import DataError
 
 NAN = float("nan")
 E, P, I = "EXPOSURES", "POINTS", "INTENSITIES"  # noqa: E741 - as in the tables

@@ -8,7 +8,8 @@ from astropy.io import fits
 from sets import cut
 from south_sets import CUTS, SouthSet
 
-from walop_jax.data import read_calibration_set, write_calibration_set
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.write import write_calibration_set
 
 # Exposures, points, rows of intensities.
 CUT = {"a": (31, 50, 775), "b": (65, 50, 1625), "c": (31, 50, 775), "d": (31, 50, 775)}

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from walop_jax.data import DataError, TableIntensities, read_calibration_set
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.io.errors import DataError
 
 NAN = float("nan")
 

@@ -10,15 +10,13 @@ import pytest
 from frames_file import write_frames
 from south_sets import CUTS, SouthSet
 
-from walop_jax.data import (
-    DataError,
-    Grid,
-    TableIntensities,
-    read_calibration_set,
-    write_calibration_set,
-)
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.frames import Grid
 from walop_jax.data.merge import _Rows, _smallest_singular_value, check_repeats
 from walop_jax.data.records import CalibrationSet, Exposures, Points
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.data.write import write_calibration_set
+from walop_jax.io.errors import DataError
 
 COLUMNS = ("exposure", "point", "source", "counts", "sigma", "flag", "used")
 

@@ -7,9 +7,9 @@ import pytest
 from astropy import units
 from astropy.table import MaskedColumn, Table
 
-from walop_jax.data import DataError
 from walop_jax.data.catalogue import field_points
 from walop_jax.data.user_tables import extended, read_input_table
+from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import write_table
 from walop_jax.model.instrument import nominal_instrument
 

@@ -15,10 +15,10 @@ from astropy.table import MaskedColumn, QTable, Table
 from astropy.time import Time
 from astropy.utils.masked import Masked
 
-from walop_jax.data import DataError
 from walop_jax.data.calset import from_arrays
 from walop_jax.data.catalogue import field_points, read_catalogue
 from walop_jax.data.user_tables import extended, in_memory, read_input_table
+from walop_jax.io.errors import DataError
 from walop_jax.model.instrument import nominal_instrument
 
 SOUTH = nominal_instrument("WALOP-SOUTH")

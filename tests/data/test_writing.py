@@ -13,13 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import walop_jax.data.write
-from walop_jax.data import (
-    DataError,
-    TableIntensities,
-    atomic_path,
-    read_calibration_set,
-    write_calibration_set,
-)
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.data.write import write_calibration_set
+from walop_jax.io.atomic import atomic_path
+from walop_jax.io.errors import DataError
 
 
 def columns(calset):

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from zemax_exports import FIELDS, STATES, export_text, transmission, write_folder
 
-from walop_jax.data import DataError, read_calibration_set, write_calibration_set
+from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.inspection import inspect
+from walop_jax.data.write import write_calibration_set
 from walop_jax.data.zemax import import_transmissions, read_export
+from walop_jax.io.errors import DataError
 
 
 @pytest.fixture

@@ -11,14 +11,15 @@ from matrix_at import matrix_at
 from score_draws import alarms, noise_scores
 from small_run import SEED, SMALL, small_fit
 
-from walop_jax.calibration.matrix import SMALLEST_DETERMINANT
+from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.diagnosis.candidates import probes
 from walop_jax.diagnosis.detection_limits import (
     PROBABILITY,
     DetectionLimits,
     detection_limits,
 )
-from walop_jax.diagnosis.examination import ALARM, Examination, examine
+from walop_jax.diagnosis.examination import Examination, examine
+from walop_jax.diagnosis.policy import ALARM
 from walop_jax.diagnosis.score import effective_trials, local_p
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.model.effects import effect_by_name

@@ -20,7 +20,7 @@ from walop_jax.diagnosis.trust import examined, group_scores
 from walop_jax.fit import refit as fitting
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import Doubt, Quality, Verdict
-from walop_jax.posterior import sample
+from walop_jax.posterior.sampling import sample
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from small_run import SMALL, small_fit
 
-from walop_jax.calibration import read_calibration, write_calibration
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.design import Design

@@ -10,7 +10,7 @@ from between_points import WORST, between_points
 from scenes import PLAN
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data import read_calibration_set
+from walop_jax.data.calset import read_calibration_set
 from walop_jax.diagnosis.candidates import probes
 from walop_jax.diagnosis.design import Design, exposure_folds, field_folds, held_out
 from walop_jax.diagnosis.examination import examine

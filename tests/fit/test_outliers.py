@@ -11,11 +11,14 @@ from quick import quick
 from small_run import SEED, SMALL, small_fit
 
 from walop_jax.commands.clip import clip
-from walop_jax.data import DataError, DataFlag, TableIntensities, read_calibration_set, write_calibration_set
-from walop_jax.data.records import CalibrationSet
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.records import CalibrationSet, DataFlag
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.misfit import describe
 from walop_jax.fit.outliers import clipped, outlying
 from walop_jax.fit.refit import fit
+from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.simulate import simulate
 

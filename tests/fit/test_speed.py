@@ -22,7 +22,8 @@ from oracle import forward
 from scipy.optimize import least_squares
 from scipy.sparse import lil_matrix
 
-from walop_jax.data import read_calibration_set, write_calibration_set
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from walop_jax.calibration import read_calibration
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import read_calibration
 from walop_jax.commands.refit import refit
-from walop_jax.data import read_calibration_set
+from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import FitResult, fit

@@ -13,7 +13,7 @@ import time
 
 import pytest
 
-from walop_jax.data import DataError
+from walop_jax.io.errors import DataError
 from walop_jax.io.folder import check_folder, output_folder
 
 NAMES = ("a.txt", "b.txt")

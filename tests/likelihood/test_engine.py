@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from oracle import forward, validate
 
-from walop_jax.data import read_calibration_set
+from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import Block, CalibrationSet, Intensities, Points, Site, Sources
 from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood import engine

@@ -12,15 +12,11 @@ from frames_file import write_frames
 
 from walop_jax.calibration import residual_map
 from walop_jax.calibration.residual_map import residual_map_of_pixels
-from walop_jax.data import (
-    Grid,
-    merge_calibration_sets,
-    read_calibration_set,
-    write_calibration_set,
-)
-from walop_jax.data.frames import RowReader, float64
-from walop_jax.data.merge import without_frames
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.frames import Grid, RowReader, float64
+from walop_jax.data.merge import merge_calibration_sets, without_frames
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.data.write import write_calibration_set
 from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit, with_honest_errors

@@ -11,7 +11,8 @@ import pytest
 from frame_run import frame_run
 from frames_file import write_frames
 
-from walop_jax.data import Grid, read_calibration_set
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.frames import Grid
 from walop_jax.data.records import Intensities
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit

@@ -11,7 +11,7 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
-from walop_jax.posterior import Target
+from walop_jax.posterior.target import Target
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 

@@ -36,7 +36,8 @@ from frames_file import write_frames
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import analysis_vectors
 from walop_jax.calibration.residual_map import residual_map
-from walop_jax.data import Grid, read_calibration_set
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.frames import Grid
 from walop_jax.data.records import Block, CalibrationSet, Intensities
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_file import base_model

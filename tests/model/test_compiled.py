@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import walop_jax
-from walop_jax.data import builtin_filter
+from walop_jax.data.settings import builtin_filter
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled, knows
 from walop_jax.model.dependence import optical_indices

@@ -6,7 +6,7 @@ import pytest
 from oracle import forward
 from scipy.optimize import least_squares
 
-from walop_jax.data import builtin_filter
+from walop_jax.data.settings import builtin_filter
 from walop_jax.model.instrument import nominal_instrument
 
 # Paper II, table of the laboratory results: tilt (deg), cross-talk from q into u_m

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from oracle import forward
 
-from walop_jax.data import builtin_filter
+from walop_jax.data.settings import builtin_filter
 from walop_jax.model import quadrature
 
 CENTRE_TO_CORNERS = (

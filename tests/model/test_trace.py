@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from quick import quick
 
-from walop_jax.data import builtin_filter
-from walop_jax.data.settings import Settings
+from walop_jax.data.settings import Settings, builtin_filter
 from walop_jax.model import light
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.base import Context

@@ -13,7 +13,7 @@ from scipy import stats
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import SMALLEST_DETERMINANT
+from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table

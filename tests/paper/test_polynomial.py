@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.data import DataError
 from walop_jax.data.settings import Settings
+from walop_jax.io.errors import DataError
 from walop_jax.paper import comparison
 from walop_jax.paper import polynomial as paper
 from walop_jax.science import star_errors as accuracy

@@ -15,6 +15,7 @@ from walop_jax.data.user_tables import in_memory
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
+from walop_jax.io.names import PLANNED
 from walop_jax.io.text import json_text
 from walop_jax.likelihood.flux import Sharing
 from walop_jax.model.specification import effect_context, with_effects
@@ -22,7 +23,6 @@ from walop_jax.plans.could import Costs, Could
 from walop_jax.plans.exposures import Illumination, candidates
 from walop_jax.plans.plan import plan_from
 from walop_jax.plans.wanted import FieldErrors, field_errors, wanted
-from walop_jax.posterior.files import PLANNED
 from walop_jax.reports.page import kind_of_run, render_other
 from walop_jax.science.field_accuracy import p_errors
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, plan_text, read_plan

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from walop_jax.fit.refit import FitResult, fit
-from walop_jax.posterior import Surrogate, Target, build_surrogate
+from walop_jax.posterior.surrogate import Surrogate, build_surrogate
+from walop_jax.posterior.target import Target
 
 from .worlds import World, Worlds
 

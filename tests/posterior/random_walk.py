@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from walop_jax.posterior import Sampler, Stretch
+from walop_jax.posterior.samplers import Sampler, Stretch
 
 
 class Metropolis(Sampler):

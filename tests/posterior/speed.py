@@ -42,11 +42,15 @@ def measure(path: Path, nuts_draws: int, plain_steps: int) -> dict[str, Any]:
     from oracle import fit as oracle_fit
     from oracle import forward
 
-    from walop_jax.data import read_calibration_set
+    from walop_jax.data.calset import read_calibration_set
     from walop_jax.fit.model_file import base_model
     from walop_jax.fit.refit import fit
     from walop_jax.likelihood.likelihood import Likelihood
-    from walop_jax.posterior import Nuts, Options, Target, build_surrogate, exact_density, sample
+    from walop_jax.posterior.nuts import Nuts
+    from walop_jax.posterior.result import Options
+    from walop_jax.posterior.sampling import sample
+    from walop_jax.posterior.surrogate import build_surrogate
+    from walop_jax.posterior.target import Target, exact_density
 
     calset = read_calibration_set(path)
     likelihood = Likelihood.of(calset, base_model(calset))

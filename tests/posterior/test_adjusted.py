@@ -10,7 +10,8 @@ from walop_jax.fit.verdict import STATED
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.specification import Model, make_model
-from walop_jax.posterior import Convergence, PosteriorSample, sandwich_adjusted
+from walop_jax.posterior.result import Convergence, PosteriorSample
+from walop_jax.posterior.sampling import sandwich_adjusted
 
 # Three parameters, the third tied to the first.
 TIES = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0]])

@@ -26,7 +26,9 @@ from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.parameters import with_values
 from walop_jax.model.planning import plan_for_settings
-from walop_jax.posterior import Options, Target, sample
+from walop_jax.posterior.result import Options
+from walop_jax.posterior.sampling import sample
+from walop_jax.posterior.target import Target
 
 from .worlds import World, Worlds, band_statistic, ecdf_band
 

@@ -15,7 +15,10 @@ import numpy as np
 import pytest
 
 from walop_jax.io.errors import DataError
-from walop_jax.posterior import MOVES, Chain, Density, Emcee, assess, r_hat
+from walop_jax.posterior.emcee import MOVES, Emcee
+from walop_jax.posterior.files import Chain
+from walop_jax.posterior.result import assess, r_hat
+from walop_jax.posterior.samplers import Density
 
 MARK = {"data": "a", "model": "b"}
 

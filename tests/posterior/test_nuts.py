@@ -12,11 +12,13 @@ import pytest
 from emcee.autocorr import integrated_time
 from south_sets import SouthSet
 
-from walop_jax.data import read_calibration_set
+from walop_jax.data.calset import read_calibration_set
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.posterior import Options, Target, sample
+from walop_jax.posterior.result import Options
+from walop_jax.posterior.sampling import sample
+from walop_jax.posterior.target import Target
 
 DRAWS = 4000
 

@@ -12,22 +12,12 @@ import pytest
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.errors import DataError
-from walop_jax.posterior import (
-    SAMPLERS,
-    Chain,
-    Density,
-    Emcee,
-    Ensembles,
-    Nuts,
-    Options,
-    Sampler,
-    Stretch,
-    make_sampler,
-    read_draws,
-    sample,
-    with_moments,
-    write_posterior,
-)
+from walop_jax.posterior.emcee import Emcee
+from walop_jax.posterior.files import Chain, read_draws, with_moments, write_posterior
+from walop_jax.posterior.nuts import Nuts
+from walop_jax.posterior.result import Options
+from walop_jax.posterior.samplers import SAMPLERS, Density, Sampler, Stretch, make_sampler
+from walop_jax.posterior.sampling import Ensembles, sample
 
 from .conftest import Scene
 
@@ -170,7 +160,9 @@ def test_what_is_no_sampler_is_refused_with_advice(tmp_path: Path, monkeypatch: 
     broken.write_text("import nothing_of_the_kind\n")
     with pytest.raises(DataError, match=r"broken\.py: cannot be run: ModuleNotFoundError"):
         Options(sampler=f"{broken}:Any")
-    broken.write_text("from walop_jax.posterior import Sampler\nclass Half(Sampler):\n    name = 'half'\n")
+    broken.write_text(
+        "from walop_jax.posterior.samplers import Sampler\nclass Half(Sampler):\n    name = 'half'\n"
+    )
     with pytest.raises(DataError, match=r"cannot be made: .*abstract"):
         Options(sampler=f"{broken}:Half")
     with pytest.raises(DataError, match="'walkers' is no option of the sampler 'metropolis'"):

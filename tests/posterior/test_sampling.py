@@ -17,16 +17,10 @@ from walop_jax.data.user_tables import read_input_table
 from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import astropy_table, write_table
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.posterior import (
-    Options,
-    PosteriorSample,
-    read_draws,
-    sample,
-    sampling,
-    with_draws,
-    with_moments,
-    write_posterior,
-)
+from walop_jax.posterior import sampling
+from walop_jax.posterior.files import read_draws, with_draws, with_moments, write_posterior
+from walop_jax.posterior.result import Options, PosteriorSample
+from walop_jax.posterior.sampling import sample
 
 from .conftest import Scene
 

@@ -7,14 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from walop_jax.posterior import (
-    Surrogate,
-    Target,
-    build_surrogate,
-    choose_sampled,
-    compare_with_exact,
-    near_linear,
-)
+from walop_jax.posterior.surrogate import Surrogate, build_surrogate, compare_with_exact
+from walop_jax.posterior.target import Target, choose_sampled, near_linear
 
 from .conftest import Scene
 

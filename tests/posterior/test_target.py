@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.posterior import Density, Target, exact_density
+from walop_jax.posterior.samplers import Density
+from walop_jax.posterior.target import Target, exact_density
 
 from .conftest import Scene
 

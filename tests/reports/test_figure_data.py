@@ -10,13 +10,13 @@ import pytest
 from astropy.io import fits
 from builders import exposures
 
-from walop_jax.data import DataError
 from walop_jax.diagnosis.figure_data import (
     best_combination,
     compare_residuals,
     read_figure_data,
     write_figure_data,
 )
+from walop_jax.io.errors import DataError
 
 ANGLES = 22.5 * np.arange(16)
 SEQUENCE = exposures(

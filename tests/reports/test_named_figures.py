@@ -13,10 +13,11 @@ import pytest
 from own_instrument import OWN
 from small_run import SEED, SMALL
 
-from walop_jax.calibration import write_calibration
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import write_calibration
 from walop_jax.commands.plot import plot
-from walop_jax.data import read_calibration_set, write_calibration_set
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.write import write_calibration_set
 from walop_jax.diagnosis.figure_data import write_figure_data
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit

@@ -15,7 +15,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import astropy_table, write_table
 from walop_jax.io.text import probability, value_and_error, with_error
 from walop_jax.model.effects import EFFECTS
-from walop_jax.posterior import Run
+from walop_jax.posterior.files import Run
 from walop_jax.reports import page as page_module
 from walop_jax.reports.page import render
 from walop_jax.reports.run import read_run

@@ -13,11 +13,11 @@ from small_run import SEED, WITH_PLATE
 from star_tables import SOUTH, read, setting, stars
 
 from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors, colour_weights
-from walop_jax.data import DataError
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Quality
+from walop_jax.io.errors import DataError
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.specification import effect_context, make_model, with_effects

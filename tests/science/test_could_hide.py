@@ -11,10 +11,11 @@ from astropy.table import Table
 from small_run import SEED, SMALL, small_fit
 from star_tables import SOUTH, setting
 
-from walop_jax.calibration import Calibration, read_calibration, write_calibration
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify
 from walop_jax.calibration.could_hide import change_by_effect, could_hide
+from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.design import Design

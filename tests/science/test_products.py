@@ -14,11 +14,11 @@ from small_run import SMALL
 from typer.testing import CliRunner
 
 import walop_jax.science.epoch
-from walop_jax.calibration import write_calibration
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify, validity
+from walop_jax.calibration.product import write_calibration
 from walop_jax.commands.program import app
-from walop_jax.data import write_calibration_set
+from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.model_file import model_for
 from walop_jax.fit.refit import fit, refit, with_honest_errors
 from walop_jax.fit.verdict import Doubt, Quality
@@ -43,7 +43,7 @@ def first():
 
 @pytest.fixture(scope="module")
 def product(first, tmp_path_factory):
-    from walop_jax.data import read_calibration_set
+    from walop_jax.data.calset import read_calibration_set
 
     path = tmp_path_factory.mktemp("sets") / "first.fits"
     write_calibration_set(path, simulate(SMALL, seed=5).calset)

@@ -15,12 +15,10 @@ import numpy as np
 import pytest
 from own_instrument import OWN
 
-from walop_jax.data import (
-    TableIntensities,
-    merge_calibration_sets,
-    read_calibration_set,
-    write_calibration_set,
-)
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.merge import merge_calibration_sets
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre

@@ -15,7 +15,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from science.truth import TrueInstrument
 
-from walop_jax.data import DataError, Site, read_calibration_set
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.records import Site
+from walop_jax.io.errors import DataError
 from walop_jax.sky.moon import (
     body_direction,
     earth_rotation,

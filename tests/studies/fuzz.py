@@ -40,14 +40,10 @@ from astropy.table import Table  # noqa: E402
 from handmade_run import parameters  # noqa: E402
 from handmade_set import Handmade  # noqa: E402
 
-from walop_jax.calibration import (  # noqa: E402
-    Calibration,
-    ListedModel,
-    MatrixMaps,
-    read_calibration,
-    write_calibration,
-)  # fmt: skip
-from walop_jax.data import DataError, read_calibration_set  # noqa: E402
+from walop_jax.calibration.calibration import Calibration, ListedModel  # noqa: E402
+from walop_jax.calibration.matrix import MatrixMaps  # noqa: E402
+from walop_jax.calibration.product import read_calibration, write_calibration  # noqa: E402
+from walop_jax.data.calset import read_calibration_set  # noqa: E402
 from walop_jax.data.catalogue import read_catalogue  # noqa: E402
 from walop_jax.data.frames import Grid  # noqa: E402
 from walop_jax.data.user_tables import read_input_table  # noqa: E402
@@ -57,6 +53,7 @@ from walop_jax.fit.model_file import (  # noqa: E402
     render,
 )
 from walop_jax.fit.verdict import Verdict  # noqa: E402
+from walop_jax.io.errors import DataError  # noqa: E402
 from walop_jax.model.instrument import nominal_instrument  # noqa: E402
 
 SLOWEST = 10  # seconds

@@ -35,8 +35,9 @@ from trust import with_block  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.calibration.matrix import sky_vectors  # noqa: E402
-from walop_jax.data import Grid, read_calibration_set  # noqa: E402
+from walop_jax.data.calset import read_calibration_set  # noqa: E402
 from walop_jax.data.catalogue import read_catalogue  # noqa: E402
+from walop_jax.data.frames import Grid  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
 from walop_jax.data.settings import Settings  # noqa: E402
 from walop_jax.data.user_tables import in_memory  # noqa: E402

@@ -48,7 +48,9 @@ from walop_jax.commands.compress import compress  # noqa: E402
 from walop_jax.commands.diagnose import diagnose  # noqa: E402
 from walop_jax.commands.refit import refit  # noqa: E402
 from walop_jax.commands.sample import sample  # noqa: E402
-from walop_jax.data import DataError, Grid, write_calibration_set  # noqa: E402
+from walop_jax.data.frames import Grid  # noqa: E402
+from walop_jax.data.write import write_calibration_set  # noqa: E402
+from walop_jax.io.errors import DataError  # noqa: E402
 from walop_jax.likelihood import limits  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402

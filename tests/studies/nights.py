@@ -35,9 +35,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np  # noqa: E402
 from scipy import linalg, stats  # noqa: E402
 
-from walop_jax.calibration import read_calibration  # noqa: E402
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
-from walop_jax.data import write_calibration_set  # noqa: E402
+from walop_jax.calibration.product import read_calibration  # noqa: E402
+from walop_jax.data.write import write_calibration_set  # noqa: E402
 from walop_jax.fit.model_file import base_model  # noqa: E402
 from walop_jax.fit.refit import fit  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402

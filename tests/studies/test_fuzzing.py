@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fuzz import OUTCOMES, Answer, Subject, outcome, study, subjects
 
-from walop_jax.data import DataError
+from walop_jax.io.errors import DataError
 
 
 @pytest.fixture(scope="module")

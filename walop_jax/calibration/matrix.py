@@ -21,6 +21,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
@@ -39,9 +40,6 @@ from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan, with_numbers
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model
-
-SMALLEST_DETERMINANT = 0.1
-"""|m22 m33 − m23 m32| below which a single exposure carries almost no information on u."""
 
 
 def matrix_names(arms: int) -> tuple[str, ...]:

@@ -31,11 +31,11 @@ from walop_jax.fit.verdict import DATA, STATED, Hidden, Structure, Verdict
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.fits_reading import OpenFile, open_fits
+from walop_jax.io.names import PRODUCT
 from walop_jax.io.text import in_ascii
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.parameters import NAME, Parameter
 
-PRODUCT = "calibration.fits"
 HASHRULE = 2
 """Rule of CONTHASH; that of earlier products, without this word, left words of the headers aside."""
 PRODVERS = 2

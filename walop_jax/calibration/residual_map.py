@@ -30,7 +30,7 @@ from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import FieldTable
-from walop_jax.likelihood.flux import project_flux, sharing
+from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.frames import FrameSums, PixelPosterior, in_blocks, information
 from walop_jax.likelihood.likelihood import Census, Likelihood, Posterior
 from walop_jax.model import light
@@ -68,7 +68,7 @@ def _point_sums(
     change = _changes(vectors, stokes, unit, instrument.cameras.pairs) * (flux * weight)[:, None]
     known = plan.exposures.flux_known
     change = jnp.moveaxis(change, 1, 0)  # exposures next to cameras
-    change = jnp.moveaxis(project_flux(change, unit * weight, known, sharing(instrument, plan)), 0, 1)
+    change = jnp.moveaxis(project_flux(change, unit * weight, known, engine.sharing(instrument, plan)), 0, 1)
     seen = (point.weight[:, 0] > 0) & chosen
     freedom = jnp.sum(jnp.where(seen, unit.shape[-1] - jnp.where(known, 0.0, instrument.cameras.fluxes), 0.0))
     chi2 = jnp.sum(jnp.where(chosen[:, None], residual, 0.0) ** 2)

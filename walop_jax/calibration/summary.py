@@ -10,8 +10,6 @@ from walop_jax.fit.misfit import Misfit
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.code import software_versions
 
-SUMMARY, FAILED = "summary.json", "summary.failed.json"
-
 
 def summary(
     result: FitResult,

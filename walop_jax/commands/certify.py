@@ -64,9 +64,9 @@ def certify(job: Job, calibration: Product, effects: Effects = None) -> Outcome[
     >>> [check.name for check in walop.certify("RUN").failed]  # doctest: +SKIP
     """
     from walop_jax import Calibration, FitResult
-    from walop_jax.calibration import product_path, read_calibration
     from walop_jax.calibration.certify import certify as checks_of
     from walop_jax.calibration.certify import validity
+    from walop_jax.calibration.product import product_path, read_calibration
 
     job.tell("checking")
     if isinstance(calibration, Calibration | FitResult):

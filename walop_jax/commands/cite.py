@@ -31,14 +31,14 @@ def cite(
     'polariser'
     """
     from walop_jax import Run, __version__
-    from walop_jax.calibration import product_path
+    from walop_jax.calibration.product import product_path
     from walop_jax.data.settings import DEFAULT_FILTER
     from walop_jax.fit import minimise
     from walop_jax.fit.model_file import model_without_data
+    from walop_jax.io.names import POSTERIOR
     from walop_jax.model.instrument import nominal_instrument
     from walop_jax.model.references import Reference, references
     from walop_jax.model.references import bibtex as entries
-    from walop_jax.posterior.files import POSTERIOR
 
     sampled = isinstance(run, Run) and POSTERIOR in run
     if isinstance(run, str | os.PathLike) and Path(run).is_dir():

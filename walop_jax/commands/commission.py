@@ -37,8 +37,8 @@ def commission(
     >>> walop.commission("night.fits").missing  # doctest: +SKIP
     """
     from walop_jax.io.atomic import atomic_path
+    from walop_jax.io.names import COMMISSIONING
     from walop_jax.io.text import json_text
-    from walop_jax.posterior.files import COMMISSIONING
     from walop_jax.science.commissioning import commissioning
 
     fitted = command_of(refit).body(job, data, model, output=output, instrument=instrument, effects=effects)

@@ -56,12 +56,14 @@ def diagnose(
 
     >>> walop.diagnose("night.fits", progress=print).verdict  # doctest: +SKIP
     """
-    from walop_jax.calibration import PRODUCT, SUMMARY, summary, write_calibration
-    from walop_jax.diagnosis.figure_data import FIGURE_DATA, figure_data, write_figure_data
-    from walop_jax.diagnosis.findings import DIAGNOSIS, document
+    from walop_jax.calibration.product import write_calibration
+    from walop_jax.calibration.summary import summary
+    from walop_jax.diagnosis.figure_data import figure_data, write_figure_data
+    from walop_jax.diagnosis.findings import document
     from walop_jax.diagnosis.workflow import diagnose as diagnosis_of
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.model_file import render
+    from walop_jax.io.names import DIAGNOSIS, FIGURE_DATA, PRODUCT, SUMMARY
     from walop_jax.science.field_accuracy import answered
 
     job.begin("reading")

@@ -50,7 +50,7 @@ def epoch(
     >>> walop.epoch("RUN", "new.fits").holds  # doctest: +SKIP
     """
     from walop_jax import Calibration
-    from walop_jax.calibration import write_calibration
+    from walop_jax.calibration.product import write_calibration
     from walop_jax.diagnosis.findings import document
     from walop_jax.diagnosis.trust import examined
     from walop_jax.diagnosis.workflow import diagnose

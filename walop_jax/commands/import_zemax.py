@@ -40,7 +40,8 @@ def import_zemax(
 
     >>> design = walop.import_zemax("exports")  # doctest: +SKIP
     """
-    from walop_jax.data import import_transmissions, write_calibration_set
+    from walop_jax.data.write import write_calibration_set
+    from walop_jax.data.zemax import import_transmissions
     from walop_jax.instruments.description import shipped
 
     try:

@@ -103,10 +103,10 @@ def read(
     'WALOP-SOUTH'
     """
     from walop_jax import Run
-    from walop_jax.calibration import FAILED, PRODUCT, read_calibration
-    from walop_jax.data import read_calibration_set
+    from walop_jax.calibration.product import read_calibration
+    from walop_jax.data.calset import read_calibration_set
     from walop_jax.io.fits_reading import primary_keywords
-    from walop_jax.posterior.files import DOCUMENTS
+    from walop_jax.io.names import DOCUMENTS, FAILED, PRODUCT
 
     load_elements(elements)
     if not paths:
@@ -159,8 +159,7 @@ def paths_of(data: Sets) -> tuple[PathLike, ...]:
 def set_of(data: Sets, instrument: Instrument | None = None) -> CalibrationSet:
     """A checked set: files are checked as they are read, tables in memory here."""
     from walop_jax import CalibrationSet
-    from walop_jax.data import read_calibration_set
-    from walop_jax.data.calset import checked
+    from walop_jax.data.calset import checked, read_calibration_set
     from walop_jax.data.records import KINDS
     from walop_jax.data.table_intensities import TableIntensities
 
@@ -217,7 +216,7 @@ def calibration_of(given: Product, effects: Effects = None) -> Calibration:
     Raises `DataError` for a file that cannot be read.
     """
     from walop_jax import Calibration, FitResult
-    from walop_jax.calibration import read_calibration
+    from walop_jax.calibration.product import read_calibration
 
     if isinstance(given, Calibration | FitResult):
         there = given if isinstance(given, Calibration) else Calibration.from_fit(given)
@@ -233,9 +232,11 @@ def save(
     Raises `DataError` where they exist already and `overwrite` is False.
     """
     from walop_jax import Calibration, FitResult, Run
-    from walop_jax.calibration import PRODUCT, SUMMARY, summary, write_calibration
+    from walop_jax.calibration.product import write_calibration
+    from walop_jax.calibration.summary import summary
     from walop_jax.io.errors import fail
     from walop_jax.io.folder import output_folder
+    from walop_jax.io.names import PRODUCT, SUMMARY
     from walop_jax.io.text import json_text
 
     held = result.calibration if isinstance(result, Run) else result

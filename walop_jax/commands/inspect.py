@@ -118,7 +118,7 @@ def inspect(
     ()
     """
     from walop_jax import CalibrationSet
-    from walop_jax.data import read_calibration_set
+    from walop_jax.data.calset import read_calibration_set
     from walop_jax.data.inspection import inspect as inspection_of
     from walop_jax.instruments.description import shipped
 

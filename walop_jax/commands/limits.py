@@ -116,7 +116,7 @@ def limits(
 
 def _plan(data: object, output: PathLike, instrument: object, result: FitResult) -> Sequence[str]:
     """The command that plans better exposures: beside a fit, of the plan that was given, or of the instrument."""
-    from walop_jax.calibration import PRODUCT
+    from walop_jax.io.names import PRODUCT
     from walop_jax.simulation.observing_plan import is_plan
 
     if len(result.model.template.cameras.pairs) != 2:

@@ -75,7 +75,7 @@ def matrix(
     from walop_jax.data.catalogue import POINT_COLUMNS, field_points
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.plain_tables import MatrixTable, table_format
-    from walop_jax.posterior import with_draws
+    from walop_jax.posterior.files import with_draws
 
     if (points is None) == (x is None):
         raise UsageError("give either x and y, or a table of points", "points")

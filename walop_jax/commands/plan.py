@@ -93,10 +93,10 @@ def plan(
     from walop_jax.data.records import CALIBRATION_PLATE
     from walop_jax.data.user_tables import read_input_table
     from walop_jax.diagnosis.findings import Diagnosis
+    from walop_jax.io.names import PLANNED
     from walop_jax.plans.could import Could
     from walop_jax.plans.plan import plan_exposures
     from walop_jax.plans.wanted import check_wishes
-    from walop_jax.posterior.files import PLANNED
     from walop_jax.simulation.observing_plan import plan_text
 
     check_wishes(minutes, goal, draws)
@@ -170,7 +170,7 @@ def _alike(after: Any, known: Calibration) -> tuple[Any, ...]:
     """The effects that a diagnosis could not tell apart: that found, as it is, then its rivals by name."""
     from walop_jax import Run
     from walop_jax.diagnosis.findings import Diagnosis, document
-    from walop_jax.posterior.files import DIAGNOSIS
+    from walop_jax.io.names import DIAGNOSIS
 
     if isinstance(after, str | os.PathLike):
         after = Run(Path(after))

@@ -14,7 +14,7 @@ from walop_jax.io.errors import fail
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.diagnosis.findings import Diagnosis
-    from walop_jax.posterior import PosteriorSample
+    from walop_jax.posterior.result import PosteriorSample
 
 FORMATS = (".pdf", ".png", ".svg", ".eps", ".jpg")
 RUN = Argument("Folder of results; none: list the figures.", "[RUN]", Path)

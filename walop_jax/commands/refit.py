@@ -58,12 +58,14 @@ def refit(
     15.6675 ± 0.0051
     """
     from walop_jax import Calibration
-    from walop_jax.calibration import FAILED, PRODUCT, SUMMARY, summary, write_calibration
+    from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.residual_map import residual_map
+    from walop_jax.calibration.summary import summary
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.refit import refit as fit
     from walop_jax.io.atomic import atomic_path
+    from walop_jax.io.names import FAILED, PRODUCT, SUMMARY
     from walop_jax.io.progress import Stage
     from walop_jax.io.text import json_text
     from walop_jax.science.field_accuracy import answered

@@ -15,7 +15,7 @@ from walop_jax.io.text import read_text
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run
-    from walop_jax.posterior import PosteriorSample, Progress
+    from walop_jax.posterior.result import PosteriorSample, Progress
 
 RUN = Argument("Folder of a `walop-jax refit`.", "RUN", Path)
 STEPS = Option("Stop there at the latest, converged or not; a multiple of --interval.", least=1)
@@ -59,7 +59,7 @@ def sample(
     >>> walop.sample(result, seed=1).to_arviz()  # doctest: +SKIP
     """
     from walop_jax import FitResult, Options, Run
-    from walop_jax.posterior import sample as sample_fit
+    from walop_jax.posterior.sampling import sample as sample_fit
 
     known = {field.name for field in dataclasses.fields(Options)}
     if unknown := sorted(set(more) - known):
@@ -108,10 +108,11 @@ def _sampled_run(
 ) -> PosteriorSample:
     """The posterior around the fit in a folder, written there, with the covariance in its product if it can be."""
     from walop_jax import Model
-    from walop_jax.calibration import PRODUCT, read_calibration
+    from walop_jax.calibration.product import read_calibration
     from walop_jax.io.folder import output_folder
-    from walop_jax.posterior import Chain, digest_of_fit
-    from walop_jax.posterior import sample as sample_fit
+    from walop_jax.io.names import PRODUCT
+    from walop_jax.posterior.files import Chain, digest_of_fit
+    from walop_jax.posterior.sampling import sample as sample_fit
 
     folder = run.folder
     if not folder.is_dir():
@@ -139,10 +140,11 @@ def _sampled_run(
 
 def _writers(product: Calibration, posterior: PosteriorSample) -> Writers:
     """The files of a sampled run."""
-    from walop_jax.calibration import PRODUCT, write_calibration
+    from walop_jax.calibration.product import write_calibration
+    from walop_jax.io.names import PRODUCT
     from walop_jax.io.plain_tables import write_table
     from walop_jax.io.text import json_text
-    from walop_jax.posterior import write_posterior
+    from walop_jax.posterior.files import write_posterior
     from walop_jax.reports.named import draw
     from walop_jax.reports.posterior_figures import save_figure
     from walop_jax.reports.run import FigureSource

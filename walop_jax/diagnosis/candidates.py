@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.data.records import CalibrationSet, Exposures
-from walop_jax.diagnosis.design import RINGS
+from walop_jax.diagnosis.policy import RINGS
 from walop_jax.diagnosis.score import Candidate
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.columns import Change, Columns, own_columns

@@ -43,18 +43,18 @@ from jaxtyping import Bool, Float, Int
 from numpy.polynomial.legendre import legvander
 
 from walop_jax.data.records import POLARISER, CalibrationSet, Exposures
+from walop_jax.diagnosis.policy import RINGS
 from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import cut, states
-from walop_jax.likelihood import limits
-from walop_jax.likelihood.flux import project_flux, sharing
+from walop_jax.likelihood import engine, limits
+from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.inverses import unit_columns, whitening
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.effects.free_form import FINE, HARMONICS, SMOOTH, WIDTH
 from walop_jax.model.instrument import Instrument
 
-RINGS = (3, 4, 5, 6, 7, 8)  # degrees; the throughput takes up what is smoother
 SINGLE_EXPOSURES = "single exposures"
 STATES = "states"
 
@@ -74,7 +74,7 @@ class Measured:
         flux = np.where(self.flux == 0, 1.0, self.flux)[..., None]
         self.model: Cube = (self.counts * self.weight - self.residual) / flux
         self.known = likelihood.flux_known
-        self.shared = sharing(likelihood.model.template, likelihood.plan)
+        self.shared = engine.sharing(likelihood.model.template, likelihood.plan)
         self.cameras = likelihood.cameras
         # Of the model, not of the counts: patterns that know the noise would find it in the residuals.
         unit = self.model / np.where(self.weight > 0, self.weight, 1.0)

@@ -41,7 +41,7 @@ from walop_jax.calibration.matrix import change_of_qu, effect_slopes, first_sett
 from walop_jax.diagnosis.candidates import Probe, applicable, fringes_of
 from walop_jax.diagnosis.candidates import probes as all_probes
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.examination import ALARM, Examination, examine, most_points
+from walop_jax.diagnosis.examination import Examination, examine, most_points
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.limits_found import (
     PROBABILITY,
@@ -50,7 +50,7 @@ from walop_jax.diagnosis.limits_found import (
     DetectionLimits,
     over_field,
 )
-from walop_jax.diagnosis.policy import POLICY
+from walop_jax.diagnosis.policy import ALARM, POLICY
 from walop_jax.diagnosis.score import ScoreSpace, local_p, noncentrality, separations
 from walop_jax.diagnosis.stated_conditions import STEP, Singles, condition_scores
 from walop_jax.diagnosis.trust import sampled

@@ -39,7 +39,8 @@ from walop_jax.diagnosis.score import (
     log_bayes,
     separations,
 )
-from walop_jax.fit.refit import SUSPECT_SIGMA, FitResult
+from walop_jax.fit.refit import FitResult
+from walop_jax.fit.verdict import SUSPECT_SIGMA
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Described, Effect
 from walop_jax.model.instrument import Instrument
@@ -48,8 +49,6 @@ from walop_jax.model.parameters import field_declarations
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
 Parts = Sequence[tuple[Probe, Collection[type[Effect]]]]
-
-ALARM = POLICY.alarm
 
 
 @dataclasses.dataclass(frozen=True)

@@ -34,7 +34,6 @@ from walop_jax.io.text import in_ascii
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import FreeForm
 
-FIGURE_DATA = "diagnosis.fits"
 DIAGVERS = 1
 """Version of the file format that is written, and the newest that is read."""
 
@@ -244,7 +243,6 @@ Used = Bool[np.ndarray, "p e"]
 
 WORDS_FROM = 0.3  # share of the best weights' power with which a combination in words is preferred
 LEAST_COVERAGE = 0.5  # share of Σ w² that the exposures of a point must hold for the point to be shown
-UNNAMED = FreeForm.name  # the effect that stands for patterns without a name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -274,7 +272,7 @@ def figure_data(diagnosis: Diagnosis) -> DiagnosisFigureData:
     pairs = [("", before, after)]
     pairs += [(step.effect, step.residual_before, step.residual_after) for step in diagnosis.steps]
     if _unnamed_term(diagnosis):
-        pairs.append((UNNAMED, pairs[-1][2] if diagnosis.steps else before, after))
+        pairs.append((FreeForm.name, pairs[-1][2] if diagnosis.steps else before, after))
     angle = np.where(exposures.clp_in, exposures.clp_angle, np.nan)
     return DiagnosisFigureData(
         points=final.calset.points,
@@ -294,7 +292,7 @@ def figure_data(diagnosis: Diagnosis) -> DiagnosisFigureData:
 
 def _unnamed_term(diagnosis: Diagnosis) -> bool:
     known = [*diagnosis.before.model.effect_names, *(step.effect for step in diagnosis.steps)]
-    return UNNAMED in diagnosis.after.model.effect_names and UNNAMED not in known
+    return FreeForm.name in diagnosis.after.model.effect_names and FreeForm.name not in known
 
 
 def compare_residuals(
@@ -377,7 +375,7 @@ def _ladder(diagnosis: Diagnosis) -> Table:
         dof -= sum(p.free and p.tie is None and p.prior is None for p in added)
         rungs.append((step.effect, step.chi2_after, dof))
     if abs(final.chi2 - rungs[-1][1]) > 1e-6 * final.chi2:
-        rungs.append((UNNAMED if _unnamed_term(diagnosis) else "final fit", final.chi2, final.dof))
+        rungs.append((FreeForm.name if _unnamed_term(diagnosis) else "final fit", final.chi2, final.dof))
     model, chi2, freedom = zip(*rungs, strict=True)
     return {"MODEL": np.array(model), "CHI2": np.array(chi2, float), "DOF": np.array(freedom, int)}
 

@@ -395,7 +395,6 @@ def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
 
 # ------------------------------------------------------------------------------------------ as plain data
 
-DIAGNOSIS = "diagnosis.json"
 _ALIKE, _CLASSES = 6, 3  # names that look alike, and groups of them, that are printed: the file has all
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.could_hide import CouldHide
-from walop_jax.diagnosis.examination import ALARM, Matrix, Vector
+from walop_jax.diagnosis.examination import Matrix, Vector
+from walop_jax.diagnosis.policy import ALARM
 from walop_jax.fit.verdict import DATA, EFFECT
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table

@@ -105,3 +105,7 @@ class Policy:
 
 
 POLICY = Policy()
+ALARM = POLICY.alarm
+
+RINGS = (3, 4, 5, 6, 7, 8)
+"""Degrees of patterns of rings about the centre of the field; the throughput takes up what is smoother."""

@@ -34,9 +34,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import linalg, special
 
+from walop_jax.io.code import cores
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.inverses import unit_columns, whitening
-from walop_jax.likelihood.runner import cores
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]

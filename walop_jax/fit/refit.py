@@ -17,7 +17,16 @@ from walop_jax.fit.model_file import base_model
 from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum
-from walop_jax.fit.verdict import NO_STRUCTURE, STATED, Doubt, Hidden, Quality, Structure, Verdict
+from walop_jax.fit.verdict import (
+    NO_STRUCTURE,
+    STATED,
+    SUSPECT_SIGMA,
+    Doubt,
+    Hidden,
+    Quality,
+    Structure,
+    Verdict,
+)
 from walop_jax.io.display import Display
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.inverses import whitening
@@ -30,7 +39,6 @@ from walop_jax.model.specification import Model
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
 
-SUSPECT_SIGMA = 5.0  # excess of χ² over its expectation, in its own standard deviations
 NEARLY = 1.15  # χ²/dof that errors stated seven per cent too small give
 TOO_LOW = 0.8  # χ²/dof below which the stated errors are those of something else
 PRIOR_EDGE = 4.0  # standard deviations
@@ -205,7 +213,7 @@ class FitResult(Fitted):
 
         Exact as far as the model is linear within the errors; `walop_jax.sample` draws from the posterior itself.
         """
-        return importlib.import_module("walop_jax.posterior.result").arviz_of_fit(self, draws, seed)
+        return importlib.import_module("walop_jax")._to_arviz(self, draws, seed)
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -17,6 +17,9 @@ from walop_jax.io.text import rounded, some
 STATED = "N_ERR"
 """Origin of the errors of a fit that explains the data: the stated errors."""
 
+SUSPECT_SIGMA = 5.0
+"""Excess of χ² over its expectation, in its own standard deviations, from which a model does not explain the data."""
+
 
 class Quality(enum.IntFlag):
     """Bits of QUALITY (of a product) and FLAG (of a row, star or pixel), each with its meaning."""

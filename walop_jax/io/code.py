@@ -1,4 +1,4 @@
-"""Code: classes in a file that users bring along, and versions of the software that results rest on."""
+"""Software and machine: classes in a file of the user, versions that results rest on, processor cores."""
 
 from __future__ import annotations
 
@@ -49,6 +49,11 @@ def blank(kind: type[T]) -> T:
     """
     importlib.import_module("walop_jax")._switch_on_float64()
     return object.__new__(kind)
+
+
+def cores() -> int:
+    """Number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 SOFTWARE = ("walop-jax", "jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy", "scipy", "astropy")

@@ -141,4 +141,4 @@ class Result(Drawn):
 
     def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write it as the folder of a run, which every command reads."""
-        importlib.import_module("walop_jax.commands.inputs").save(self, folder, overwrite=overwrite)
+        importlib.import_module("walop_jax")._save(self, folder, overwrite=overwrite)

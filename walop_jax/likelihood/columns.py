@@ -26,8 +26,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.engine import PointData, best_flux, point_prediction, real_counts
-from walop_jax.likelihood.flux import Sharing, project_flux, sharing
+from walop_jax.likelihood.engine import PointData, best_flux, point_prediction, real_counts, sharing
+from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.layout import PointReader, median_over_field
 from walop_jax.likelihood.likelihood import Likelihood, Vector, used_rows
 from walop_jax.likelihood.pieces import NoColumnError, Piece, Resolver

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from walop_jax.likelihood import limits, optics
 from walop_jax.likelihood.field_table import FieldTable
-from walop_jax.likelihood.flux import eliminate_flux, project_flux, sharing
+from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
 from walop_jax.likelihood.optics import LocalDerivatives, linearised, plain_positions, to_all
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
@@ -55,6 +55,11 @@ class PointData(NamedTuple):
     def sight(self, plan: Plan) -> Sight:
         """Quantities of a field point that the model asks for."""
         return Sight(plan.exposures, self.sky, self.source, self.x, self.y)
+
+
+def sharing(instrument: Instrument, plan: Plan) -> Sharing:
+    """Common fluxes of cameras and of the exposures of a plan."""
+    return Sharing(instrument.cameras.together, plan.exposures.shared)
 
 
 class Normal(NamedTuple):

@@ -1,4 +1,4 @@
-"""A flux that nobody knows: the one that fits best, and derivatives with it eliminated.
+"""Elimination of the unknown flux of each exposure, and derivatives with it eliminated.
 
 Equation    For the cameras of one exposure at one field point, with y = N/σ and a = model/σ for unit flux,
                 F = y·a / a·a,    r = y − F a,    d ← d − a (a·d)/(a·a)
@@ -18,9 +18,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-
-from walop_jax.model.instrument import Instrument
-from walop_jax.model.plan import Plan
 
 
 def _namespace(array: Any) -> ModuleType:
@@ -48,11 +45,6 @@ class Sharing(NamedTuple):
 
 ALONE = Sharing()
 """A flux for every exposure, of all cameras."""
-
-
-def sharing(instrument: Instrument, plan: Plan) -> Sharing:
-    """Common fluxes in the exposures of a plan."""
-    return Sharing(instrument.cameras.together, plan.exposures.shared)
 
 
 def eliminate_flux(

@@ -43,7 +43,6 @@ from walop_jax.data.records import Block
 from walop_jax.data.table_intensities import NEGATIVE
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import TOLERANCE, FieldTable, accurate_table, in_batches
-from walop_jax.likelihood.flux import sharing
 from walop_jax.likelihood.likelihood import Census, DataTerms, Likelihood, Matrix, OpticsUsed, Posterior
 from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle
@@ -373,7 +372,7 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
     unit = np.asarray(smooth.coefficients.unit)[..., exposures]
     series = np.swapaxes(unit.reshape(smooth.count, smooth.count, *unit.shape[1:]), 0, 1)
     known = jnp.asarray(likelihood.flux_known[exposures])
-    together = sharing(instrument, likelihood.plan).cameras
+    together = instrument.cameras.together
     read = RowReader(frames, height, width)
 
     def work(number: int) -> tuple[np.ndarray, CellSums]:
@@ -498,7 +497,7 @@ def information_of(
 ) -> Float[np.ndarray, "k k ..."]:
     """K from Σ F²/σ² and the counts for light of unit flux, for any places: cameras, exposures, then these."""
     k, likelihood = len(unit), found.likelihood
-    shared = sharing(found.instrument, likelihood.plan).cameras
+    shared = found.instrument.cameras.together
     shared = np.ones((k, k)) if shared is None else np.asarray(shared)
     light = weight * unit
     power = np.einsum("k...,kl->l...", light * unit, shared)

@@ -37,3 +37,10 @@ def unit_columns(matrix: Matrix) -> tuple[Matrix, Float[np.ndarray, " _"]]:
     length = np.linalg.norm(matrix, axis=0)
     length = np.where(length > 0, length, 1.0)
     return matrix / length, length
+
+
+def root_of(matrices: Float[np.ndarray, "r n n"], least: float = 0.0) -> Float[np.ndarray, "r n b"]:
+    """B with B Bᵀ the matrices, without eigenvalues below a share `least` of the largest (none: as many columns)."""
+    value, vector = np.linalg.eigh(matrices)
+    kept = int((value > least * value[:, -1:]).sum(axis=1).max())
+    return vector[:, :, -kept:] * np.sqrt(np.clip(value[:, None, -kept:], 0.0, None))

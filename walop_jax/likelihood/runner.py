@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
 import time
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +17,7 @@ from typing import TypeVar
 
 import jax
 
+from walop_jax.io.code import cores
 from walop_jax.model.compiled import float64
 
 Progress = Callable[[str], None]
@@ -34,11 +34,6 @@ def usual_threads() -> int:
     if devices > 1 or jax.default_backend() != "cpu":
         return 2 * devices  # one computes while the next one is read
     return cores()
-
-
-def cores() -> int:
-    """Number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,12 +17,12 @@ from walop_jax.data.write import sign_and_write, table_hdu
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
 from walop_jax.io.fits_reading import OpenFile, open_fits
+from walop_jax.io.names import NIGHTS
 from walop_jax.io.text import in_ascii
 from walop_jax.model.parameters import Parameter
 from walop_jax.nights.equations import Night
 
 NIGHTVER = 1
-NIGHTS = "nights.fits"
 _NAN = float("nan")
 _AGAIN = "make the nights again and write them anew"
 _PARAMETERS = {

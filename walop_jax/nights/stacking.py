@@ -18,9 +18,9 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration import PRODUCT, read_calibration, write_calibration
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data import read_calibration_set
+from walop_jax.calibration.product import read_calibration, write_calibration
+from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.schema import EXPOSURES, Column, Place
 from walop_jax.data.table_intensities import TableIntensities
@@ -30,6 +30,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import STATED, Doubt, Quality
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.fits_reading import primary_keywords
+from walop_jax.io.names import NIGHTS, PRODUCT, REFERENCE, SURVEY, TRACKS
 from walop_jax.io.text import check_input, parse_toml, read_json, read_text
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.laws import Law, laws_of, resolved
@@ -49,9 +50,9 @@ from walop_jax.nights.equations import (
     together,
     with_candidates_of,
 )
-from walop_jax.nights.night_file import NIGHTS, nights_in, read_nights, write_nights
+from walop_jax.nights.night_file import nights_in, read_nights, write_nights
 from walop_jax.nights.survey import Survey
-from walop_jax.posterior.files import SURVEY, Run
+from walop_jax.posterior.files import Run
 
 Given = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
 """Sources of nights: a fit, a set, a night, or a path: of a set, of a RUN, of a SURVEY or of its nights."""
@@ -65,8 +66,6 @@ SKETCH, COPIED = (
     0.02,
 )  # measurements by which sets are compared, and their share that no two have by chance
 MANY = 20  # sets from which on programs are better compiled for longer
-REFERENCE = "reference.fits"
-TRACKS = "tracks.fits"
 FILES = (NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY)
 """The files of a survey."""
 PARTIAL = "partial"

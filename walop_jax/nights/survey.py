@@ -24,6 +24,7 @@ from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import p_errors, sample_stars
+from walop_jax.calibration.thresholds import GOAL
 from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, fail
@@ -37,7 +38,6 @@ from walop_jax.nights.breaks import Break, part_of, shape_of
 from walop_jax.nights.changes import scan
 from walop_jax.nights.equations import Together, night_numbers
 from walop_jax.science.field_accuracy import NODES, SIZE, TOLERANCE, judged, measures_u, reached
-from walop_jax.science.star_errors import GOAL
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]

@@ -22,7 +22,8 @@ from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import LARGEST_P, SMALLEST_DETERMINANT, STARS, sample_stars
+from walop_jax.calibration.matrix import LARGEST_P, STARS, sample_stars
+from walop_jax.calibration.thresholds import GOAL, SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import DEFAULT_FILTER, Settings
 from walop_jax.io.display import Display, Displayed
@@ -42,7 +43,6 @@ from walop_jax.paper.polynomial import (
 )
 from walop_jax.paper.wavelength import DEGREE, TEMPERATURES, colour_spread, efficiencies, spread_document
 from walop_jax.science.star_errors import (
-    GOAL,
     QUANTITIES,
     MethodErrors,
     Truth,

@@ -26,7 +26,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.flux import Sharing, project_flux, sharing
+from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.model import light
@@ -140,7 +140,7 @@ def candidates(
     likelihood = Likelihood.of(calset, model)
     factor, flux, exptime = _factor(could.plan, few), fluxes(plan, None), plan.exposures().exptime
     noise, floor = PhotonNoise(plan.read_noise), model.template.cameras.floor
-    shared = Sharing(sharing(model.template, likelihood.plan).cameras)
+    shared = Sharing(model.template.cameras.together)
     responses = []
     for number, one in enumerate(values):
         tell(f"expected counts of instrument {number + 1} of {draws}")

@@ -43,6 +43,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import linalg
 
+from walop_jax.likelihood.inverses import root_of
 from walop_jax.plans.families import Family
 
 GAP = 0.01  # proven distance from the optimum at which the search ends
@@ -360,13 +361,6 @@ def _nearest(relative: Float[np.ndarray, "r k"]) -> Int[np.ndarray, "r l"]:
     """Numbers of the targets that come near the largest, as many in each draw."""
     most = int((relative >= _NEAR).sum(axis=1).max())
     return np.argsort(-relative, axis=1)[:, :most]
-
-
-def root_of(matrices: Float[np.ndarray, "r n n"], least: float = 0.0) -> Float[np.ndarray, "r n b"]:
-    """B with B Bᵀ the matrices, without eigenvalues below a share `least` of the largest (none: as many columns)."""
-    value, vector = np.linalg.eigh(matrices)
-    kept = int((value > least * value[:, -1:]).sum(axis=1).max())
-    return vector[:, :, -kept:] * np.sqrt(np.clip(value[:, None, -kept:], 0.0, None))
 
 
 def _on_the_budget(

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.inspection import about_exposures
 from walop_jax.data.user_tables import InputTable
 from walop_jax.io.display import Display, Displayed
@@ -49,7 +50,6 @@ from walop_jax.plans.wanted import (
     field_errors,
     wanted,
 )
-from walop_jax.science.star_errors import GOAL
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 
 _NOTHING = 1e-6  # of what is known: less of it makes no plan

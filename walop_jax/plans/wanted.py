@@ -21,15 +21,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from walop_jax.calibration.matrix import SMALLEST_DETERMINANT, matrix_slopes, p_forms, sample_stars
+from walop_jax.calibration.matrix import matrix_slopes, p_forms, sample_stars
+from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.data.schema import Column
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import InputTable, numeric_column
 from walop_jax.diagnosis.policy import POLICY
+from walop_jax.likelihood.inverses import root_of
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.parameters import check_names
 from walop_jax.plans.exposures import Candidates
-from walop_jax.plans.optimal import root_of
 
 LONGEST = 1440.0
 """Minutes of a plan at most. It is one of a night, in which the sky stands still and the instrument does not change."""

@@ -25,10 +25,10 @@ import h5py
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration import FAILED, PRODUCT, SUMMARY, read_calibration
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data import CalibrationSet, read_calibration_set
-from walop_jax.data.records import InputFile
+from walop_jax.calibration.product import read_calibration
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.records import CalibrationSet, InputFile
 from walop_jax.fit.model_file import model_for
 from walop_jax.fit.parameter_table import ParameterValue
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
@@ -36,6 +36,7 @@ from walop_jax.fit.verdict import STATED
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.display import Display, Result
 from walop_jax.io.errors import fail
+from walop_jax.io.names import DOCUMENTS, FAILED, POSTERIOR, PRODUCT, SUMMARY
 from walop_jax.io.text import read_json, two_digits
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
@@ -233,23 +234,6 @@ def _shares(kept: Any) -> Float[np.ndarray, "n w"]:
     """Shares of proposals accepted: of a chain that was kept, the mean of each walker."""
     return np.repeat(kept.accepted[None] / kept.iteration, kept.iteration, axis=0)
 
-
-DIAGNOSIS, COMPARISON, EPOCH, LIMITS = "diagnosis.json", "comparison.json", "epoch.json", "limits.json"
-COMMISSIONING, PLANNED, SURVEY, WATCHED = "commissioning.json", "plan.json", "survey.json", "watch.json"
-POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "posterior_corner.png", "sample.json"
-DOCUMENTS = {
-    "summary": SUMMARY,
-    "diagnosis": DIAGNOSIS,
-    "sample": SAMPLE,
-    "comparison": COMPARISON,
-    "epoch": EPOCH,
-    "limits": LIMITS,
-    "commissioning": COMMISSIONING,
-    "plan": PLANNED,
-    "survey": SURVEY,
-    "watch": WATCHED,
-}
-"""The documents that a run may hold, and their files."""
 
 VERDICTS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "diagnosis": lambda d: str(d["verdict"]),

@@ -19,6 +19,7 @@ from walop_jax.data.records import Points
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, PointMap, ResidualComparison, Table
 from walop_jax.diagnosis.limits_found import NO_LEVEL, DetectionLimits
 from walop_jax.diagnosis.policy import POLICY
+from walop_jax.fit.verdict import SUSPECT_SIGMA
 from walop_jax.reports.style import (
     AFTER,
     BEFORE,
@@ -44,7 +45,6 @@ SIGN_BEYOND = 3.0  # σ beyond which a tile carries its sign
 MOST_MARKED = 400  # points above which signs would run into each other
 MOST_BINS = 48  # of polariser angle
 _MODELS = ("starting\nmodel", "final\nmodel")
-EXPLAINS = 5.0  # standard deviations of χ² within which a model counts as explaining the data
 
 
 @styled
@@ -200,7 +200,7 @@ def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
     names = [names[0], *(name if name == "final fit" else f"+ {name}" for name in names[1:])]
     ratio = ladder["CHI2"] / np.maximum(ladder["DOF"], 1)
     place = np.arange(len(ratio))
-    width = EXPLAINS * np.sqrt(2.0 / max(int(ladder["DOF"][-1]), 1))
+    width = SUSPECT_SIGMA * np.sqrt(2.0 / max(int(ladder["DOF"][-1]), 1))
     figure, axis = on.single(7.0, 0.8 + 0.38 * len(ratio))
     axis.axvspan(max(1.0 - width, 1e-3), 1.0 + width, color="0.88", lw=0, zorder=0)
     axis.axvline(1.0, color="0.5", lw=0.8, zorder=1)

@@ -14,6 +14,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap
+from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_file import instrument_of
 from walop_jax.io.text import two_digits, with_minus_sign
@@ -43,7 +44,6 @@ from walop_jax.reports.style import (
     styled,
 )
 from walop_jax.science.field_accuracy import FieldAccuracy
-from walop_jax.science.star_errors import GOAL
 
 FITTED = Normalize(0.7, 1.3)
 """Scale of rms residuals of a fit that explains its data, the same for every run."""

@@ -8,16 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.calibration import PRODUCT
-from walop_jax.diagnosis.figure_data import FIGURE_DATA
 from walop_jax.io.errors import fail, nearest
+from walop_jax.io.names import FIGURE_DATA, LIMITS, POSTERIOR, PRODUCT
 from walop_jax.paper.polynomial import TERMS
 from walop_jax.paper.wavelength import plate_names
-from walop_jax.posterior.files import LIMITS, POSTERIOR
 from walop_jax.reports import diagnosis_figures, figures, paper_figures, posterior_figures
 from walop_jax.reports.run import FigureSource
-from walop_jax.reports.style import AnyFigure
-from walop_jax.reports.wording import PLATES, listed
+from walop_jax.reports.style import PLATES, AnyFigure
+from walop_jax.reports.wording import listed
 from walop_jax.science.field_accuracy import field_accuracy
 
 

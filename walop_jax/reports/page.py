@@ -14,12 +14,13 @@ from typing import Any, NamedTuple
 import jinja2
 from matplotlib.figure import Figure
 
-from walop_jax.calibration import SUMMARY, read_calibration
+from walop_jax.calibration.product import read_calibration
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.findings import sentences
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError, fail
+from walop_jax.io.names import COMPARISON, EPOCH, LIMITS, PLANNED, SUMMARY, SURVEY, TRACKS, WATCHED
 from walop_jax.io.text import (
     probability,
     read_json,
@@ -30,15 +31,13 @@ from walop_jax.io.text import (
     with_minus_sign,
 )
 from walop_jax.model.cameras import Cameras
-from walop_jax.nights.stacking import TRACKS
-from walop_jax.posterior.files import COMPARISON, EPOCH, LIMITS, PLANNED, SURVEY, WATCHED
+from walop_jax.model.effects.free_form import FreeForm
 from walop_jax.posterior.result import interval_in_words
 from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import draw
 from walop_jax.reports.posterior_figures import unit_in_words
 from walop_jax.reports.run import RunContents, read_limits
 from walop_jax.reports.wording import (
-    UNNAMED,
     data_in_words,
     effect_in_words,
     hidden_in_words,
@@ -117,7 +116,7 @@ def _context(run: RunContents, accuracy: FieldAccuracy | None) -> dict[str, Any]
         "hidden": hidden_in_words(summary),
         "steps": [dict(step) | _drawn(run, number) for number, step in enumerate(found_steps, start=1)],
         "unnamed": None if diagnosis is None else _drawn(run, len(found_steps) + 1),
-        "unnamed_term": UNNAMED,
+        "unnamed_term": FreeForm.name,
         "shown_candidates": SHOWN_CANDIDATES,
         "ladder": _ladder(run),
         "whole_combination": ""

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_file import instrument_of
@@ -23,6 +24,7 @@ from walop_jax.reports.style import (
     DIVERGING,
     FONT,
     PAGE,
+    PLATES,
     SEQUENTIAL,
     SMALL,
     AnyFigure,
@@ -35,8 +37,7 @@ from walop_jax.reports.style import (
     point_map,
     styled,
 )
-from walop_jax.reports.wording import PLATES
-from walop_jax.science.star_errors import GOAL, QUANTITIES, plate_errors, transmitted
+from walop_jax.science.star_errors import QUANTITIES, plate_errors, transmitted
 
 _PIXELS, _LINES = 31, 41
 _WAVELENGTH, _WAVELENGTHS = 0.62, (0.5, 0.75)  # µm

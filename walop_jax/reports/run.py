@@ -10,23 +10,31 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from walop_jax.calibration import PRODUCT, SUMMARY, Calibration, MatrixMaps
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.data.user_tables import read_input_table
-from walop_jax.diagnosis.figure_data import (
-    FIGURE_DATA,
-    UNNAMED,
-    DiagnosisFigureData,
-    figure_data,
-    read_figure_data,
-)
+from walop_jax.diagnosis.figure_data import DiagnosisFigureData, figure_data, read_figure_data
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import DataError, fail
+from walop_jax.io.names import (
+    COMMISSIONING,
+    CORNER,
+    DIAGNOSIS,
+    FIGURE_DATA,
+    INTERVALS,
+    LIMITS,
+    POSTERIOR,
+    PRODUCT,
+    SAMPLE,
+    SUMMARY,
+)
 from walop_jax.io.text import read_json
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.posterior import PosteriorSample, files
-from walop_jax.posterior.files import DIAGNOSIS, LIMITS, POSTERIOR, Run
+from walop_jax.model.effects.free_form import FreeForm
+from walop_jax.posterior.files import Run
+from walop_jax.posterior.result import PosteriorSample
 from walop_jax.reports.style import PAGE, Canvas
 
 SUMMARY_KEYS = ("chi2", "dof", "n_data", "parameters", "converged", "message", "versions", "inputs")
@@ -196,7 +204,7 @@ def read_run(run: Run | Path) -> RunContents:
         pictures = optional(FIGURE_DATA, lambda _: source.figure_data, lost)
         names = [step["effect"] for step in diagnosis["steps"]]
         drawn = [] if pictures is None else [one.effect for one in pictures.comparisons[1:]]
-        if pictures is not None and drawn not in (names, [*names, UNNAMED]):
+        if pictures is not None and drawn not in (names, [*names, FreeForm.name]):
             missing.append(
                 f"{FIGURE_DATA} is of another diagnosis than {DIAGNOSIS}: its pictures are left out."
             )
@@ -207,14 +215,12 @@ def read_run(run: Run | Path) -> RunContents:
             )
     sampled = POSTERIOR in source
     rest = {
-        "sample": optional(
-            files.SAMPLE, lambda path: _document(path, ()), "no verdict on the sampling", sampled
-        ),
-        "intervals": optional(files.INTERVALS, _intervals, "no table of the posterior", sampled) or (),
-        "corner": optional(files.CORNER, Path.read_bytes, "no corner plot", sampled),
+        "sample": optional(SAMPLE, lambda path: _document(path, ()), "no verdict on the sampling", sampled),
+        "intervals": optional(INTERVALS, _intervals, "no table of the posterior", sampled) or (),
+        "corner": optional(CORNER, Path.read_bytes, "no corner plot", sampled),
         "limits": optional(LIMITS, lambda path: _limits(path, summary), "no protection level", False),
         "commissioning": optional(
-            files.COMMISSIONING, lambda path: _document(path, ("go", "requirements")), "no go or no-go", False
+            COMMISSIONING, lambda path: _document(path, ("go", "requirements")), "no go or no-go", False
         ),
     }
     if product is not None and diagnosis is None:

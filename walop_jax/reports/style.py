@@ -21,13 +21,14 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import NullLocator, ScalarFormatter
 
-from walop_jax.calibration.matrix import SMALLEST_DETERMINANT
+from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.io.text import with_minus_sign
 
 FONT = 9
 SMALL = 7
 DIVERGING = "RdBu_r"
 SEQUENTIAL = "viridis"
+PLATES = {"half1.plate": "HWP1", "half2.plate": "HWP2"}
 BEFORE = "#b2182b"  # dark enough to be told from AFTER in grey as well; both are ends of DIVERGING
 AFTER = "#2166ac"
 QUIET = "0.8"

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration import Calibration
-from walop_jax.diagnosis.figure_data import UNNAMED
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.fit.parameter_table import PRIOR_ONLY
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import probability, rounded, some, value_and_error, with_error, with_minus_sign
 from walop_jax.model.effects import EFFECTS
+from walop_jax.model.effects.free_form import FreeForm
 from walop_jax.reports.posterior_figures import LABELS
 from walop_jax.sky.nights import night_of
 
@@ -29,7 +29,7 @@ _PROPER = ("Wollaston", "Moon", "Stokes")
 
 def effect_in_words(effect: str) -> str:
     """A few words on an effect that may stand inside a sentence; empty for a name that is not known."""
-    if effect == UNNAMED:
+    if effect == FreeForm.name:
         return "unidentified patterns"
     known = next((entry for entry in EFFECTS if entry.name == effect), None)
     if known is None:
@@ -208,7 +208,6 @@ def model_entries(product: Calibration) -> dict[str, dict[str, str]]:
     return found
 
 
-PLATES = {"half1.plate": "HWP1", "half2.plate": "HWP2"}
 PLACES = {
     "half1": "half1 for the half of the pupil with HWP1",
     "half2": "half2 for that with HWP2",

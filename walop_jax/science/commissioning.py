@@ -6,12 +6,12 @@ import dataclasses
 from typing import Any
 
 from walop_jax.calibration.could_hide import off_by, unmeasured
+from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.inspection import inspect
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import two_digits
 from walop_jax.science.field_accuracy import SHARE, FieldAccuracy
-from walop_jax.science.star_errors import GOAL
 
 MOST = GOAL / 2  # error of p that the calibration may make
 

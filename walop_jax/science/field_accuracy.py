@@ -16,16 +16,11 @@ from jaxtyping import Bool, Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import CouldHide, could_hide, off_by, unmeasured
-from walop_jax.calibration.matrix import (
-    SMALLEST_DETERMINANT,
-    p_errors,
-    p_forms,
-    sample_stars,
-)
+from walop_jax.calibration.matrix import p_errors, p_forms, sample_stars
+from walop_jax.calibration.thresholds import GOAL, SMALLEST_DETERMINANT
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import two_digits
 from walop_jax.likelihood.inverses import whitening
-from walop_jax.science.star_errors import GOAL
 
 SHARE = 0.95  # of the field where one exposure measures u: what a calibration is judged by
 SIZE = 21  # points along each axis of the map

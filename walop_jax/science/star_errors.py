@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.settings import Settings
 from walop_jax.science.estimate import estimate
 
-GOAL = 0.001
 QUANTITIES = ("q", "u", "p")
 _ELECTRONS = 1e6  # of the stars; their photon noise does not enter
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from walop_jax.data import read_calibration_set
+from walop_jax.data.calset import read_calibration_set
 from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Context, Effect, effect_by_name

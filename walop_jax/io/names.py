@@ -1,0 +1,30 @@
+"""Names of the files that a folder of results may hold."""
+
+from __future__ import annotations
+
+PRODUCT = "calibration.fits"
+SUMMARY, FAILED = "summary.json", "summary.failed.json"
+DIAGNOSIS, FIGURE_DATA = "diagnosis.json", "diagnosis.fits"
+POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "posterior_corner.png", "sample.json"
+COMPARISON, EPOCH, LIMITS, COMMISSIONING = (
+    "comparison.json",
+    "epoch.json",
+    "limits.json",
+    "commissioning.json",
+)
+PLANNED, WATCHED, SURVEY = "plan.json", "watch.json", "survey.json"
+NIGHTS, REFERENCE, TRACKS = "nights.fits", "reference.fits", "tracks.fits"
+
+DOCUMENTS = {
+    "summary": SUMMARY,
+    "diagnosis": DIAGNOSIS,
+    "sample": SAMPLE,
+    "comparison": COMPARISON,
+    "epoch": EPOCH,
+    "limits": LIMITS,
+    "commissioning": COMMISSIONING,
+    "plan": PLANNED,
+    "survey": SURVEY,
+    "watch": WATCHED,
+}
+"""Files of the documents of commands, by the name of the document."""
