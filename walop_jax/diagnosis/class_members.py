@@ -176,7 +176,7 @@ class _Step:
         self.left = self.projector(design.residual + self.lost)
 
     def told(self, name: str, sums: tuple[Sum, ...]) -> Member:
-        """What was added, as the fit has it."""
+        """The member that was added, as the fit has it."""
         fit, design, floor = self.laid.fit, self.laid.design, self.laid.state.floor
         positions = fit.model.free[self.at]
         own = self.projector(design.jacobian[:, self.at])

@@ -54,7 +54,7 @@ class Member(NamedTuple):
 
 
 class ClassOf(NamedTuple):
-    """What was added, and the members of its class, itself first.
+    """An addition, and the members of its class, itself first.
 
     `at` are the positions of its amplitudes among the free parameters. `spread` is the error of p of stars between
     members, `stated` that of the fit, medians over the field; `off` by how many errors of the product the farthest
@@ -164,7 +164,7 @@ def only_a_class(classes: Sequence[ClassOf]) -> Iterator[str]:
 
 
 def _deciding(one: ClassOf) -> str:
-    """What would tell the members apart."""
+    """Observations that would tell the members apart."""
     tests = [s.tested_by for member in one.members for each in member.sums for _, s in each[:1]]
     told = some(list(dict.fromkeys(tests)), 2) if tests else "other exposures"
     return f"what would decide: {told}; walop-jax plan --criterion apart finds the exposures"

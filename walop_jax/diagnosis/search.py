@@ -24,7 +24,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from walop_jax.calibration.matrix import instrument_matrices, largest_change
 from walop_jax.diagnosis.candidates import said_by
@@ -39,6 +39,8 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import Model, model_without, with_effects
+
+LaidOut = tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, " _"], int]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -330,10 +332,33 @@ def predicts_unseen(
     return True
 
 
+def gains_by_kind(before: Design, after: Design) -> dict[str, float]:
+    """Gain in ln p of the exposures of each KIND, as all others predict them, by what one design has beyond another.
+
+    Polariser, Moon and standards see one instrument: what is true makes none of them less probable given the others.
+    The gains of a KIND and of all others by themselves add up to the evidence.
+    """
+    kinds = before.fit.calset.exposures.kind[before.exposure]
+    names = np.unique(kinds)
+    if len(names) < 2:
+        return {}
+    one, other = ((d.jacobian, d.residual, d.projector.free) for d in (before, after))
+    return dict(zip(map(str, names), gains_of_units(kinds, one, other).tolist(), strict=True))
+
+
+def gains_of_units(unit: np.ndarray, before: LaidOut, after: LaidOut) -> Float[np.ndarray, " u"]:
+    """Gain in ln p of each unit of the data rows, as all others predict it, of one model over another.
+
+    Of each model the Jacobian, the residuals at its minimum, priors last, and its degrees of freedom.
+    """
+    found = [_predictions(rows, residual, unit, free)[:, 0] for rows, residual, free in (before, after)]
+    return found[1] - found[0]
+
+
 def _predictions(
     rows: Float[np.ndarray, "r n"],
     residual: Float[np.ndarray, " r"],
-    unit: Int[np.ndarray, " d"],
+    unit: np.ndarray,
     free: int,
 ) -> Float[np.ndarray, "u 2"]:
     """ln p of the data rows of each unit as all the others predict them, and the square of how far they are off.

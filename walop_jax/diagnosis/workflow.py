@@ -29,7 +29,7 @@ from walop_jax.diagnosis.candidates import Probe, applicable
 from walop_jax.diagnosis.candidates import probes as all_probes
 from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import only_a_class
-from walop_jax.diagnosis.design import Design, strata
+from walop_jax.diagnosis.design import Design, held_out, strata
 from walop_jax.diagnosis.examination import (
     Examination,
     Ranked,
@@ -44,6 +44,7 @@ from walop_jax.diagnosis.search import (
     before_and_after,
     beyond_prior,
     evidence_of_presence,
+    gains_by_kind,
     names_first,
     predicts_unseen,
     refit_without,
@@ -189,8 +190,8 @@ class Refit:
     """The judge that fits: the current fit of a diagnosis, and the steps so far.
 
     `wanted` are the probes of `catalogue`, `sentences` and `parts` what else can be said (`candidates`). `choices` are
-    other descriptions that were tried, `said` the groups of sentences that were added. `ended` says that there was no
-    time for something.
+    other descriptions that were tried, `said` the groups of sentences that were added, `contradicted` what exposures of
+    another KIND speak against, in words. `ended` says that there was no time for something.
     """
 
     calset: CalibrationSet
@@ -207,6 +208,7 @@ class Refit:
     steps: list[Step] = dataclasses.field(default_factory=list)
     choices: dict[str, Choice] = dataclasses.field(default_factory=dict)
     said: list[str] = dataclasses.field(default_factory=list)
+    contradicted: dict[str, str] = dataclasses.field(default_factory=dict)
     ended: bool = False
     _compared: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -316,10 +318,23 @@ class Refit:
         return [*sorted(clearly, key=lambda trial: names_first(trial, self.policy)), *others]
 
     def confirmed(self, state: Examination, trial: Trial) -> bool:
-        """True if data that took no part in the fit agree better with the effect than without."""
+        """True if data that took no part in the fit agree better with the effect than without, and no KIND worse."""
         assert trial.fit is not None
-        self._compared = before_and_after(trial.effect.name, state.design, Design.of(trial.fit))
-        return self._compared["heldout_after"] < self._compared["heldout_before"]
+        after = Design.of(trial.fit)
+        self._compared = before_and_after(trial.effect.name, state.design, after)
+        if self._compared["heldout_after"] >= self._compared["heldout_before"]:
+            return False
+        worse = self._contradicted(state.design, after)
+        if worse:
+            name = trial.effect.name if trial.effect is not Described else "; ".join(trial.sentences)
+            self.contradicted[name] = f"{name} (exposures of {worse} speak against it)"
+            self.tell(f"{name}: exposures of {worse} speak against it")
+        return not worse
+
+    def _contradicted(self, before: Design, after: Design) -> str:
+        """KINDS of exposures that all others predict worse with what a fit has more; empty: none."""
+        gains = gains_by_kind(before, after)
+        return ", ".join(f"KIND {kind}" for kind, gain in gains.items() if gain < -self.policy.contradicted)
 
     def adopted(self, state: Examination, trial: Trial) -> Examination:
         """Go on with the model of a trial, everything fitted again where priors or errors were in its way."""
@@ -373,6 +388,11 @@ class Refit:
     def conclusion(self, first: Examination, last: Examination) -> tuple[Examination, Unexplained | None]:
         """Drop what is not needed, then ask what has no name: the examination of the final model, and that."""
         state, nameless = self._concluded(first, last)
+        if self.steps and (worse := self._worse(first, state)):
+            return self._not_adopted(first, worse)
+        if nameless is not None and self.contradicted:
+            told = tuple(text for name, text in self.contradicted.items() if name not in self.said)
+            nameless = dataclasses.replace(nameless, parts=(*nameless.parts, *told))
         if nameless is not None or len(self.said) <= self.policy.most_sentences:
             return state, nameless
         # Something that no sentence holds looks like several that are there.
@@ -385,6 +405,24 @@ class Refit:
         state = self.examined(first)
         self.steps = refitted_in_order(self.steps, first.design, state.design)
         return state, _and(dataclasses.replace(nameless, p_value=state.table.p_global), _LEFT_OUT)
+
+    def _worse(self, first: Examination, last: Examination) -> str:
+        """What the final model predicts worse than the first, in words; empty: nothing."""
+        if kinds := self._contradicted(first.design, last.design):
+            return f"exposures of {kinds}, as all others predict them"
+        before, after = (held_out(one.design, "exposures") for one in (first, last))
+        if after > (1.0 + self.policy.held_out_worse) * before:
+            return f"exposures that are left out (mean squared residual {before:.3g} → {after:.3g})"
+        return ""
+
+    def _not_adopted(self, first: Examination, worse: str) -> tuple[Examination, Unexplained]:
+        """Go back to the first model: what was found is told as parts."""
+        steps, self.steps, self.fit = self.steps, [], first.result
+        parts = tuple(f"{step.effect} (χ² {step.chi2_before:.4g} → {step.chi2_after:.4g})" for step in steps)
+        text = f"with what was found the model predicts worse {worse}, so nothing was adopted: {'; '.join(parts)}"
+        self.said.clear()
+        found = _and(unexplained(first, tuple(first.patterns_needed())), text)
+        return first, dataclasses.replace(found, parts=(*parts, *self.contradicted.values()))
 
     def _concluded(self, first: Examination, state: Examination) -> tuple[Examination, Unexplained | None]:
         dropped, parts = self._drop_what_is_not_needed(), ()
