@@ -184,6 +184,7 @@ ALONE = ("diattenuation v", "retardance v", "depolarisation")
 STEPS, FEW = 16, 18  # times of a step that are looked at first; times of which all spells are
 AFTER = 0.5  # hours behind the last exposure that a step ends
 ROUNDED = 1e-4  # hours, of times that are written into a description
+NEARLY_TIME = 0.999  # correlation of the order of exposures with time
 HARMONICS = (1, 2)
 HARMONICS_OF_ENCODER = (1, 2, 3, 4, 5, 6)
 
@@ -323,6 +324,22 @@ class _Asked:
         if np.isfinite(angle).all() and np.ptp(left) > 1e-3 * np.ptp(angle):
             yield "hour angle"
 
+    def single(self) -> Iterator[str]:
+        """Exposure time, and the order of the exposures where that is not the time."""
+        seconds = self.exposures.exptime
+        if np.isfinite(seconds).all() and seconds.min() > 0 and np.ptp(seconds) > 1e-3 * seconds.max():
+            yield "per EXPTIME"
+        hours, order = hours_of(self.exposures), np.arange(len(self.exposures), dtype=float)
+        if self.hours and len(order) > 2 and abs(np.corrcoef(hours, order)[0, 1]) < NEARLY_TIME:
+            yield "order"
+
+    def sides(self, prefix: str) -> Iterator[str]:
+        """The side from which a moving element came, where it came from both."""
+        angle, inside = (getattr(self.exposures.position(prefix), name) for name in ("angle", "inside"))
+        turned = np.sin(np.deg2rad(np.diff(angle[inside])))
+        if self.hours and min(np.sum(turned > 1e-9), np.sum(turned < -1e-9)) > 1:
+            yield f"side {prefix}"
+
     def slow(self) -> Iterator[str]:
         """Time and temperature."""
         if self.hours:
@@ -373,10 +390,9 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
             yield from _over_field(base, asked)
             if not fixed:
                 continue
-            if asked.colours:
-                yield _times(base, "colour")
-            for factor in asked.slow():
+            for factor in (*(("colour",) if asked.colours else ()), *asked.slow()):
                 yield _times(base, factor)
+                yield from (_times(one, factor) for one in _grown(base, asked))
     for prefix, element in _turning(instrument, exposures).items():
         if element is instrument.polariser:
             continue
@@ -386,6 +402,7 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
         inside = exposures.position(prefix).inside
         for span in (*asked.steps(inside), *asked.spells(inside)):
             yield (Sentence("turn", "of", element.name, (span,)),)
+    yield from _ahead(instrument, asked)
     yield from _of_plates(instrument, exposures, asked)
     yield from _of_cameras(instrument, asked)
     yield from _of_field_and_band(instrument, asked)
@@ -424,6 +441,27 @@ def _over_field(base: tuple[Sentence, ...], asked: _Asked) -> Iterator[tuple[Sen
         yield (dataclasses.replace(base[0], kind=f"{kind} {axis}"),)
 
 
+def _grown(base: tuple[Sentence, ...], asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+    """The patterns of the field that stress and temperature make: with the radius, radial, diagonal."""
+    if asked.over_field:
+        yield from itertools.islice(_over_field(base, asked), 2, None)
+
+
+def _ahead(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+    """Changes of light from the sky that differ between exposures: telescopes turn, warm up and gather dust."""
+    polariser, exposures = instrument.polariser, asked.exposures
+    if polariser is None or exposures.clp_in.all():
+        return
+    added = tuple(Sentence(f"added polarisation {axis}", "ahead of", polariser.name) for axis in "qu")
+    if asked.over_field:
+        yield _times(added, "x", "y")
+        yield _times(added, "r2")
+    for factor in (*asked.slow(), *asked.hour_angle(), *asked.single()):
+        yield _times(added, factor)
+        for base in _families("ahead of", polariser.name):
+            yield _times(base, factor)
+
+
 def _of_polariser(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
     polariser = instrument.polariser
     if polariser is None or polariser.moves is None or not asked.exposures.clp_in.any():
@@ -434,7 +472,7 @@ def _of_polariser(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sente
         orders = HARMONICS_OF_ENCODER if base is turn else HARMONICS
         for pair in asked.harmonics(polariser.moves, orders):
             yield _times(base, *pair)
-        for factor in asked.slow():
+        for factor in (*asked.slow(), *asked.single(), *asked.sides(polariser.moves)):
             yield _times(base, factor)
     for pair in asked.harmonics(polariser.moves, (1,)) if asked.over_field else ():
         yield _times(_times(turn, *pair), "x", "y")  # a beam that wanders over a film that is not uniform
@@ -562,7 +600,7 @@ def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
                 yield _times(gain, *pair)
             for pair in asked.harmonics(prefix, (1,)) if asked.over_field else ():
                 yield _times(_times(gain, *pair), "x", "y")  # an image that goes in a circle
-        for factor in (*asked.slow(), *asked.nights(), *asked.steps()):
+        for factor in (*asked.slow(), *asked.single(), *asked.nights(), *asked.steps()):
             yield _times(gain, factor)
         if asked.over_field and len(e) <= limits.FREE_EXPOSURES:
             for number in range(len(e)):
@@ -570,7 +608,7 @@ def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
         for kind in asked.kinds():
             yield _times(gain, kind)
         if asked.over_field:
-            for factor in (*asked.slow(), *asked.kinds()):
+            for factor in (*asked.slow(), *asked.single(), *asked.kinds()):
                 yield _times(_times(gain, factor), "x", "y")
             for factor in asked.slow():
                 yield (*_times(gain, factor), *_times(_times(gain, factor), "r2"))  # a focus that drifts
@@ -587,10 +625,11 @@ def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
                 yield (Sentence("light", "in", camera, origin=other),)
     for arm in instrument.arms if len(instrument.arms) > 1 else ():
         gain = (Sentence("gain", "of", arm.name),)
-        for factor in (*asked.slow(), *asked.nights()):
+        for factor in (*asked.slow(), *asked.single(), *asked.nights()):
             yield _times(gain, factor)
         if asked.over_field:
             yield _times(gain, *(f"ring {n}" for n in RINGS))
             both = tuple(Sentence("gain", "of", name) for name in arm.analyser.cameras)
-            for kind in asked.kinds():
-                yield _times(_times(both, kind), "x", "y")
+            for factor in (*asked.kinds(), *asked.single()):
+                yield _times(_times(both, factor), "x", "y")
+                yield _times(_times((Sentence("gain", "of", arm.name),), factor), "x", "y")

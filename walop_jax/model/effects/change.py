@@ -34,6 +34,13 @@ from walop_jax.model.sources import ExposureArrays
 
 Term = tuple["Change", Scalar]
 OPPOSITE = "opposite"  # the field point, as an origin of light
+SINGLE = (
+    "exposure",
+    "kind",
+    "side",
+    "order",
+    "per EXPTIME",
+)  # forms of factors that ask for the list of exposures
 SKY, BAND = "sky", "band"  # places that are no element
 
 
@@ -135,9 +142,7 @@ class Change:
     def of_stars(self) -> bool:
         """True if what it does to a star is known from the counts and the place of the star alone."""
         elsewhere = self.kind == "afterglow" or (self.kind == "light" and self.origin in ("", OPPOSITE))
-        return not elsewhere and all(
-            factor.split()[0] not in ("hours", "exposure", "kind") for factor in self.factors
-        )
+        return not elsewhere and all(factor.split()[0] not in ("hours", *SINGLE) for factor in self.factors)
 
     def times(self, *factors: str) -> Change:
         """The change with further factors."""
@@ -178,7 +183,7 @@ class Change:
             if one.form == "kind":
                 check_names("KIND of exposures", one.given, instrument.kinds)
             known = angle is None or (one.form in ("cos", "sin") and one.given[-1] == angle)
-            single = one.form in ("cos", "sin", "exposure", "kind")
+            single = one.form in ("cos", "sin", *SINGLE)
             if one.depends_on not in allowed or (single and not known):
                 takes = ", ".join(allowed) or "nothing"
                 only = f"; of angles that of {angle} alone" if angle else ""
