@@ -47,6 +47,7 @@ Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
 ALIKE = 0.5  # of the errors of the matrix: members that differ by less are one
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members that differ in what they do to stars
+LINEAR = 0.01  # of the evidence, which a linear step may miss
 LEAST_PROBABLE, PLAUSIBLE = 1e-3, 0.02  # of members that are kept, and of those that must not be far off
 
 
@@ -179,8 +180,9 @@ class _Step:
         """The member that was added, as the fit has it."""
         fit, design, floor = self.laid.fit, self.laid.design, self.laid.state.floor
         positions = fit.model.free[self.at]
-        own = self.projector(design.jacobian[:, self.at])
-        own[design.rows :] = 0.0  # its prior is that of the declaration, below
+        column = design.jacobian[:, self.at]
+        column[design.rows :] = 0.0  # without its own prior, which comes in with the widths
+        own = self.projector(column)
         parameters = [fit.model.parameters[i] for i in positions.tolist()]
         widths = np.array([p.scale if p.prior is None else p.prior[1] for p in parameters])
         evidence = log_bayes(own.T @ own, own.T @ self.left, widths) / floor**2
@@ -232,7 +234,8 @@ class _Step:
         widths = np.array([_width(each) for each in sums])
         evidence = log_bayes(square, along, widths) / self.laid.state.floor**2
         # The same difference, seen from the other side: as probable, however its throughputs are known.
-        evidence = member.evidence if abs(evidence - member.evidence) < 3.0 else evidence
+        alike = max(self.laid.state.policy.even_odds, LINEAR * abs(member.evidence))
+        evidence = member.evidence if abs(evidence - member.evidence) < alike else evidence
         name = "; ".join(sentence.text for each in sums for _, sentence in each)
         return self._member(name, evidence, sums, column, square, along, widths)
 
