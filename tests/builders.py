@@ -54,9 +54,8 @@ def exposures(*rows: dict[str, Any]) -> Exposures:
     for row in rows:
         inside = {f"{what}_in": f"{what}_angle" in row for what in ("clp", "chwp")}
         full.append(_BLANK | inside | row)
-    return Exposures(
-        exposure=np.arange(len(rows)), **{key: np.array([row[key] for row in full]) for key in _BLANK}
-    )
+    columns = {key.upper(): np.array([row[key] for row in full]) for key in _BLANK}
+    return Exposures.from_columns(columns | {"EXPOSURE": np.arange(len(rows))})
 
 
 def curve(wavelength: Sequence[float], throughput: Sequence[float]) -> FilterCurve:

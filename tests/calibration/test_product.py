@@ -17,6 +17,7 @@ from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.frames import Grid
+from walop_jax.data.records import Position
 from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.fit.verdict import Verdict
 from walop_jax.io.errors import DataError
@@ -197,7 +198,9 @@ def test_the_hash_is_of_the_content(product):
     assert moved.content_hash() != product.content_hash()
     warned = dataclasses.replace(product, verdict=dataclasses.replace(product.verdict, against=()))
     assert warned.content_hash() != product.content_hash()
-    for name in ("temp", "ha", "teff", "clp_angle", "rotator"):
+    turned = product.exposures.placed(CLP=Position.at(product.exposures.clp_angle + 1.5))
+    assert dataclasses.replace(product, exposures=turned).content_hash() != product.content_hash()
+    for name in ("temp", "ha", "teff", "rotator"):
         other = dataclasses.replace(product.exposures, **{name: getattr(product.exposures, name) + 1.5})
         if np.isfinite(getattr(other, name)).any():
             assert dataclasses.replace(product, exposures=other).content_hash() != product.content_hash()

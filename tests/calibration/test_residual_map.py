@@ -133,7 +133,7 @@ def test_the_map_is_of_the_setting_with_the_most_exposures():
     setting, chosen = residual_map._main_setting(Settings.of(e, ("CHWP",)), e.clp_in)
     assert setting.filter[0] == "SDSS-r"
     assert np.isnan(setting.position("CHWP")[0])
-    np.testing.assert_array_equal(chosen, ~e.chwp_in)
+    np.testing.assert_array_equal(chosen, ~e.position("CHWP").inside)
     only = dataclasses.replace(plan, plate=(45.0,))
     e = simulate(only, seed=1).calset.exposures
     assert residual_map._main_setting(Settings.of(e, ("CHWP",)), e.clp_in)[0].position("CHWP")[0] == 45.0

@@ -18,7 +18,6 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import _physics
 from walop_jax.calibration.matrix import analysis_vectors, matrices
 from walop_jax.data.calset import empty_sources
-from walop_jax.data.catalogue import field_points, read_catalogue
 from walop_jax.data.records import Exposures, FilterCurve, Position, Site
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
@@ -30,6 +29,7 @@ from walop_jax.model.planning import plan_for, plan_for_settings
 from walop_jax.model.specification import Model, make_model
 from walop_jax.model.trace import Sightline, trace
 from walop_jax.science.apply import apply
+from walop_jax.science.catalogue import field_points, read_catalogue
 from walop_jax.science.star_errors import determinant
 
 TEXT = """
@@ -108,9 +108,11 @@ def calibration(model) -> Calibration:
     nan, count, odd = np.full(8, np.nan), 8, np.arange(8) % 2 > 0
     exposures = Exposures(
         exposure=np.arange(count), kind=np.repeat(["lamp", "clp"], 4), mjd=61000.0 + np.arange(8), exptime=nan,
-        filter=np.full(count, "line"), clp_in=np.arange(8) > 3, clp_angle=np.where(np.arange(8) > 3, 30.0, np.nan),
-        chwp_in=np.zeros(8, bool), chwp_angle=nan, temp=np.full(8, 10.0), ha=nan, ra=nan, dec=nan, rotator=nan,
-        teff=nan, moving={"HWP": Position(np.ones(8, bool), angles), "RET": Position(odd, np.where(odd, 20.0, np.nan))},
+        filter=np.full(count, "line"), temp=np.full(8, 10.0), ha=nan, ra=nan, dec=nan, rotator=nan, teff=nan,
+        positions={
+            "CLP": Position.at(np.where(np.arange(8) > 3, 30.0, np.nan)), "HWP": Position.at(angles),
+            "RET": Position.at(np.where(odd, 20.0, np.nan)),
+        },
     )  # fmt: skip
     verdict = Verdict(1.0, 1, 16, 1.0, converged=True)
     return Calibration(

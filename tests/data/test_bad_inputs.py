@@ -97,7 +97,7 @@ def all_flagged(made):
 E, P, I, S, F = "EXPOSURES", "POINTS", "INTENSITIES", "SOURCES", "FILTERS"  # noqa: E741 - as in the tables
 BAD = {
     # headers
-    "no INSTRUME": (header("INSTRUME", None), "[PRIMARY] INSTRUME: is ''", "WALOP-SOUTH"),
+    "no INSTRUME": (header("INSTRUME", None), "[PRIMARY] INSTRUME: is '', not a name"),
     "misspelt INSTRUME": (header("INSTRUME", "WALOP-SUOTH"), "INSTRUME", "did you mean 'WALOP-SOUTH'"),
     "newer CALVERS": (header("CALVERS", 3), "[PRIMARY] CALVERS: is 3", "newer walop-jax"),
     "no CALVERS": (header("CALVERS", None), "CALVERS: is missing", "is this a calibration set?"),
@@ -124,8 +124,8 @@ BAD = {
         column(E, "CLP_IN", "J", None, np.arange(8)),
         "CLP_IN: is neither true nor false in rows 2",
     ),
-    "three cameras": (column(I, "N", "3D", "electron", np.ones((24, 3))), "[INTENSITIES] N: has shape (3,)"),
-    "scalar N": (column(I, "N", "D", "electron", np.ones(24)), "[INTENSITIES] N: has shape"),
+    "three cameras": (column(I, "N", "3D", "electron", np.ones((24, 3))), "[INTENSITIES] N: has 3 camera(s)"),
+    "scalar N": (column(I, "N", "D", "electron", np.ones(24)), "[INTENSITIES] N: has 1 camera(s)"),
     "complex": (column(P, "X", "C", "deg", np.zeros(3)), "[POINTS] X: holds complex64"),
     # exposures
     "same exposure": (put(E, "EXPOSURE", 3, 10), "[EXPOSURES] EXPOSURE", "rows 0, 3 (counted from 0)"),

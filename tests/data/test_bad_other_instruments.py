@@ -1,4 +1,4 @@
-"""Bad sets of other instruments (CALVERS 2): what is done to a good one, and what the error must name."""
+"""Bad sets of other instruments: what is done to a good one, and what the error must name."""
 
 from __future__ import annotations
 
@@ -40,14 +40,6 @@ def three(name):
     return column(I, name, "3D", "electron", np.ones((24, 3)))
 
 
-def as_version_1(made):
-    """The lamp set with the columns that version 1 wants."""
-    made.header.update(CALVERS=1, INSTRUME="WALOP-SOUTH")
-    made[E]["CLP_IN"] = ["L", None, np.zeros(8, bool)]
-    for name in ("N", "N_ERR"):
-        made[I][name] = ["4D", "electron", np.tile(made.values(I, name), 2)]
-
-
 TRUE = ["L", None, np.ones(8, bool)]
 ANGLE = ["D", "deg", np.zeros(8)]
 BAD = {
@@ -55,7 +47,8 @@ BAD = {
     "number": (header("INSTRUME", 3), "[PRIMARY] INSTRUME: is 3, not a name"),
     "leading blank": (header("INSTRUME", " A"), "[PRIMARY] INSTRUME: is ' A'", "no blank at either end"),
     "long name": (header("INSTRUME", 33 * "A"), "[PRIMARY] INSTRUME", "1 to 32"),
-    "other name in version 1": (header("CALVERS", 1), "[PRIMARY] INSTRUME: is 'BENCH OF TWO'"),
+    "another separator": (header("INSTRUME", "walop_south"), "[PRIMARY] INSTRUME", "did you mean 'WALOP-SOUTH'"),
+    "of four cameras": (header("INSTRUME", "WALOP-SOUTH"), "[INTENSITIES] N: has 2 camera(s), WALOP-SOUTH has 4"),
     "one camera": (narrow("N", "N_ERR"), "[INTENSITIES] N: has 1 value in a row", "two at least"),
     "fewer errors": (narrow("N_ERR"), "[INTENSITIES] N_ERR: has 1 value(s) in a row, N has 2"),
     "more errors": (three("N_ERR"), "[INTENSITIES] N_ERR: has 3 value(s) in a row, N has 2"),
@@ -89,11 +82,6 @@ BAD = {
     "CHWP in without angle": (column(E, "CHWP_IN", *TRUE), "[EXPOSURES] CHWP_ANGLE: is not finite in rows 0"),
     "clp without CLP": (put(E, "KIND", 3, "clp"), "[EXPOSURES] CLP_IN: is false in row 3"),
     "unknown kind": (put(E, "KIND", 3, "lamb"), "[EXPOSURES] KIND: 'lamb' is not a kind", "did you mean 'lamp'"),
-    "lamp in version 1": (
-        as_version_1,
-        "[EXPOSURES] KIND: 'lamp' is a kind of CALVERS 2, this is 1, in rows 0, 1, 2, 3, 4 … (6 in all",
-        "set CALVERS = 2",
-    ),
     "lamp with a source": (put(I, "SOURCE", 4, 3), "[INTENSITIES] SOURCE: a lamp is no source of the sky, in row 4"),
 }  # fmt: skip
 
@@ -122,7 +110,7 @@ def test_rows_with_different_numbers_of_cameras(two_cameras):
 
 def means_what_it_says(calset, made):
     written = {name.upper(): entry[2] for name, entry in made[E].items()}
-    for prefix, position in calset.exposures.moving.items():
+    for prefix, position in calset.exposures.positions.items():
         assert re.fullmatch(r"[A-Z][A-Z0-9_]*", prefix)
         inside = written.get(f"{prefix}_IN", np.ones(8, bool))
         np.testing.assert_array_equal(position.inside, inside)

@@ -16,10 +16,10 @@ from astropy.time import Time
 from astropy.utils.masked import Masked
 
 from walop_jax.data.calset import from_arrays
-from walop_jax.data.catalogue import field_points, read_catalogue
 from walop_jax.data.user_tables import extended, in_memory, read_input_table
 from walop_jax.io.errors import DataError
 from walop_jax.model.instrument import nominal_instrument
+from walop_jax.science.catalogue import field_points, read_catalogue
 
 SOUTH = nominal_instrument("WALOP-SOUTH")
 ROWS = 5

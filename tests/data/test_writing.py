@@ -94,7 +94,7 @@ def test_what_stands_in_the_file(handmade):
         assert columns["N"].unit == "electron"
         assert hdus["EXPOSURES"].columns["TEMP"].unit == "Celsius"
         assert hdus["EXPOSURES"].columns["CLP_IN"].format == "L"
-        assert hdus[0].header["CALVERS"] == 1
+        assert hdus[0].header["CALVERS"] == 2
         assert hdus["INTENSITIES"].data["SOURCE"][21:].tolist() == [3, 3, 3]
 
 

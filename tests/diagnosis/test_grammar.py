@@ -1,7 +1,5 @@
 """The sentences of an instrument: their columns, and the names that are sentences with a history."""
 
-import dataclasses
-
 import builders
 import numpy as np
 import pytest
@@ -127,7 +125,7 @@ def test_grammar_of_another_instrument():
     ]
     instrument = build(parsed(OWN, "own.toml"))
     window = Position(np.ones(5, bool), np.array([0.0, 10.0, 20.0, 40.0, 80.0]))
-    exposures = dataclasses.replace(builders.exposures(*turns), moving={"WIN": window})
+    exposures = builders.exposures(*turns).placed(WIN=window)
     said = {p.name for p in candidates.sentences(instrument, exposures, 25)}
     assert "retardance q behind window; retardance u behind window" in said
     assert "depolarisation of window * cos 2 WIN; depolarisation of window * sin 2 WIN" in said

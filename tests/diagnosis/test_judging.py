@@ -10,6 +10,7 @@ from scenes import PLAN
 from scipy import integrate, stats
 
 from walop_jax.calibration.matrix import largest_change
+from walop_jax.data.records import Position
 from walop_jax.diagnosis import search, workflow
 from walop_jax.diagnosis.design import Design, Measured, strata
 from walop_jax.diagnosis.examination import Evidence, upper_limit
@@ -213,7 +214,7 @@ def slipped(seed=1):
     e = simulated.calset.exposures
     nearest = np.abs(e.clp_angle[:, None] - true).argmin(axis=1)
     angle = np.where(e.clp_in, stated[nearest], e.clp_angle)
-    exposures = dataclasses.replace(e, clp_angle=angle)
+    exposures = e.placed(CLP=Position.at(angle))
     return dataclasses.replace(simulated.calset, exposures=exposures)
 
 

@@ -12,7 +12,7 @@ from quick import quick
 from small_run import SEED, SMALL
 
 from walop_jax.data.inspection import inspect
-from walop_jax.data.records import CalibrationSet
+from walop_jax.data.records import CalibrationSet, Position
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.alternatives import _angles, mixups
 from walop_jax.diagnosis.trust import examined
@@ -59,15 +59,15 @@ def with_data(
     return dataclasses.replace(calset, points=where, intensities=TableIntensities.dense(where, block))
 
 
-def with_angle(calset: CalibrationSet, **columns: np.ndarray) -> CalibrationSet:
-    return dataclasses.replace(calset, exposures=dataclasses.replace(calset.exposures, **columns))
+def with_angle(calset: CalibrationSet, angle: np.ndarray, prefix: str = "CLP") -> CalibrationSet:
+    return dataclasses.replace(calset, exposures=calset.exposures.placed(**{prefix: Position.at(angle)}))
 
 
 def unpolarised(simulated: Simulated) -> CalibrationSet:
     """The polariser exposures as they would be without it, written down as if it had been there."""
     calset, truth = simulated
     e = calset.exposures
-    out = with_angle(calset, clp_in=np.zeros(len(e), bool), clp_angle=np.full(len(e), np.nan))
+    out = with_angle(calset, np.full(len(e), np.nan))
     model, true = base_model(out), truth_values(truth)
     block = calset.intensities.block(0, len(calset.points))
     _, left = Likelihood.of(out, model).residuals(np.array([true[p.name] for p in model.parameters]))
@@ -107,13 +107,13 @@ CASES: dict[str, tuple[Spoil, str]] = {
     "the arms exchanged": (lambda c: with_data(c, (2, 3, 0, 1)), "their order is O1, E1, O2, E2"),
     "the beams of an arm exchanged": (lambda c: with_data(c, (1, 0, 2, 3)), "in the order E1, O1, O2, E2"),
     "cameras in a ring": (lambda c: with_data(c, (1, 2, 3, 0)), "in the order E1, O2, E2, O1"),
-    "the polariser runs backwards": (lambda c: with_angle(c, clp_angle=-c.exposures.clp_angle), "give −CLP_ANGLE"),
-    "polariser + 90": (lambda c: with_angle(c, clp_angle=c.exposures.clp_angle + 90), r"give CLP_ANGLE \+ 90°"),
-    "polariser + 45": (lambda c: with_angle(c, clp_angle=c.exposures.clp_angle + 45), r"give CLP_ANGLE \+ 135°"),
+    "the polariser runs backwards": (lambda c: with_angle(c, -c.exposures.clp_angle), "give −CLP_ANGLE"),
+    "polariser + 90": (lambda c: with_angle(c, c.exposures.clp_angle + 90), r"give CLP_ANGLE \+ 90°"),
+    "polariser + 45": (lambda c: with_angle(c, c.exposures.clp_angle + 45), r"give CLP_ANGLE \+ 135°"),
     "polariser in radians": (
-        lambda c: with_angle(c, clp_angle=np.deg2rad(c.exposures.clp_angle)), "CLP_ANGLE is in radians",
+        lambda c: with_angle(c, np.deg2rad(c.exposures.clp_angle)), "CLP_ANGLE is in radians",
     ),
-    "plate backwards": (lambda c: with_angle(c, chwp_angle=-c.exposures.chwp_angle), "give −CHWP_ANGLE"),
+    "plate backwards": (lambda c: with_angle(c, -c.exposures.position("CHWP").angle, "CHWP"), "give −CHWP_ANGLE"),
     "X mirrored": (lambda c: with_data(c, x=-c.points.x), "give −X"),
     "Y mirrored": (lambda c: with_data(c, y=-c.points.y), "give −Y"),
     "turned by 90 degrees": (lambda c: with_data(c, x=c.points.y, y=-c.points.x), "give −Y as X, and X as Y"),
@@ -144,15 +144,14 @@ TWO = {*OF_THE_PLATE, "Q of standards of the other sign"}  # the one polarised s
 
 def test_angles_are_rewritten_as_the_remedy_says(calset):
     """Without a fit: what is tried is what is recommended."""
-    plate, found = calset.exposures.chwp_angle, 0
+    plate, found = calset.exposures.position("CHWP").angle, 0
     for one in _angles(calset):
         told = re.fullmatch(r"give (−?)(CLP|CHWP)_ANGLE(?: \+ (\d+)°)?", one.remedy)
         if told is None:
             continue
-        name = f"{told[2].lower()}_angle"
         sign, offset = -1.0 if told[1] else 1.0, float(told[3] or 0.0)
-        changed = getattr(one.change(calset).exposures, name)
-        np.testing.assert_allclose(changed, sign * getattr(calset.exposures, name) + offset, rtol=1e-12)
+        before, changed = (c.exposures.position(told[2]).angle for c in (calset, one.change(calset)))
+        np.testing.assert_allclose(changed, sign * before + offset, rtol=1e-12)
         found += 1
     assert np.isfinite(plate).any()
     assert found == 14
@@ -212,7 +211,7 @@ def test_right_data_and_effects_are_no_mix_up(calset):
     model = base_model(calset)
     assert mixups(calset, model, left=1.0) == ()
     wobble = 2.0 * np.sin(np.deg2rad(calset.exposures.clp_angle))
-    assert mixups(with_angle(calset, clp_angle=calset.exposures.clp_angle + wobble), model, left=5e3) == ()
+    assert mixups(with_angle(calset, calset.exposures.clp_angle + wobble), model, left=5e3) == ()
     counts = block.counts * np.array([1.0, 0.5, 1.0, 1.0])
     table = TableIntensities.dense(calset.points, dataclasses.replace(block, counts=counts))
     assert mixups(dataclasses.replace(calset, intensities=table), model, left=1e3) == ()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from small_run import SEED, SMALL, small_fit
 
+from walop_jax.data.records import Position
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.repeated_noise import pairs_alike, repeated_noise
@@ -79,9 +80,7 @@ def test_a_copy_in_a_small_set_is_not_trusted():
     sigma[:, through[1]] = sigma[:, through[3]]
     table = TableIntensities.dense(calset.points, dataclasses.replace(block, counts=counts, sigma=sigma))
     found = examined(
-        refit(
-            dataclasses.replace(calset, intensities=table, exposures=dataclasses.replace(e, clp_angle=angle))
-        )
+        refit(dataclasses.replace(calset, intensities=table, exposures=e.placed(CLP=Position.at(angle))))
     )
     assert not found.trusted
     assert "the same noise" in "; ".join(found.verdict.doubts)

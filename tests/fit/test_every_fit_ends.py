@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from small_run import SEED, SMALL
 
+from walop_jax.data.records import Position
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
@@ -40,7 +41,7 @@ def with_scrambled_angles(calset, rng):
     e = calset.exposures
     angle, there = e.clp_angle.copy(), np.flatnonzero(e.clp_in)
     angle[there] = rng.permutation(angle[there])
-    return dataclasses.replace(calset, exposures=dataclasses.replace(e, clp_angle=angle))
+    return dataclasses.replace(calset, exposures=e.placed(CLP=Position.at(angle)))
 
 
 def from_elsewhere(calset, rng):

@@ -12,7 +12,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify
 from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.calibration.summary import summary
-from walop_jax.data.records import CalibrationSet
+from walop_jax.data.records import CalibrationSet, Position
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit import robust
@@ -88,7 +88,7 @@ def test_exposures_with_a_disturbance_of_their_own(clean, tmp_path):
     """The polariser stands a twentieth of a degree from where its encoder says, each time another way."""
     calset, true = clean
     off = np.random.default_rng(3).normal(0.0, 0.05, len(calset.exposures))
-    said = dataclasses.replace(calset.exposures, clp_angle=calset.exposures.clp_angle + off)
+    said = calset.exposures.placed(CLP=Position.at(calset.exposures.clp_angle + off))
     disturbed = dataclasses.replace(calset, exposures=said)
     plain = fit(Likelihood.of(disturbed, base_model(disturbed)))
     result = refit(disturbed)
@@ -112,7 +112,9 @@ def test_blocks(clean):
     e = calset.exposures
     assert len(np.unique(states(calset))) == len(e)
     coarse = np.round(e.clp_angle / 30.0) * 30.0
-    at_once = dataclasses.replace(e, mjd=np.zeros(len(e)), temp=np.zeros(len(e)), clp_angle=coarse)
+    at_once = dataclasses.replace(e, mjd=np.zeros(len(e)), temp=np.zeros(len(e))).placed(
+        CLP=Position.at(coarse)
+    )
     twice = dataclasses.replace(calset, exposures=at_once)
     through = e.clp_in
     assert len(np.unique(states(twice)[through])) == len(np.unique(coarse[through]))

@@ -166,7 +166,7 @@ def exposures(states: list[dict[str, float | None]]) -> Exposures:
     for prefix in PREFIXES[1:]:
         angle = np.array([np.nan if s[prefix] is None else s[prefix] for s in states])
         moving[prefix] = Position(np.isfinite(angle), angle)
-    return dataclasses.replace(builders.exposures(*rows), moving=moving)
+    return builders.exposures(*rows).placed(**moving)
 
 
 def found_vectors(instrument: Instrument, states) -> np.ndarray:

@@ -130,7 +130,7 @@ def test_without_an_arm_of_two_cameras_there_is_a_fit_and_no_product(tmp_path):
 
 def test_a_gain_may_follow_any_element_that_moves(tmp_path):
     instrument, calset = described(tmp_path, ONE_DETECTOR), one_detector()
-    angle = np.deg2rad(calset.exposures.moving["PLATE"].angle)
+    angle = np.deg2rad(calset.exposures.position("PLATE").angle)
     calset.intensities.counts[:] *= (1.0 + 0.004 * np.cos(angle))[:, None]
     model = saying(base_model(calset, instrument), calset, ["gain of detector * cos 1 PLATE"])
     result = refit(calset, model)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import builders
@@ -147,7 +146,7 @@ def vectors(instrument: Instrument, stretch: float = 1.0) -> np.ndarray:
     wavelength = np.linspace(1.41, 1.59, 181)
     curve = FilterCurve("band", stretch * wavelength, np.exp(-0.5 * ((wavelength - 1.5) / 0.025) ** 2))
     moving = {"DEROT": Position(np.array([True]), np.array([12.0]))}
-    exposures = dataclasses.replace(builders.exposures({"kind": "flux"}), moving=moving)
+    exposures = builders.exposures({"kind": "flux"}).placed(**moving)
     plan = plan_for(instrument, exposures, {"band": curve})
     return builders.vectors(instrument, plan, 0.0, 0.0)[0, 0]
 

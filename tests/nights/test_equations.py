@@ -9,7 +9,7 @@ import pytest
 from small_run import SMALL
 
 from walop_jax.data.merge import merge_calibration_sets
-from walop_jax.data.records import InputFile, Site
+from walop_jax.data.records import InputFile, Position, Site
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.variance_components import groupings
 from walop_jax.fit.model_file import base_model
@@ -46,7 +46,7 @@ def test_data_are_identified_by_their_files_or_their_content(two):
     calset = two[0]
     content = data_hash(calset)
     assert data_hash(simulate(SMALL, seed=1).calset) == content
-    exposures = dataclasses.replace(calset.exposures, clp_angle=calset.exposures.clp_angle + 1e-9)
+    exposures = calset.exposures.placed(CLP=Position.at(calset.exposures.clp_angle + 1e-9))
     assert data_hash(dataclasses.replace(calset, exposures=exposures)) != content
     rows = calset.intensities
     counts = rows.counts.copy()

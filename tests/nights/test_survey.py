@@ -22,7 +22,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, make_model, with_effects
-from walop_jax.nights import night_file, stacking
+from walop_jax.nights import making, night_file, stacking
 from walop_jax.nights.equations import night_equations
 from walop_jax.nights.stacking import stack
 from walop_jax.science import apply as application
@@ -289,7 +289,7 @@ def kept(sets, single, tmp_path_factory):
 
     words = [run, folder / "night2.fits", folder / "night1.fits", "-o", stopped]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stacking, "night_equations", interrupted)
+        patch.setattr(making, "night_equations", interrupted)
         assert run_program("stack", *words).exit_code == 130
         assert [entry.name for entry in stopped.iterdir()] == ["partial"]
         # The first night is kept: the other two are made, then all three again at the common solution, as often as need

@@ -14,13 +14,13 @@ from scipy import stats
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
-from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.paper import polynomial as paper
 from walop_jax.science import star_errors as accuracy
 from walop_jax.science.apply import apply
+from walop_jax.science.catalogue import read_catalogue
 from walop_jax.science.estimate import estimate
 
 TEFF = 5772.0  # of the light that the true matrices are of

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from astropy.table import Table
 
-from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.model.instrument import nominal_instrument
+from walop_jax.science.catalogue import read_catalogue
 
 SOUTH = nominal_instrument("WALOP-SOUTH")
 

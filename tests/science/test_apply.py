@@ -13,7 +13,6 @@ from small_run import SEED, WITH_PLATE
 from star_tables import SOUTH, read, setting, stars
 
 from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors, colour_weights
-from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Quality
@@ -22,6 +21,7 @@ from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.specification import effect_context, make_model, with_effects
 from walop_jax.science.apply import COOL, HOT, apply
+from walop_jax.science.catalogue import read_catalogue
 from walop_jax.science.detectors import linearised
 from walop_jax.simulation.simulate import simulate
 
@@ -404,7 +404,7 @@ def test_simulated_observation_of_standards(calset, calibration, tmp_path):
     point, star = np.array(point), np.array(star)
     table = Table({"X": block.x[point], "Y": block.y[point], "N": block.counts[point, star]})
     table["N_ERR"] = block.sigma[point, star]
-    table["CHWP_ANGLE"] = np.where(exposures.chwp_in[star], exposures.chwp_angle[star], np.nan)
+    table["CHWP_ANGLE"] = exposures.position("CHWP").angle[star]
     table["ROTATOR"] = exposures.rotator[star]
     source = block.source[point, star]
     table["TEFF"] = run.calset.sources.teff[source]

@@ -16,7 +16,6 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify
 from walop_jax.calibration.could_hide import change_by_effect, could_hide
 from walop_jax.calibration.product import read_calibration, write_calibration
-from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hidden_mistakes import _Starlight, hidden_mistakes
@@ -25,6 +24,7 @@ from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.fit.verdict import Hidden
 from walop_jax.science.apply import apply
+from walop_jax.science.catalogue import read_catalogue
 from walop_jax.science.commissioning import commissioning
 from walop_jax.science.field_accuracy import field_accuracy
 from walop_jax.simulation.simulate import simulate

@@ -10,9 +10,9 @@ import pytest
 from studies import watch as study
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.data.catalogue import read_catalogue
 from walop_jax.data.user_tables import in_memory
 from walop_jax.reports.survey_figures import watch_figure
+from walop_jax.science.catalogue import read_catalogue
 from walop_jax.science.star_residuals import noise_scale, normal_matrix
 from walop_jax.science.watch import Watching, dated, grouped, with_rivals
 

@@ -89,7 +89,7 @@ def test_plates_and_narrow_bands_multiply_the_polariser_and_alternate_on_the_sky
     e = simulate(plan, 1).calset.exposures
     assert (e.kind == "clp").sum() == 6 * 3 * 3
     assert set(e.filter[e.kind != "clp"]) == {"SDSS-r"}
-    np.testing.assert_array_equal(e.chwp_angle[e.kind == "moon"], [np.nan, 0.0, 45.0, np.nan])
+    np.testing.assert_array_equal(e.position("CHWP").angle[e.kind == "moon"], [np.nan, 0.0, 45.0, np.nan])
 
 
 @pytest.mark.parametrize("instrument", ["WALOP-SOUTH", "WALOP-NORTH"])

@@ -57,6 +57,7 @@ def write_set(case: str, path: Path) -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    from walop_jax.data.records import Position
     from walop_jax.data.write import write_calibration_set
     from walop_jax.model.effects import effect_by_name
     from walop_jax.model.effects.base import Context
@@ -80,9 +81,7 @@ def write_set(case: str, path: Path) -> None:
     e = calset.exposures
     stated = e.clp_angle.copy()
     stated[e.clp_in] = 15.0 * np.round(e.clp_angle[e.clp_in] / 15.0)
-    write_calibration_set(
-        path, dataclasses.replace(calset, exposures=dataclasses.replace(e, clp_angle=stated))
-    )
+    write_calibration_set(path, dataclasses.replace(calset, exposures=e.placed(CLP=Position.at(stated))))
 
 
 def measured(calset: Path, folder: Path, package: Path) -> dict[str, object]:

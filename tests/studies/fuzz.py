@@ -44,7 +44,6 @@ from walop_jax.calibration.calibration import Calibration, ListedModel  # noqa: 
 from walop_jax.calibration.matrix import MatrixMaps  # noqa: E402
 from walop_jax.calibration.product import read_calibration, write_calibration  # noqa: E402
 from walop_jax.data.calset import read_calibration_set  # noqa: E402
-from walop_jax.data.catalogue import read_catalogue  # noqa: E402
 from walop_jax.data.frames import Grid  # noqa: E402
 from walop_jax.data.user_tables import read_input_table  # noqa: E402
 from walop_jax.fit.model_file import (  # noqa: E402
@@ -55,6 +54,7 @@ from walop_jax.fit.model_file import (  # noqa: E402
 from walop_jax.fit.verdict import Verdict  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
 from walop_jax.model.instrument import nominal_instrument  # noqa: E402
+from walop_jax.science.catalogue import read_catalogue  # noqa: E402
 
 SLOWEST = 10  # seconds
 OUTCOMES = ("error", "same", "word", "silent", "traceback", "slow")

@@ -36,7 +36,6 @@ from trust import with_block  # noqa: E402
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.calibration.matrix import sky_vectors  # noqa: E402
 from walop_jax.data.calset import read_calibration_set  # noqa: E402
-from walop_jax.data.catalogue import read_catalogue  # noqa: E402
 from walop_jax.data.frames import Grid  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
 from walop_jax.data.settings import Settings  # noqa: E402
@@ -54,6 +53,7 @@ from walop_jax.model.instrument import Instrument  # noqa: E402
 from walop_jax.model.planning import plan_for_settings  # noqa: E402
 from walop_jax.model.specification import with_effects  # noqa: E402
 from walop_jax.science.apply import COOL, HOT, apply  # noqa: E402
+from walop_jax.science.catalogue import read_catalogue  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
 
 STARS, ELECTRONS, COLOURS = 200, 4e6, 16

@@ -22,7 +22,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ from small_run import SMALL  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.calibration.matrix import sky_vectors  # noqa: E402
-from walop_jax.data.records import CalibrationSet  # noqa: E402
+from walop_jax.data.records import CalibrationSet, Position  # noqa: E402
 from walop_jax.data.settings import Settings  # noqa: E402
 from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
 from walop_jax.diagnosis.trust import examined  # noqa: E402
@@ -104,7 +104,7 @@ def mistakes(rng: np.random.Generator) -> dict[str, Callable[[CalibrationSet], M
     ) -> Callable[[CalibrationSet], Mistake]:
         return plain(lambda c: with_block(c, counts=change(c, block(c).counts.copy())))
 
-    def columns(**changed: Callable[[CalibrationSet], np.ndarray]) -> Callable[[CalibrationSet], Mistake]:
+    def columns(**changed: Callable[[CalibrationSet], Any]) -> Callable[[CalibrationSet], Mistake]:
         def change(c: CalibrationSet) -> CalibrationSet:
             e = dataclasses.replace(c.exposures, **{name: new(c) for name, new in changed.items()})
             return dataclasses.replace(c, exposures=e)
@@ -166,10 +166,10 @@ def mistakes(rng: np.random.Generator) -> dict[str, Callable[[CalibrationSet], M
         counts[..., rng.integers(counts.shape[2])] = 0.0
         return counts
 
-    def glitch(calset: CalibrationSet) -> np.ndarray:
+    def glitch(calset: CalibrationSet) -> dict[str, Position]:
         angle = calset.exposures.clp_angle.copy()
         angle[rng.choice(np.flatnonzero(calset.exposures.clp_in))] += 0.05 * size
-        return angle
+        return {**calset.exposures.positions, "CLP": Position.at(angle)}
 
     def lamp(calset: CalibrationSet) -> np.ndarray:
         e = calset.exposures
@@ -213,8 +213,10 @@ def mistakes(rng: np.random.Generator) -> dict[str, Callable[[CalibrationSet], M
                 c, counts=block(c).counts[..., [2, 3, 0, 1]], sigma=block(c).sigma[..., [2, 3, 0, 1]]
             )
         ),
-        "polariser backwards": columns(clp_angle=lambda c: -c.exposures.clp_angle),
-        "polariser off once": columns(clp_angle=glitch),
+        "polariser backwards": columns(
+            positions=lambda c: {**c.exposures.positions, "CLP": Position.at(-c.exposures.clp_angle)}
+        ),
+        "polariser off once": columns(positions=glitch),
         "camera not linear": camera(lambda counts: counts * (1.0 - 3e-4 * size * counts / 1e6)),
         "scattered light": counted(scattered),
         "light of another camera": counted(leaking),

@@ -29,10 +29,10 @@ from small_run import small_fit_with_plate  # noqa: E402
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors  # noqa: E402
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
-from walop_jax.data.catalogue import read_catalogue  # noqa: E402
 from walop_jax.data.settings import Settings  # noqa: E402
 from walop_jax.data.user_tables import in_memory  # noqa: E402
 from walop_jax.science.apply import residuals_of  # noqa: E402
+from walop_jax.science.catalogue import read_catalogue  # noqa: E402
 from walop_jax.science.star_residuals import StarResiduals  # noqa: E402
 from walop_jax.science.watch import Watching, with_rivals  # noqa: E402
 from walop_jax.science.watch_found import Watch  # noqa: E402

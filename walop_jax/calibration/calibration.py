@@ -470,9 +470,7 @@ class Calibration(Fitted):
             _, covariance, _ = self.over_field(points.x, points.y, settings[:1], MAP_NODES, MAP_ERRORS)
         errors = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
         planes, flat = (-1, size, size), values.reshape(size * size, -1)
-        return MatrixMaps(
-            grid, name, flat.T.reshape(planes), errors.T.reshape(planes), settings[:1].further()
-        )
+        return MatrixMaps(grid, name, flat.T.reshape(planes), errors.T.reshape(planes), settings[:1].inside())
 
     @functools.cached_property
     def maps(self) -> MatrixMaps:

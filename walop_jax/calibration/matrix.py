@@ -60,8 +60,8 @@ def residual_names(arms: int) -> tuple[str, ...]:
 class MatrixMaps:
     """The elements of the instrument matrix over the field, for a look: order of `matrix_names`, three per arm.
 
-    For the filter named, a flat photon spectrum, the calibration plate out, and the further moving elements at
-    `positions` (deg by column prefix; those not there are out). Raises ValueError for another number of planes.
+    For the filter named, a flat photon spectrum, and the moving elements at `positions` (deg by column prefix; those
+    not there are out). Raises ValueError for another number of planes.
     """
 
     grid: Grid
@@ -90,14 +90,12 @@ class ResidualMap:
     """Residuals of the smooth model in cells of the field: planes in the order of `residual_names`.
 
     To be added to the matrix (throughput of an arm: relative); NaN where a cell has too few data. `chi2` is that of the
-    residuals before the correction, per degree of freedom. Through `filter`, with the calibration plate at
-    `chwp_angle` (deg, NaN out) and the further moving elements at `positions` (deg by column prefix; those not there
-    are out). Raises ValueError for another number of planes.
+    residuals before the correction, per degree of freedom. Through `filter`, with the moving elements at `positions`
+    (deg by column prefix; those not there are out). Raises ValueError for another number of planes.
     """
 
     grid: Grid
     filter: str
-    chwp_angle: float
     values: Float[np.ndarray, "m y x"]
     errors: Float[np.ndarray, "m y x"]
     chi2: Float[np.ndarray, "y x"]

@@ -22,12 +22,13 @@ from walop_jax.calibration.calibration import UNCHECKED, Calibration, ListedMode
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap, matrix_names, residual_names
 from walop_jax.data import schema
 from walop_jax.data.calset import empty_sources
-from walop_jax.data.checks import instrument_name, make_exposures, make_filters, make_sources, oldest_version
+from walop_jax.data.checks import instrument_name, make_exposures, make_filters, make_sources
 from walop_jax.data.frames import Grid, read_grid
-from walop_jax.data.records import PREFIX, InputFile, Site
+from walop_jax.data.records import CALIBRATION_PLATE, PREFIX, InputFile, Site
 from walop_jax.data.schema import Column, Place, column_names, read_table, table_rules
 from walop_jax.data.write import filter_columns, grid_cards, set_table_hdu, sign_and_write, table_hdu
 from walop_jax.fit.verdict import DATA, STATED, Hidden, Structure, Verdict
+from walop_jax.instruments.description import shipped
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.fits_reading import OpenFile, open_fits
@@ -151,7 +152,7 @@ def _hdus(c: Calibration, path: object) -> list[Any]:
         if len(next(iter(columns.values())))
     }
     version = _version(c)
-    instrument_name(c.instrument, version, Place(path, "PRIMARY"))
+    instrument_name(c.instrument, Place(path, "PRIMARY"))
     images = [fits.ImageHDU(c.covariance, name="COVARIANCE")]
     for suffix, planes in (("", c.maps.values), ("_ERR", c.maps.errors)):
         for name, image in zip(c.maps.names, planes, strict=True):
@@ -161,7 +162,7 @@ def _hdus(c: Calibration, path: object) -> list[Any]:
     if c.hidden is not None:
         images.append(_hidden_hdu(c.hidden))
     parameters, filters = made.pop("PARAMETERS"), made.pop("FILTERS")
-    exposures = set_table_hdu("EXPOSURES", c.exposures.columns(), version, path)
+    exposures = set_table_hdu("EXPOSURES", c.exposures.columns(), path)
     return [_primary(c, version), parameters, *images, filters, exposures, *made.values()]
 
 
@@ -171,8 +172,8 @@ def _strings(values: Iterable[str]) -> np.ndarray:
 
 def _version(c: Calibration) -> int:
     """The oldest version of the format that can hold a calibration."""
-    newer = c.maps.arms != 2 or c.maps.positions or (c.residuals is not None and c.residuals.positions)
-    return 2 if newer else oldest_version(c.instrument, c.exposures, 4)
+    newer = c.maps.arms != 2 or c.exposures.further or c.instrument not in shipped()
+    return 2 if newer or np.isin(c.exposures.kind, ("lamp", "steady")).any() else 1
 
 
 def _primary(c: Calibration, version: int) -> fits.PrimaryHDU:
@@ -244,8 +245,8 @@ def _map_hdu(name: str, image: np.ndarray, maps: MatrixMaps | ResidualMap) -> fi
     """An image of the field, with cards for the moving elements that are in the beam."""
     hdu = fits.ImageHDU(image, name=name)
     hdu.header.update(grid_cards(maps.grid))
-    inside = [entry for entry in maps.positions.items() if np.isfinite(entry[1])]
-    for number, (prefix, angle) in enumerate(inside, start=1):
+    further = {prefix: angle for prefix, angle in maps.positions.items() if prefix != CALIBRATION_PLATE}
+    for number, (prefix, angle) in enumerate(further.items(), start=1):
         hdu.header[f"ELEM{number}"], hdu.header[f"ANGLE{number}"] = prefix, angle
     return hdu
 
@@ -256,8 +257,8 @@ def _residual_hdus(residuals: ResidualMap) -> list[fits.ImageHDU]:
     ]
     for hdu in hdus:
         hdu.header["FILTER"] = residuals.filter
-        if np.isfinite(residuals.chwp_angle):
-            hdu.header["CHWPANG"] = (residuals.chwp_angle, "[deg] calibration plate; absent: out")
+        if (angle := residuals.positions.get(CALIBRATION_PLATE)) is not None:
+            hdu.header["CHWPANG"] = (angle, "[deg] calibration plate; absent: out")
         if hdu.header["NAXIS"] == 3:
             for number, quantity in enumerate(residuals.names, start=1):
                 hdu.header[f"PLANE{number}"] = quantity
@@ -334,7 +335,7 @@ class _Reader:
         exposures, place = self.table("EXPOSURES"), Place(self.path, "EXPOSURES")
         return Calibration(
             fitted=ListedModel(
-                name=instrument_name(self.header.get("INSTRUME", ""), self.version, self.primary),
+                name=instrument_name(self.header.get("INSTRUME", ""), self.primary),
                 parameters=_listed(table, model_lines),
                 maps=maps,
                 lines=model_lines,
@@ -360,7 +361,7 @@ class _Reader:
                 structure=Structure(self.number("STRUCTG", 0.0), self.number("STRUCTR", 0.0)),
             ),
             filters=filters,
-            exposures=make_exposures(exposures, filters, site, place, version=self.version, kinds=None),
+            exposures=make_exposures(exposures, filters, site, place, kinds=None),
             sources=make_sources(sources, Place(self.path, "SOURCES")) if sources else empty_sources(),
             site=site,
             origin=self.text("ORIGIN"),
@@ -443,7 +444,7 @@ class _Reader:
         if optional and name not in self.hdus:
             return {}
         hdu, place = self.hdu(name), Place(self.path, name)
-        rules = TABLES.get(name) or table_rules(name, self.version, column_names(hdu, place), place)
+        rules = TABLES.get(name) or table_rules(name, column_names(hdu, place), place)
         return read_table(hdu, rules, place)[0]
 
     def hdu(self, name: str) -> Any:
@@ -513,11 +514,11 @@ class _Reader:
                 self.fail(name, "is not an image on the grid of RESIDUAL")
             images[attribute] = np.ascontiguousarray(data, dtype=np.float64)
         header = self.hdus["RESIDUAL"].header
+        plate = {CALIBRATION_PLATE: float(header["CHWPANG"])} if "CHWPANG" in header else {}
         return ResidualMap(
             grid=self.grid("RESIDUAL"),
             filter=str(header.get("FILTER", "")).strip(),
-            chwp_angle=float(header.get("CHWPANG", np.nan)),
-            positions=self.positions("RESIDUAL"),
+            positions=plate | self.positions("RESIDUAL"),
             **images,
         )
 

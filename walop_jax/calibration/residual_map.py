@@ -25,7 +25,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.calibration.matrix import ResidualMap, residual_names
 from walop_jax.data.frames import Grid
-from walop_jax.data.records import CALIBRATION_PLATE
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.likelihood import engine, limits
@@ -224,9 +223,8 @@ def _solved_map(grid: Grid, setting: Settings, sums: _MapSums) -> ResidualMap:
     return ResidualMap(
         grid=grid,
         filter=str(setting.filter[0]),
-        chwp_angle=float(setting.position(CALIBRATION_PLATE)[0]),
         values=found.reshape(n, *shape),
         errors=errors.reshape(n, *shape),
         chi2=(sums.chi2 / np.where(sums.freedom > 0, sums.freedom, np.nan)).reshape(shape),
-        positions=setting.further(),
+        positions=setting.inside(),
     )

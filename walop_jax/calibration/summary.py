@@ -63,7 +63,7 @@ def summary(
         "scaled_gradient": result.minimum.scaled_gradient,
         "condition_number": result.minimum.condition,
         "chi2_history": list(result.minimum.history),
-        "misfit": None if misfit is None else dataclasses.asdict(misfit),
+        "misfit": None if misfit is None else misfit.document(),
         "residual_map": None
         if residuals is None
         else {

@@ -67,12 +67,12 @@ def apply(
     >>> star = {"X": [0.1], "Y": [0.0], "N": [[51e4, 49e4, 50e4, 48e4]], "N_ERR": [[714.0, 700.0, 707.0, 693.0]]}
     >>> walop.apply(result, star)["P", "P_ERR", "EVPA"]  # doctest: +SKIP
     """
-    from walop_jax.data.catalogue import read_catalogue
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.plain_tables import table_format
     from walop_jax.nights.stacking import calibration_of_stars, is_survey, read_survey
     from walop_jax.posterior.files import with_moments
     from walop_jax.science.apply import apply as apply_to_rows
+    from walop_jax.science.catalogue import read_catalogue
     from walop_jax.science.polarisation import ESTIMATORS
     from walop_jax.science.stokes_columns import header, stokes_columns
 

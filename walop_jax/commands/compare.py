@@ -59,13 +59,13 @@ def compare(
     >>> walop.compare("night.fits").document()["between"]  # doctest: +SKIP
     """
     from walop_jax import Calibration
-    from walop_jax.data.catalogue import true_matrices
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.refit import refit
     from walop_jax.io.errors import fail
     from walop_jax.io.plain_tables import astropy_table, write_table
     from walop_jax.paper.comparison import compare as comparison_of
     from walop_jax.reports import paper_figures
+    from walop_jax.science.catalogue import true_matrices
     from walop_jax.science.star_errors import Truth
 
     if output is not None and (calibration is not None or isinstance(truth, Truth)):

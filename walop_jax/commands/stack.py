@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
 from walop_jax.commands.inputs import Effects, PathLike, calibration_of, catalogue_of
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.nights.survey import Survey
 
@@ -17,6 +20,8 @@ LAWS = Option("Model file with [law] tables (default: that of the first fit).", 
 LIKE = Option("Fit with the model of all nights (default: the first RUN or SURVEY given).", "RUN", Path)
 EVENTS = Option("Table of what was done to the instrument: MJD, WHAT.", "TABLE", Path)
 KNOWN = Option("Do not look for breaks.")
+WORKERS = Option("Make nights in so many processes of this machine, by Dask.", "N", int, least=1)
+SCHEDULER = Option("Make nights on the workers of a Dask cluster that share the files.", "ADDRESS", str)
 SURVEY = Option("Folder of the survey.", "SURVEY", Path, "-o", required=True)
 
 
@@ -29,6 +34,8 @@ def stack(
     like: Annotated[Calibration | FitResult | Run | PathLike | None, LIKE] = None,
     events: Annotated[Any, EVENTS] = None,
     no_breaks: Annotated[bool, KNOWN] = False,
+    workers: Annotated[int | None, WORKERS] = None,
+    scheduler: Annotated[str | Executor | None, SCHEDULER] = None,
     output: Annotated[Any, SURVEY] = None,
     effects: Effects = None,
 ) -> Outcome[Survey]:
@@ -45,16 +52,27 @@ def stack(
     walop-jax apply SURVEY takes the calibration of the MJD of its stars. Exit code 3 if the laws do not explain the
     nights.
 
-    In Python: a `Survey`; nights may be fits and sets in memory, `laws` a mapping of names to [law] tables.
+    Nights are made by Dask on a cluster, or in processes of this machine, with --scheduler or --workers: the survey is
+    the same to the last digit, and a worker that is lost is replaced (walop-jax docs nights).
+
+    In Python: a `Survey`; nights may be fits and sets in memory, `laws` a mapping of names to [law] tables,
+    `scheduler` any `concurrent.futures.Executor`.
 
     >>> walop.stack(["night1.fits", "night2.fits"]).trusted  # doctest: +SKIP
     """
+    from walop_jax.nights.making import executor_of
     from walop_jax.nights.stacking import FILES, PARTIAL, writers
     from walop_jax.nights.stacking import stack as stacked
 
+    if workers is not None and scheduler is not None:
+        raise UsageError(
+            "workers and scheduler exclude each other: a cluster has its own workers", "scheduler"
+        )
     given: list[Any] = list(nights) if isinstance(nights, list | tuple) else [nights]
-    with job.reserved(output, FILES) as job:
+    with contextlib.ExitStack() as hold:
+        job = hold.enter_context(job.reserved(output, FILES))
         job.begin("reading")
+        executor = hold.enter_context(executor_of(workers, scheduler))
         survey = stacked(
             given,
             laws,
@@ -62,6 +80,7 @@ def stack(
             find=not no_breaks,
             events=events,
             partial=None if output is None else Path(output) / PARTIAL,
+            executor=executor,
             tell=lambda text: job.tell(text, "stacking"),
             catalogue=catalogue_of(effects),
         )

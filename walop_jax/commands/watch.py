@@ -42,9 +42,9 @@ def watch(
 
     >>> walop.watch("RUN", ["night1.fits", "night2.fits"])  # doctest: +SKIP
     """
-    from walop_jax.data.catalogue import read_catalogue
     from walop_jax.io.errors import errors_naming
     from walop_jax.reports.survey_figures import watch_figure
+    from walop_jax.science.catalogue import read_catalogue
     from walop_jax.science.watch import watch as watched
 
     job.begin("reading")

@@ -13,16 +13,16 @@ import numpy as np
 
 from walop_jax.data import schema
 from walop_jax.data.checks import (
+    check_cameras,
     doubts_about,
     instrument_name,
     make_exposures,
     make_filters,
     make_points,
     make_sources,
-    oldest_version,
 )
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
-from walop_jax.data.merge import check_repeats, merge_calibration_sets
+from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import (
     KINDS,
     CalibrationSet,
@@ -46,9 +46,14 @@ from walop_jax.data.schema import (
     without_mask,
 )
 from walop_jax.data.settings import builtin_filter
-from walop_jax.data.table_intensities import TableIntensities, mask_repeats, table_intensities, usable
+from walop_jax.data.table_intensities import (
+    TableIntensities,
+    mask_repeats,
+    repeated_counts,
+    table_intensities,
+    usable,
+)
 from walop_jax.data.write import EXTENSION, filter_columns, read_compression, remark, set_tables
-from walop_jax.instruments.description import described, shipped
 from walop_jax.io.errors import fail, nearest
 from walop_jax.io.fits_reading import OpenFile, open_fits
 
@@ -62,8 +67,8 @@ def read_calibration_set(*paths: str | os.PathLike[str], kinds: Collection[str] 
     """Read and check one calibration set, merging several files into one.
 
     Whole frames are not read, only described; their blocks are checked as they are read. What was odd but
-    harmless (unknown columns, masked rows, …) stands in `remarks`. `kinds` are kinds of exposures beyond `KINDS`
-    that sets of version 2 may have, for sources of the caller's own.
+    harmless (unknown columns, masked rows, …) stands in `remarks`. `kinds` are kinds of exposures beyond `KINDS`,
+    for sources of the caller's own.
 
     Raises `DataError` that names file, extension, column and row for anything that cannot be trusted.
     """
@@ -97,8 +102,8 @@ def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
 def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
     path, remarks = opened.path, list(opened.remarks)
     primary = opened.hdus[0].header
-    version, instrument, site = _header(primary, path)
-    hdus, images = _extensions(opened, version, remarks)
+    instrument, site = _header(primary, path)
+    hdus, images = _extensions(opened, remarks)
     if images and "INTENSITIES" in hdus:
         raise fail("has frames and a table of intensities", file=path, advice="use one file for each")
     if images and opened.compressed:
@@ -107,7 +112,10 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
     for name in ("EXPOSURES", *(() if images else ("POINTS", "INTENSITIES")), "FILTERS", "SOURCES"):
         place = Place(path, name)
         if name in hdus:
-            rules = table_rules(name, version, column_names(hdus[name], place), place)
+            columns = column_names(hdus[name], place)
+            if primary["CALVERS"] == 1:  # CLP and CHWP alone move there, whatever other columns are called
+                columns = [column for column in columns if column in schema.TABLES[name]]
+            rules = table_rules(name, columns, place)
             tables[name], more = read_table(hdus[name], rules, place)
             remarks += more
         elif name not in ("FILTERS", "SOURCES"):
@@ -115,7 +123,6 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
     return assembled(
         tables,
         path,
-        version=version,
         instrument=instrument,
         site=site,
         origin=str(primary.get("ORIGIN", "")).strip(),
@@ -130,11 +137,10 @@ def assembled(
     tables: Mapping[str, dict[str, Any]],
     path: Path,
     *,
-    version: int,
     instrument: str,
     site: Site,
     origin: str,
-    kinds: Collection[str] = KINDS,
+    kinds: Collection[str] = KINDS.keys(),
     remarks: Iterable[str] = (),
     images: Mapping[str, Any] | None = None,
     compression: Compression | None = None,
@@ -149,22 +155,22 @@ def assembled(
     remarks = list(remarks)
     filters = make_filters(tables["FILTERS"], Place(path, "FILTERS")) if "FILTERS" in tables else {}
     place = Place(path, "EXPOSURES")
-    exposures = make_exposures(tables["EXPOSURES"], filters, site, place, version=version, kinds=kinds)
+    exposures = make_exposures(tables["EXPOSURES"], filters, site, place, kinds)
     remarks += doubts_about(instrument, site, exposures, place)
     sources = empty_sources()
     if "SOURCES" in tables:
         sources = make_sources(tables["SOURCES"], Place(path, "SOURCES"))
     if images:
-        intensities, points = _frames(images, exposures, instrument, version, path)
+        intensities, points = _frames(images, exposures, instrument, path)
     else:
         points = make_points(tables["POINTS"], instrument, Place(path, "POINTS"))
         place = Place(path, "INTENSITIES")
+        check_cameras(instrument, tables["INTENSITIES"]["N"].shape[1], place, "N")
         intensities, more = table_intensities(tables["INTENSITIES"], exposures, points, sources, place)
         intensities, repeated = mask_repeats(intensities, exposures, path)
         remarks += more + repeated + _idle(intensities, exposures, path)
-    if compression is None:
-        remarks += check_repeats(intensities, exposures, points, path)
-    else:
+    remarks += repeated_counts(intensities, exposures, points, path, compression)
+    if compression is not None:
         remarks.append(remark(compression, len(points)))
     return CalibrationSet(
         instrument=instrument,
@@ -180,7 +186,7 @@ def assembled(
     )
 
 
-def _header(header: Any, path: Path) -> tuple[int, str, Site]:
+def _header(header: Any, path: Path) -> tuple[str, Site]:
     place = Place(path, "PRIMARY")
     version = header.get("CALVERS")
     if version is None:
@@ -194,7 +200,7 @@ def _header(header: Any, path: Path) -> tuple[int, str, Site]:
     if isinstance(version, bool) or not isinstance(version, int) or not 1 <= version <= CALVERS:
         what = f"is {version!r}, this program reads up to {CALVERS}"
         raise place.fail(what, "CALVERS", "use a newer walop-jax")
-    instrument = instrument_name(header.get("INSTRUME", ""), version, place)
+    instrument = instrument_name(header.get("INSTRUME", ""), place)
     values: dict[str, float] = {}
     for name in ("SITELAT", "SITELONG", "SITEELEV"):
         value = header.get(name, float("nan"))
@@ -203,17 +209,17 @@ def _header(header: Any, path: Path) -> tuple[int, str, Site]:
         values[name] = float(value)
     telescope = str(header.get("TELESCOP", "")).strip()
     site = Site(telescope, values["SITELAT"], values["SITELONG"], values["SITEELEV"])
-    return version, instrument, site
+    return instrument, site
 
 
-def _extensions(opened: OpenFile, version: int, remarks: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Sort the extensions of a file by name into tables and images."""
     four = [name for names in image_names(4) for name in names] + ["FLAG"]
     tables: dict[str, Any] = {}
     images: dict[str, Any] = {}
     for number, hdu in enumerate(opened.hdus[1:], start=1):
         name = hdu.name.strip().upper()
-        image = name in four or (version > 1 and _IMAGE.fullmatch(name))
+        image = name == "FLAG" or _IMAGE.fullmatch(name)
         kind = tables if name in (*schema.TABLES, EXTENSION) else images if image else None
         if kind is None:
             known = (*schema.TABLES, EXTENSION, *four)
@@ -222,6 +228,9 @@ def _extensions(opened: OpenFile, version: int, remarks: list[str]) -> tuple[dic
             raise fail("is there twice", file=opened.path, extension=name, advice="remove one")
         else:
             kind[name] = hdu
+    if "INTENSITIES" in tables and "N0" not in images:  # pictures of something else
+        remarks += [f"{opened.path} [{name}]: unknown extension, not used" for name in images]
+        images.clear()
     return tables, images
 
 
@@ -244,14 +253,15 @@ def _idle(intensities: TableIntensities, exposures: Exposures, path: Path) -> li
 
 
 def _frames(
-    images: Mapping[str, Any], exposures: Exposures, instrument: str, version: int, path: Path
+    images: Mapping[str, Any], exposures: Exposures, instrument: str, path: Path
 ) -> tuple[Intensities, Points]:
     """Describe frames, and look at a few rows of pixels for what is wrong everywhere."""
-    if np.any(bad := (exposures.kind == "standard") & ~exposures.clp_in):
+    if np.any(bad := exposures.direct("standard")):
         what = f"EXPOSURE {exposures.exposure[bad][0]} is a standard, and a pixel of a frame has no SOURCE"
         advice = "give standards in a table, in another file"
         raise Place(path, "EXPOSURES").fail(what, "KIND", advice)
-    grid, stack = frame_stack(images, len(exposures), path, 4 if version == 1 else None)
+    grid, stack = frame_stack(images, len(exposures), path)
+    check_cameras(instrument, len(stack.counts), Place(path, "N0"), "")
     width, total = grid.width, grid.pixels
     corners = (0, width - 1, total - width, total - 1)
     x, y = (np.concatenate(parts) for parts in zip(*(grid.xy(n, n + 1) for n in corners), strict=True))
@@ -330,13 +340,8 @@ def from_arrays(
             column="counts",
             advice="its axes are (point, exposure, camera)",
         )
-    cameras = len(described(instrument).cameras) if instrument.upper() in shipped() else counts.shape[2]
-    if counts.shape[2] != cameras:
-        raise fail(
-            f"has {counts.shape[2]} cameras, {instrument} has {cameras}",
-            column="counts",
-            advice="say with instrument= which other one it is",
-        )
+    instrument = instrument_name(instrument, Place(NAME, "PRIMARY"))
+    check_cameras(instrument, counts.shape[2], Place(NAME, ""), "counts")
     for name, curve in (filters or {}).items():
         if not isinstance(curve, FilterCurve):
             raise fail(
@@ -373,8 +378,7 @@ def from_arrays(
         tables["FILTERS"] = filter_columns(filters)
     found = _in_memory(
         tables,
-        version=schema.CALVERS,
-        instrument=instrument_name(instrument, schema.CALVERS, Place(NAME, "PRIMARY")),
+        instrument=instrument,
         site=Site("", _NAN, _NAN, _NAN) if site is None else site,
         origin=origin,
     )
@@ -386,11 +390,9 @@ def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationS
 
     `kinds` are kinds of exposures beyond those of the format. Raises `DataError` as `read_calibration_set` does.
     """
-    version = oldest_version(calset.instrument, calset.exposures, calset.cameras)
     found = _in_memory(
         set_tables(calset),
-        version=version,
-        instrument=instrument_name(calset.instrument, version, Place(NAME, "PRIMARY")),
+        instrument=instrument_name(calset.instrument, Place(NAME, "PRIMARY")),
         site=calset.site,
         origin=calset.origin,
         kinds=(*KINDS, *kinds),
@@ -403,13 +405,13 @@ def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationS
     return found
 
 
-def _in_memory(tables: Mapping[str, Mapping[str, Any]], *, version: int, **said: Any) -> CalibrationSet:
+def _in_memory(tables: Mapping[str, Mapping[str, Any]], **said: Any) -> CalibrationSet:
     """A checked set of columns in memory; `said` as for `assembled`."""
     made = {}
     for name, columns in tables.items():
         place = Place(NAME, name)
-        made[name] = table_of(columns, table_rules(name, version, list(columns), place), place)
-    return assembled(made, Path(NAME), version=version, **said)
+        made[name] = table_of(columns, table_rules(name, list(columns), place), place)
+    return assembled(made, Path(NAME), **said)
 
 
 def _spoilt(counts: np.ndarray) -> Iterator[str]:

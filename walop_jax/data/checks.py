@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
@@ -16,7 +17,7 @@ from walop_jax.io.errors import nearest, rows_text
 
 _ANY_FIELD = 90.0  # deg
 _LONGEST_NAME = 32
-_FIRST_KINDS = ("clp", "moon", "standard", "flux")  # of version 1
+_LIKE = 0.85  # of two names, for "did you mean"
 
 EPHEMERIS_MJD = (15020.0, 88069.0)
 """Range of astropy's built-in ephemeris (ERFA `moon98`, the years 1900 to 2100)."""
@@ -27,29 +28,33 @@ def field_limit(instrument: str) -> float:
     return described(instrument).field_limit if instrument in shipped() else _ANY_FIELD
 
 
-def instrument_name(value: object, version: int, place: Place) -> str:
-    """Check INSTRUME, in which the names of shipped instruments know no upper and lower case, and return it.
+def _letters(name: str) -> list[str]:
+    return sorted(filter(str.isalnum, name.upper()))
 
-    Raises `DataError` for another name in version 1; from version 2 on for one that is empty, longer than 32
-    letters, begins or ends with a blank, or is not printable ASCII.
+
+def instrument_name(value: object, place: Place) -> str:
+    """Check INSTRUME, in which names of shipped instruments are case-insensitive, and return it.
+
+    Raises `DataError` for a name that is empty, longer than 32 letters, begins or ends with a blank, or is not
+    printable ASCII, and for one with the letters of a shipped instrument in another order or with other separators.
     """
-    if version == 1:
-        name = str(value).strip().upper()
-        if name not in shipped():
-            raise place.fail(f"is {name!r}", "INSTRUME", nearest(name, shipped()))
-        return name
     name = value if isinstance(value, str) else ""
     good = 0 < len(name) <= _LONGEST_NAME and name == name.strip() and name.isascii() and name.isprintable()
     if not good:
         advice = f"1 to {_LONGEST_NAME} printable ASCII letters, no blank at either end"
         raise place.fail(f"is {value!r}, not a name", "INSTRUME", advice)
-    return name.upper() if name.upper() in shipped() else name
+    if name.upper() in shipped():
+        return name.upper()
+    if any(_letters(name) == _letters(known) for known in shipped()):
+        raise place.fail(f"is {name!r}", "INSTRUME", nearest(name, shipped()))
+    return name
 
 
-def oldest_version(instrument: str, exposures: Exposures, cameras: int) -> int:
-    """The oldest version of the calibration set format (CALVERS) that can hold a set."""
-    newer = instrument not in shipped() or cameras != 4 or exposures.moving
-    return 1 if not newer and np.isin(exposures.kind, _FIRST_KINDS).all() else 2
+def check_cameras(instrument: str, cameras: int, place: Place, column: str) -> None:
+    """Raise `DataError` for another number of cameras than a shipped instrument has."""
+    if instrument in shipped() and cameras != (known := len(described(instrument).cameras)):
+        what = f"has {cameras} camera(s), {instrument} has {known}"
+        raise place.fail(what, column, "write all of them, or correct the name of the instrument")
 
 
 def make_points(table: dict[str, Any], instrument: str, place: Place) -> Points:
@@ -120,17 +125,16 @@ def make_exposures(
     filters: Mapping[str, FilterCurve],
     site: Site,
     place: Place,
-    *,
-    version: int = 1,
-    kinds: Collection[str] | None = KINDS,
+    kinds: Collection[str] | None = KINDS.keys(),
 ) -> Exposures:
-    """Check the EXPOSURES table (degrees, days, kelvin, …) of a CALVERS `version` for what every KIND needs.
+    """Check the EXPOSURES table (degrees, days, kelvin, …) for what every KIND needs.
 
     `kinds` are those that KIND may have, None: any.
     """
     table["KIND"] = kind = np.char.lower(table["KIND"])
-    if kinds is not None:
-        _kinds(kind, kinds, version, place)
+    for name in np.unique(kind).tolist():
+        if kinds is not None and name not in kinds:
+            place.refuse(kind == name, f"{name!r} is not a kind,", "KIND", nearest(name, kinds))
     known = {*filters, *BUILTIN_FILTERS}
     for name in np.unique(table["FILTER"]).tolist():
         if name not in known:
@@ -164,16 +168,6 @@ def make_exposures(
     place.refuse(bad, "is not in 1900 … 2100", "MJD", "is this a Julian Date? subtract 2400000.5")
     _site(site, place, needed=bool(np.any(moon)))
     return Exposures.from_columns(table)
-
-
-def _kinds(kind: np.ndarray, kinds: Collection[str], version: int, place: Place) -> None:
-    known = [name for name in kinds if version > 1 or name in _FIRST_KINDS]
-    for name in np.unique(kind).tolist():
-        if name not in kinds:
-            place.refuse(kind == name, f"{name!r} is not a kind,", "KIND", nearest(name, known))
-        if name not in known:
-            what = f"{name!r} is a kind of CALVERS 2, this is {version},"
-            place.refuse(kind == name, what, "KIND", "set CALVERS = 2 in the primary header")
 
 
 def _site(site: Site, place: Place, *, needed: bool) -> None:
@@ -216,6 +210,8 @@ def doubts_about(instrument: str, site: Site, exposures: Exposures, place: Place
     """
     if instrument in shipped():
         yield from _about_site(instrument, site, place)
+    elif like := difflib.get_close_matches(instrument.upper(), shipped(), 1, _LIKE):
+        yield f"{place.file} [PRIMARY] INSTRUME: is {instrument!r}, not shipped; did you mean {like[0]!r}?"
     where = f"{place.file} [EXPOSURES] MJD"
     given = np.flatnonzero(np.isfinite(exposures.mjd))
     if not len(given):

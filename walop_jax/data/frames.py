@@ -213,20 +213,15 @@ class FrameIntensities(Intensities):
         return counts, sigma, np.broadcast_to(flag, counts.shape[:2])
 
 
-def frame_stack(
-    images: Mapping[str, Any], exposures: int, path: Path, cameras: int | None = None
-) -> tuple[Grid, FrameStack]:
+def frame_stack(images: Mapping[str, Any], exposures: int, path: Path) -> tuple[Grid, FrameStack]:
     """Describe the image extensions of a file, `images` by name, without reading their pixels.
-
-    `cameras` None: as many as there are images, at least two.
 
     Raises `DataError` for a missing or compressed extension, a shape that does not fit the exposures or the
     other extensions, a coordinate system that is not linear in X and Y, and a unit that is not electrons.
     """
     grids: dict[Grid, str] = {}
     cubes: dict[str, Cube] = {}
-    if cameras is None:
-        cameras = max([2, *(int(name[1:]) + 1 for name in images if name != "FLAG")])
+    cameras = max([2, *(int(name[1:]) + 1 for name in images if name != "FLAG")])
     counts, errors = image_names(cameras)
     for name in (*counts, *errors, *(("FLAG",) if "FLAG" in images else ())):
         place = Place(path, name)

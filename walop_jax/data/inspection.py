@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from walop_jax.data.checks import like_radians
-from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, CalibrationSet, DataFlag, Exposures
+from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet, DataFlag, Exposures
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.instruments.description import shipped
 
@@ -128,7 +128,7 @@ def inspect(calset: CalibrationSet) -> Inspection:
         field=(float(points.x.min()), float(points.x.max()), float(points.y.min()), float(points.y.max())),
         angles=tuple(angles.tolist()),
         widest_gap=float(gaps.max(initial=0.0)) if len(angles) > 1 else 180.0,
-        elements=tuple(_element_use(e, prefix, live) for prefix in e.moving),
+        elements=tuple(_element_use(e, prefix, live) for prefix in e.further),
         looked_at=sample.points,
         rows=int(sample.used.sum()),
         possible=int(sample.used.size),
@@ -156,7 +156,7 @@ def _sample(calset: CalibrationSet) -> _Sample:
         starts = np.unique(np.linspace(0, total - _RUN, _LOOKED_AT // _RUN).astype(int))
         blocks = [calset.intensities.block(int(start), int(start) + _RUN) for start in starts]
     used = np.concatenate([block.used for block in blocks])
-    counted = calset.exposures.kind != "flux"
+    counted = ~calset.exposures.flux_known
     rows = used & counted
     counts = np.concatenate([block.counts for block in blocks])[rows]
     sigma = np.concatenate([block.sigma for block in blocks])[rows]
@@ -169,11 +169,12 @@ def _sample(calset: CalibrationSet) -> _Sample:
 
 def _groups(calset: CalibrationSet, share: np.ndarray) -> tuple[Group, ...]:
     e = calset.exposures
+    plate = e.position(CALIBRATION_PLATE)
     keys = [
         (
             str(e.kind[n]),
             str(e.filter[n]),
-            f"{e.chwp_angle[n]:g} deg" if e.chwp_in[n] else "out",
+            f"{plate.angle[n]:g} deg" if plate.inside[n] else "out",
             "star" if e.kind[n] == "standard" else (f"{e.teff[n]:g} K" if np.isfinite(e.teff[n]) else "flat"),
         )
         for n in range(len(e))
@@ -204,7 +205,7 @@ def _flags(calset: CalibrationSet) -> dict[str, int]:
 
 
 def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
-    if not calset.exposures.moving:
+    if not calset.exposures.further:
         yield from _about_angles(made)
     if made.points < 2:
         # What another instrument needs its own description says.
@@ -267,13 +268,13 @@ def _about_angles(made: Inspection) -> Iterator[Finding]:
 def about_exposures(exposures: Exposures) -> Iterator[Finding]:
     """Notes on what exposures, taken or planned, cannot show whatever their counts are."""
     e = exposures
-    if e.clp_in.any() and not e.moving and np.ptp(np.mod(e.clp_angle[e.clp_in], 360.0)) < 180.0:
+    if e.clp_in.any() and not e.further and np.ptp(np.mod(e.clp_angle[e.clp_in], 360.0)) < 180.0:
         yield Finding(
             "note",
             "the polariser turns through half a turn only",
             "a full turn tells a wobble of its rotation from the instrument",
         )
-    if not np.any(((e.kind == "moon") | (e.kind == "standard")) & ~e.clp_in):
+    if not np.any(e.direct("moon", "standard")):
         yield Finding(
             "note",
             "no light of known polarisation but through the polariser (neither Moon sky nor standards)",
@@ -283,20 +284,19 @@ def about_exposures(exposures: Exposures) -> Iterator[Finding]:
 
 def _about_settings(exposures: Exposures, live: np.ndarray) -> Iterator[Finding]:
     """Findings where further elements move: which of them does the polariser's work is not known here."""
-    if not exposures.moving:
+    if not exposures.further:
         return
     used = exposures[np.flatnonzero(live)]
-    prefixes = (POLARISER, CALIBRATION_PLATE, *used.moving)
-    states = [used.position(prefix) for prefix in prefixes]
-    distinct = len({tuple(str(state.angle[row]) for state in states) for row in range(len(used))})
+    angles = [position.angle.astype(str) for position in used.positions.values()]
+    distinct = len(set(zip(*angles, strict=True)))
     if distinct < _FEWEST_SETTINGS:
         yield Finding(
             "fault",
             f"{distinct} distinct setting(s) of the moving elements with usable data",
             f"a fit needs at least {_FEWEST_SETTINGS}",
         )
-    for prefix, state in zip(prefixes, states, strict=True):
-        if like_radians(state.angle[state.inside]):
+    for prefix, position in used.positions.items():
+        if like_radians(position.angle[position.inside]):
             yield Finding(
                 "doubt", f"the angles of {prefix} look like radians", f"{prefix}_ANGLE is in degrees"
             )

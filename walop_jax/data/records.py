@@ -6,9 +6,9 @@ import dataclasses
 import enum
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -17,8 +17,29 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import nearest
 from walop_jax.io.plain_tables import astropy_table
 
-KINDS = ("clp", "moon", "standard", "flux", "lamp", "steady")
-"""Kinds of exposures: through the polariser, full-Moon sky, standard star, known throughput, lamp, lamp of one flux."""
+
+class ExposureKind(NamedTuple):
+    """Facts about a KIND of exposures.
+
+    `flux_known`: its flux is one, `flux_shared`: an unknown one is the same in all exposures of a filter, `from_sky`:
+    the light comes through the telescope. `seconds` is the usual exposure time, None where no plan observes it.
+    """
+
+    flux_known: bool = False
+    flux_shared: bool = False
+    from_sky: bool = True
+    seconds: float | None = None
+
+
+KINDS: Mapping[str, ExposureKind] = {
+    "clp": ExposureKind(seconds=30.0),
+    "lamp": ExposureKind(from_sky=False, seconds=30.0),
+    "moon": ExposureKind(seconds=60.0),
+    "standard": ExposureKind(seconds=60.0),
+    "flux": ExposureKind(flux_known=True, from_sky=False),
+    "steady": ExposureKind(flux_shared=True, from_sky=False),
+}
+"""Kinds of exposures: through the polariser, lamp, full-Moon sky, standard star, known throughput, lamp of one flux."""
 
 POLARISER, CALIBRATION_PLATE = "CLP", "CHWP"
 """Column prefixes of the moving elements that every calibration set knows."""
@@ -97,6 +118,12 @@ class Position:
         return Position(self.inside[rows], self.angle[rows])
 
     @classmethod
+    def at(cls, angles: Iterable[float | None]) -> Position:
+        """An element in the beam at these angles (deg), out of it where they are NaN or None."""
+        angle = np.array([np.nan if a is None else a for a in angles], float)
+        return cls(np.isfinite(angle), angle)
+
+    @classmethod
     def out(cls, exposures: int) -> Position:
         """An element that is out of the beam throughout."""
         return cls(np.zeros(exposures, dtype=bool), np.full(exposures, np.nan))
@@ -107,8 +134,8 @@ class Exposures:
     """One entry per exposure; angles in degrees, NaN where a quantity has no meaning.
 
     `mjd` UTC days at mid-exposure, `exptime` s, `temp` Celsius, `ha` hours, `teff` K (NaN: flat photon
-    spectrum), `rotator` the position angle of ICS +X (north through east). `moving` holds the moving elements
-    beyond polariser and calibration plate, by column prefix.
+    spectrum), `rotator` the position angle of ICS +X (north through east). `positions` holds the moving elements by
+    column prefix; polariser and calibration plate come first, out of the beam where they are not given.
 
     Raises ValueError for a prefix that cannot be one, an element with another number of exposures, and one that
     is in the beam without an angle.
@@ -119,24 +146,22 @@ class Exposures:
     mjd: Float[np.ndarray, " e"]
     exptime: Float[np.ndarray, " e"]
     filter: Shaped[np.ndarray, " e"]
-    clp_in: Bool[np.ndarray, " e"]
-    clp_angle: Float[np.ndarray, " e"]
-    chwp_in: Bool[np.ndarray, " e"]
-    chwp_angle: Float[np.ndarray, " e"]
     temp: Float[np.ndarray, " e"]
     ha: Float[np.ndarray, " e"]
     ra: Float[np.ndarray, " e"]
     dec: Float[np.ndarray, " e"]
     rotator: Float[np.ndarray, " e"]
     teff: Float[np.ndarray, " e"]
-    moving: Mapping[str, Position] = dataclasses.field(default_factory=dict)
+    positions: Mapping[str, Position] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for prefix, position in self.moving.items():
-            if not PREFIX.fullmatch(prefix) or prefix in (POLARISER, CALIBRATION_PLATE):
+        everywhere = {prefix: Position.out(len(self)) for prefix in (POLARISER, CALIBRATION_PLATE)}
+        object.__setattr__(self, "positions", {**everywhere, **self.positions})
+        for prefix, position in self.positions.items():
+            if not PREFIX.fullmatch(prefix):
                 raise ValueError(
-                    f"{prefix!r} cannot be the prefix of a further moving element: capital letters, digits and _, "
-                    f"a letter first, not {POLARISER} or {CALIBRATION_PLATE}"
+                    f"{prefix!r} cannot be the prefix of a moving element: capital letters, digits and _, a letter "
+                    "first"
                 )
             if len(position) != len(self):
                 raise ValueError(f"{prefix} has {len(position)} positions for {len(self)} exposures")
@@ -147,46 +172,70 @@ class Exposures:
         return len(self.exposure)
 
     def __getitem__(self, rows: slice | Int[np.ndarray, " r"] | Bool[np.ndarray, " e"]) -> Exposures:
-        plain = {name.lower(): values[rows] for name, values in self._plain().items()}
-        return Exposures(**plain, moving={prefix: entry[rows] for prefix, entry in self.moving.items()})
+        return Exposures(
+            **{name: values[rows] for name, values in self._plain().items()},
+            positions={prefix: position[rows] for prefix, position in self.positions.items()},
+        )
+
+    @property
+    def clp_in(self) -> Bool[np.ndarray, " e"]:
+        """True where the polariser is in the beam."""
+        return self.positions[POLARISER].inside
+
+    @property
+    def clp_angle(self) -> Float[np.ndarray, " e"]:
+        """Angle of the polariser (deg), NaN where it is out."""
+        return self.positions[POLARISER].angle
+
+    @property
+    def further(self) -> dict[str, Position]:
+        """The moving elements beyond polariser and calibration plate."""
+        return {p: at for p, at in self.positions.items() if p not in (POLARISER, CALIBRATION_PLATE)}
+
+    @property
+    def flux_known(self) -> Bool[np.ndarray, " e"]:
+        """True in exposures of a KIND of known flux."""
+        return np.isin(self.kind, [name for name, kind in KINDS.items() if kind.flux_known])
+
+    def direct(self, *kinds: str) -> Bool[np.ndarray, " e"]:
+        """True in exposures of some KINDs that are not taken through the polariser."""
+        return np.isin(self.kind, kinds) & ~self.clp_in
 
     def position(self, prefix: str) -> Position:
-        """The moving element of a column prefix: CLP, CHWP, or one of `moving`.
+        """The moving element of a column prefix.
 
         Raises ValueError with the nearest names for one that the set does not have.
         """
-        if prefix == POLARISER:
-            return Position(self.clp_in, self.clp_angle)
-        if prefix == CALIBRATION_PLATE:
-            return Position(self.chwp_in, self.chwp_angle)
-        if prefix in self.moving:
-            return self.moving[prefix]
+        if prefix in self.positions:
+            return self.positions[prefix]
         advice = f"give {prefix}_IN and {prefix}_ANGLE, in an observing plan moving = {{ {prefix} = [0, 22.5, 45] }}"
-        like = f"; {nearest(prefix, self.moving)}" if self.moving else ""
+        like = f"; {nearest(prefix, self.further)}" if self.further else ""
         raise ValueError(f"the exposures have no moving element {prefix!r}: {advice}{like}")
 
+    def placed(self, **positions: Position) -> Exposures:
+        """The same with moving elements, by column prefix, at other positions."""
+        return dataclasses.replace(self, positions={**self.positions, **positions})
+
     def columns(self) -> dict[str, np.ndarray]:
-        """All columns by their names in EXPOSURES, further moving elements last."""
-        columns = self._plain()
-        for prefix, entry in self.moving.items():
+        """All columns by their names in EXPOSURES, those of moving elements last."""
+        columns = {name.upper(): values for name, values in self._plain().items()}
+        for prefix, entry in self.positions.items():
             columns |= {f"{prefix}_IN": entry.inside, f"{prefix}_ANGLE": entry.angle}
         return columns
 
     @classmethod
     def from_columns(cls, columns: Mapping[str, np.ndarray]) -> Exposures:
         """Exposures from all columns by their names in EXPOSURES: the inverse of `columns`."""
-        plain = {field.name.upper() for field in dataclasses.fields(cls)} - {"MOVING"}
-        prefixes = [
-            name.removesuffix("_IN") for name in columns if name not in plain and name.endswith("_IN")
-        ]
+        plain = {field.name.upper() for field in dataclasses.fields(cls)} - {"POSITIONS"}
+        prefixes = [name.removesuffix("_IN") for name in columns if name.endswith("_IN")]
         return cls(
             **{name.lower(): columns[name] for name in plain},
-            moving={p: Position(columns[f"{p}_IN"], columns[f"{p}_ANGLE"]) for p in prefixes},
+            positions={p: Position(columns[f"{p}_IN"], columns[f"{p}_ANGLE"]) for p in prefixes},
         )
 
     def _plain(self) -> dict[str, np.ndarray]:
-        names = [field.name for field in dataclasses.fields(self) if field.name != "moving"]
-        return {name.upper(): getattr(self, name) for name in names}
+        names = [field.name for field in dataclasses.fields(self) if field.name != "positions"]
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ from walop_jax.io.errors import fail, nearest, rows_text
 Kind = Literal["int", "float", "bool", "str"]
 
 CALVERS = 2
-"""Newest version of the calibration set format; a set is written in the oldest version that can hold it."""
+"""Version of the calibration set format that is written. Sets of version 1 are sets of version 2 as well."""
 
 
 class Rule(NamedTuple):
@@ -103,7 +103,7 @@ EXPOSURES: Mapping[str, Column] = {
     "MJD": _number("d", _IS_JULIAN),
     "EXPTIME": _number("s", _TIME),
     "FILTER": Column("str", missing="SDSS-r"),
-    "CLP_IN": Column("bool"),
+    "CLP_IN": Column("bool", missing=False),
     "CLP_ANGLE": _ANGLE,
     "CHWP_IN": Column("bool", missing=False),
     "CHWP_ANGLE": _ANGLE,
@@ -116,7 +116,9 @@ EXPOSURES: Mapping[str, Column] = {
 }
 _COORDINATE = Column("float", "deg", rules=(finite("remove these points"),))
 POINTS: Mapping[str, Column] = {"POINT": _IDENTIFIER, "X": _COORDINATE, "Y": _COORDINATE}
-_COUNTS = Column("float", "electron", width=4, shape_advice="one row holds the four cameras O1, E1, O2, E2")
+_COUNTS = Column(
+    "float", "electron", width=None, shape_advice="one row holds all cameras, the same number in every row"
+)
 INTENSITIES: Mapping[str, Column] = {
     "EXPOSURE": Column("int"),
     "POINT": Column("int"),
@@ -150,7 +152,7 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
     "SOURCES": SOURCES,
     "FILTERS": FILTERS,
 }
-"""The tables of a calibration set of version 1, in the order in which they are written."""
+"""The tables of a calibration set, in the order in which they are written; see `table_rules`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,19 +184,13 @@ def check(table: Mapping[str, np.ndarray], columns: Mapping[str, Column], place:
             place.refuse(rule.broken(table[name]), rule.what, name, rule.advice)
 
 
-def table_rules(name: str, version: int, columns: Collection[str], place: Place) -> Mapping[str, Column]:
-    """The columns of a table of a calibration set of a version, where a file has `columns` (in capitals).
+def table_rules(name: str, columns: Collection[str], place: Place) -> Mapping[str, Column]:
+    """The columns of a table of a calibration set, where a file has `columns` (in capitals).
 
-    From version 2 on EXPOSURES has a pair `<P>_IN`, `<P>_ANGLE` for every further moving element, need not have
-    those of CLP and CHWP, and INTENSITIES has any number of cameras. Raises `DataError` for half a pair and for a
+    EXPOSURES has a pair `<P>_IN`, `<P>_ANGLE` for every moving element. Raises `DataError` for half a pair and for a
     prefix that is none.
     """
-    rules = TABLES[name]
-    if version > 1 and name == "INTENSITIES":
-        advice = "one row holds all cameras, the same number in every row"
-        counts = dataclasses.replace(_COUNTS, width=None, shape_advice=advice)
-        return {**rules, "N": counts, "N_ERR": counts}
-    return {**rules, **_moving_columns(columns, place)} if version > 1 and name == "EXPOSURES" else rules
+    return TABLES[name] if name != "EXPOSURES" else {**EXPOSURES, **_moving_columns(columns, place)}
 
 
 def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]:
@@ -202,12 +198,12 @@ def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]
     rules: dict[str, Column] = {}
     for prefix in (POLARISER, CALIBRATION_PLATE):
         inside, angle = f"{prefix}_IN", f"{prefix}_ANGLE"
-        absent = inside not in columns and angle not in columns
-        rules[inside] = Column("bool", missing=False if absent else None, remarked=not absent)
-        rules[angle] = dataclasses.replace(_ANGLE, remarked=not absent)
+        there = inside in columns or angle in columns
+        rules[inside] = Column("bool", missing=None if there else False, remarked=there)
+        rules[angle] = dataclasses.replace(_ANGLE, remarked=there)
     for name in columns:
-        prefix, mark, last = name.rpartition("_")
-        if not mark or last not in ("IN", "ANGLE") or name in rules:
+        prefix, _, last = name.rpartition("_")
+        if last not in ("IN", "ANGLE") or name == last or name in rules:
             continue
         if not PREFIX.fullmatch(prefix):
             raise place.fail(
@@ -219,11 +215,8 @@ def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]
         if angle not in columns:
             pairs = [entry for entry in columns if entry.endswith("_ANGLE")]
             advice = f"add it, or rename {inside} if there is no such element"
-            raise place.fail(
-                f"the column is missing, {inside} is there",
-                angle,
-                f"{advice} ({nearest(angle, pairs)})" if pairs else advice,
-            )
+            like = f" ({nearest(angle, pairs)})" if pairs else ""
+            raise place.fail(f"the column is missing, {inside} is there", angle, advice + like)
         rules[inside] = Column("bool", missing=True, remarked=False)
         rules[angle] = dataclasses.replace(_ANGLE, missing=None)
     return rules

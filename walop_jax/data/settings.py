@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from walop_jax.data.records import CALIBRATION_PLATE, Exposures, FilterCurve
+from walop_jax.data.records import Exposures, FilterCurve
 from walop_jax.io.errors import fail, nearest
 
 DEFAULT_FILTER = "SDSS-r"
@@ -137,11 +137,9 @@ class Settings:
         """Angle of a moving element (deg; NaN: out)."""
         return self.positions.get(prefix, np.full(len(self), np.nan))
 
-    def further(self) -> dict[str, float]:
-        """Angles (deg) of the elements in the beam of a single row, calibration plate apart."""
-        (row,) = range(len(self))
-        angles = {prefix: float(angle[row]) for prefix, angle in self.positions.items()}
-        return {p: angle for p, angle in angles.items() if p != CALIBRATION_PLATE and np.isfinite(angle)}
+    def inside(self) -> dict[str, float]:
+        """Angles (deg) of the elements in the beam, of a single row."""
+        return {prefix: float(angle.item()) for prefix, angle in self.positions.items() if np.isfinite(angle)}
 
     def check_moving(self, moving: Iterable[str]) -> None:
         """Raise ValueError, with the nearest names, for an element in the beam that is none of `moving`."""
@@ -182,5 +180,5 @@ class Settings:
         """Key that tells the optics of a single row from those of others; ValueError for several rows."""
         if len(self) != 1:
             raise ValueError(f"one setting is asked for, {len(self)} are given")
-        inside = sorted((p, float(a[0])) for p, a in self.positions.items() if np.isfinite(a[0]))
-        return (str(self.filter[0]), tuple(inside), float(self.temperature[0]), float(self.hour_angle[0]))
+        inside = tuple(sorted(self.inside().items()))
+        return (str(self.filter[0]), inside, float(self.temperature[0]), float(self.hour_angle[0]))

@@ -4,19 +4,32 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.records import Block, DataFlag, Exposures, Intensities, Points, Sources
+from walop_jax.data.records import (
+    KINDS,
+    Block,
+    Compression,
+    DataFlag,
+    Exposures,
+    Intensities,
+    Points,
+    Sources,
+)
 from walop_jax.data.schema import Place
 from walop_jax.io.errors import rows_text
+from walop_jax.io.text import some
 
-ONE_CAMERA = ("flux", "steady")  # KINDs of which a single camera says something
+ONE_CAMERA = [name for name, kind in KINDS.items() if kind.flux_known or kind.flux_shared]
+"""KINDs of exposures for which one camera is sufficient."""
 NEGATIVE = 5.0
 """Counts below minus this many sigma are no bias-subtracted counts but a fault."""
 
+_LOOKED_AT, _RUN = 4096, 64  # field points whose counts are compared; of large sets, in evenly spaced runs
 _SPOILT = 0.2
 """Above this share of unusable rows the set is refused, not masked."""
 
@@ -236,12 +249,13 @@ def _source_rows(
         order = np.argsort(sources.source, kind="stable")
         at = order[np.minimum(np.searchsorted(sources.source[order], ids), len(order) - 1)]
         rows = np.where((sources.source[at] == ids) & (ids >= 0), at, -1)
-    standard = ((exposures.kind == "standard") & ~exposures.clp_in)[exposure] & used
+    standard = exposures.direct("standard")[exposure] & used
     if np.any(bad := standard & (rows < 0)):
         known = ", ".join(str(entry) for entry in sources.source[:10]) or "none"
         what = f"a standard star needs a row of SOURCES; {ids[np.argmax(bad)]} is not one,"
         place.refuse(bad, what, "SOURCE", f"SOURCES has {known}")
-    lamp = (exposures.kind == "lamp")[exposure] & used & (ids >= 0)
+    indoors = [name for name, kind in KINDS.items() if not kind.from_sky and not kind.flux_known]
+    lamp = np.isin(exposures.kind, indoors)[exposure] & used & (ids >= 0)
     place.refuse(lamp, "a lamp is no source of the sky,", "SOURCE", "write −1, or another KIND")
     lost = np.flatnonzero(used & (ids >= 0) & (rows < 0))
     remark = f"{place.file} [{place.extension}] SOURCE: not in SOURCES, taken as unknown in {rows_text(lost)}"
@@ -299,3 +313,58 @@ def _same_data(intensities: TableIntensities, first: int, second: int) -> bool:
         np.array_equal(getattr(intensities, name)[rows[0]], getattr(intensities, name)[rows[1]])
         for name in ("point", "counts")
     )
+
+
+def repeated_counts(
+    intensities: Intensities,
+    exposures: Exposures,
+    points: Points,
+    file: object,
+    compression: Compression | None = None,
+) -> Iterator[str]:
+    """Remark on exposures, or field points, most of whose rows have the counts of another row at the same place.
+
+    Counts agree where they do in single precision, whatever times and identifiers they have. Noise does not repeat in
+    all cameras; expected counts without noise may. Exposures of known flux, which may be exact, are left out, and
+    those whose pixels were summed. Of large sets, and of frames, a sample of the points is looked at.
+    """
+    counted = ~exposures.flux_known
+    if compression is not None:
+        counted &= ~compression.covers(exposures)
+    total = len(points) if counted.any() else 0
+    starts = (
+        range(0, total, _RUN) if total <= _LOOKED_AT else np.linspace(0, total - _RUN, _LOOKED_AT // _RUN)
+    )
+    if not len(starts):
+        return
+    places = np.concatenate([np.arange(start, min(start + _RUN, total)) for start in map(int, starts)])
+    block = Block.joined([intensities.block(int(start), int(start) + _RUN) for start in starts])
+    at, exposure = np.nonzero(block.used & counted)
+    same = equal_rows([block.x[at], block.y[at], *block.counts[at, exposure].T])
+    order = np.lexsort((at, exposure, same))  # copies behind what they repeat
+    again = np.zeros(len(at), bool)
+    again[order[1:]] = same[order[1:]] == same[order[:-1]]
+    for name, ids, row in (("exposures", exposures.exposure, exposure), ("points", points.point[places], at)):
+        copies = np.flatnonzero(2 * np.bincount(row, again) > np.bincount(row))
+        if len(copies):
+            yield (
+                f"{file} [INTENSITIES] N: {name} {some(ids[copies].astype(str).tolist(), 5)} have the counts of others "
+                "at the same places; remove them if they are copies, which make errors too small"
+            )
+            return
+
+
+def equal_rows(columns: Sequence[np.ndarray]) -> Int[np.ndarray, " n"]:
+    """Number of the group of equal rows of columns, floats in single precision, that every row is in."""
+    mixed = np.full(len(columns[0]), 0x9E3779B97F4A7C15, np.uint64)
+    for column in columns:  # a hash of 64 bits: of a million rows two collide in one of 10⁷ tables
+        if column.dtype.kind == "f":
+            single = np.where(
+                np.isnan(column), np.float32(np.nan), column.astype(np.float32) + np.float32(0.0)
+            )
+            words = single.astype(np.float32).view(np.uint32).astype(np.uint64)
+        else:
+            words = column.astype(np.uint64)
+        mixed = (mixed ^ words) * np.uint64(0xBF58476D1CE4E5B9)
+        mixed ^= mixed >> np.uint64(29)
+    return np.unique(mixed, return_inverse=True)[1].reshape(-1)

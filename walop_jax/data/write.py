@@ -16,7 +16,7 @@ import numpy as np
 from astropy.io import fits
 
 from walop_jax.data import schema
-from walop_jax.data.checks import instrument_name, oldest_version
+from walop_jax.data.checks import instrument_name
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import CalibrationSet, Compression, FilterCurve, InputFile
 from walop_jax.data.schema import Place
@@ -119,8 +119,7 @@ def write_calibration_set(
     """Write a calibration set as tables, with checksums; the file appears whole or not at all.
 
     What was read comes back bit for bit, rows that are not used included; other intensities (frames, say)
-    are written as their used rows. The bytes depend on the set alone, not on the day. CALVERS is the oldest
-    version of the format that can hold the set.
+    are written as their used rows. The bytes depend on the set alone, not on the day.
 
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only,
     and if a name cannot be written in FITS (ASCII only).
@@ -128,10 +127,9 @@ def write_calibration_set(
     >>> walop.write_calibration_set("copy.fits", calset)
     """
     with atomic_path(path, overwrite=overwrite) as temporary:
-        version = oldest_version(calset.instrument, calset.exposures, calset.cameras)
-        hdus: list[Any] = [_primary(calset, version, path)]
+        hdus: list[Any] = [_primary(calset, path)]
         for name, columns in set_tables(calset).items():
-            hdus.append(set_table_hdu(name, columns, version, path))
+            hdus.append(set_table_hdu(name, columns, path))
         if calset.compression is not None:
             hdus.append(compression_hdu(calset.compression, path))
         sign_and_write(hdus, temporary)
@@ -169,13 +167,13 @@ def sign_and_write(hdus: list[Any], path: Path) -> None:
     fits.HDUList(hdus).writeto(path, overwrite=True, output_verify="exception")
 
 
-def _primary(calset: CalibrationSet, version: int, path: object) -> fits.PrimaryHDU:
+def _primary(calset: CalibrationSet, path: object) -> fits.PrimaryHDU:
     primary, site, place = fits.PrimaryHDU(), calset.site, Place(path, "PRIMARY")
-    instrument_name(calset.instrument, version, place)
+    instrument_name(calset.instrument, place)
     cards = {
         "TELESCOP": (site.telescope, ""),
         "INSTRUME": (calset.instrument, ""),
-        "CALVERS": (version, "version of the calibration set format"),
+        "CALVERS": (schema.CALVERS, "version of the calibration set format"),
         "SITELAT": (site.latitude, "[deg] latitude"),
         "SITELONG": (site.longitude, "[deg] longitude, east positive"),
         "SITEELEV": (site.elevation, "[m] elevation"),
@@ -190,11 +188,9 @@ def _primary(calset: CalibrationSet, version: int, path: object) -> fits.Primary
     return primary
 
 
-def set_table_hdu(
-    name: str, columns: Mapping[str, np.ndarray], version: int, path: object
-) -> fits.BinTableHDU:
-    """A table of a calibration set in a version of its format."""
-    rules = schema.table_rules(name, version, list(columns), Place(path, name))
+def set_table_hdu(name: str, columns: Mapping[str, np.ndarray], path: object) -> fits.BinTableHDU:
+    """A table of a calibration set."""
+    rules = schema.table_rules(name, list(columns), Place(path, name))
     return table_hdu(name, columns, path, rules)
 
 

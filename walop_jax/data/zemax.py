@@ -411,7 +411,6 @@ def _calibration_set(
     return assembled(
         tables,
         Path(folder),
-        version=1,
         instrument=instrument,
         site=Site(*described(instrument).place[:4]),
         origin="optical design program, polarization transmission",

@@ -34,7 +34,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, CalibrationSet, Exposures, Points
+from walop_jax.data.records import POLARISER, CalibrationSet, Exposures, Points, Position
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.findings import Choice
@@ -197,9 +197,7 @@ def _readings(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
         yield Alternative(
             "the calibration polariser was not in the beam",
             "set CLP_IN to F and CLP_ANGLE to NaN, or observe again",
-            with_exposures(
-                lambda e: dataclasses.replace(e, clp_in=e.clp_in & False, clp_angle=e.clp_angle * np.nan)
-            ),
+            with_exposures(lambda e: e.placed(**{POLARISER: Position.out(len(e))})),
         )
 
 
@@ -351,9 +349,9 @@ def _orders(model: Model) -> Iterator[Alternative]:
 
 def _angles(calset: CalibrationSet) -> Iterator[Alternative]:
     e = calset.exposures
-    prefixes = [p for p in (POLARISER, CALIBRATION_PLATE, *e.moving) if e.position(p).inside.any()]
-    for prefix in prefixes:
-        angle = e.position(prefix).angle
+    for prefix, position in e.positions.items():
+        if not position.inside.any():
+            continue
         column = f"{prefix}_ANGLE"
         for sign, offset in itertools.product((1.0, -1.0), (0.0, 45.0, 90.0, 135.0)):
             if (sign, offset) == (1.0, 0.0):
@@ -365,7 +363,7 @@ def _angles(calset: CalibrationSet) -> Iterator[Alternative]:
                 f"give {'−' if sign < 0 else ''}{column}{f' + {offset:g}°' if offset else ''}",
                 _with_angle(prefix, lambda a, sign=sign, offset=offset: sign * a + offset),
             )
-        if np.nanmax(np.abs(angle)) <= 2.0 * np.pi:
+        if np.nanmax(np.abs(position.angle)) <= 2.0 * np.pi:
             yield Alternative(
                 f"{column} is in radians", "give degrees, or the unit of the column", _with_angle(prefix, np.rad2deg)
             )  # fmt: skip
@@ -414,12 +412,7 @@ def with_places(turn: Callable[..., tuple[np.ndarray, np.ndarray]]) -> Change:
 
 def _with_angle(prefix: str, turned: Callable[[np.ndarray], np.ndarray]) -> Change:
     def change(e: Exposures) -> Exposures:
-        if prefix == POLARISER:
-            return dataclasses.replace(e, clp_angle=turned(e.clp_angle))
-        if prefix == CALIBRATION_PLATE:
-            return dataclasses.replace(e, chwp_angle=turned(e.chwp_angle))
-        there = dataclasses.replace(e.moving[prefix], angle=turned(e.moving[prefix].angle))
-        return dataclasses.replace(e, moving={**e.moving, prefix: there})
+        return e.placed(**{prefix: Position.at(turned(e.position(prefix).angle))})
 
     return with_exposures(change)
 

@@ -552,7 +552,7 @@ def _of_field_and_band(instrument: Instrument, asked: _Asked) -> Iterator[tuple[
 
 def _of_sources(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
     own = tuple(Sentence(kind, "of", SKY) for kind in OF_SOURCES)
-    moon = np.flatnonzero((asked.exposures.kind == "moon") & ~asked.exposures.clp_in)
+    moon = np.flatnonzero(asked.exposures.direct("moon"))
     if moon.size:
         yield own[2:]
     each = [_times(own[:2], f"exposure {number}") for number in moon]

@@ -42,7 +42,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.polynomial.legendre import legvander
 
-from walop_jax.data.records import POLARISER, CalibrationSet, Exposures
+from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, CalibrationSet, Exposures
 from walop_jax.diagnosis.policy import RINGS
 from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram
 from walop_jax.fit.refit import FitResult
@@ -194,7 +194,7 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
     names = measured.likelihood.model.template.cameras.names
     every = range(len(names))
     # Calibration plates that are put in at one or two angles are compared as groups, below.
-    further = [(f" {prefix}", prefix) for prefix in measured.likelihood.plan.moving if prefix in e.moving]
+    further = [(f" {prefix}", prefix) for prefix in measured.likelihood.plan.moving if prefix in e.further]
     turning = [("θ", POLARISER), *further]
 
     scale = measured.likelihood.model.template.units.field
@@ -392,8 +392,9 @@ def exposure_folds(design: Design) -> Int[np.ndarray, " d"]:
     e = design.fit.calset.exposures
     fold = np.zeros(len(e), int)
     groups: dict[tuple[str, ...], int] = {}
+    plate = positions_of(e, CALIBRATION_PLATE)
     for i in range(len(e)):
-        key = (str(e.kind[i]), str(e.filter[i]), str(e.chwp_in[i]), str(e.chwp_angle[i]))
+        key = (str(e.kind[i]), str(e.filter[i]), str(plate[i]))
         fold[i] = groups.get(key, 0) % HOLDOUT_FOLDS
         groups[key] = groups.get(key, 0) + 1
     return fold[design.exposure]

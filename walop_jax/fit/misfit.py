@@ -14,6 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, Position
 from walop_jax.fit.outliers import BEYOND, MOST, outlying
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import limits
@@ -27,19 +28,24 @@ class Misfit:
     """Mean squared normalised residual per intensity in each group, and rms disagreement of matrix elements.
 
     With the flux eliminated, noise alone gives 1 − 1/K per intensity of K cameras (1 where the flux is known).
-    `elements` are the further moving elements, by the prefix of their columns and their angle; `outliers` is the share
-    of (exposure, point) pairs that lie off by themselves (`outliers.outlying`).
+    `positions` are the angles of the moving elements by the prefix of their columns; `outliers` is the share of
+    (exposure, point) pairs that lie off by themselves (`outliers.outlying`).
     """
 
     camera: Mapping[str, float]
     kind: Mapping[str, float]
     filter: Mapping[str, float]
-    calibration_plate: Mapping[str, float]
+    positions: Mapping[str, Mapping[str, float]]
     matrix_element: Mapping[str, float]
     worst_exposure: tuple[int, float]
     worst_point: tuple[int, float, float, float]
     outliers: float = 0.0
-    elements: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
+
+    def document(self) -> dict[str, object]:
+        """The entry of `summary.json` (docs: files)."""
+        entries = dataclasses.asdict(self)
+        elements = entries.pop("positions")
+        return entries | {"calibration_plate": elements.pop(CALIBRATION_PLATE), "elements": elements}
 
     def sentences(self) -> tuple[str, ...]:
         """The disagreement in words, the largest of each kind first."""
@@ -49,12 +55,10 @@ class Misfit:
             return ", ".join(f"{name} {format(value, form)}" for name, value in order)
 
         point, x, y, value = self.worst_point
-        settings = {"calibration plate": self.calibration_plate} | {
-            f"angle of {prefix}": groups for prefix, groups in self.elements.items()
-        }
         moved = [
-            f"by {name}: {ranked(groups, '.3g')}"
-            for name, groups in settings.items()
+            f"by {'calibration plate' if prefix == CALIBRATION_PLATE else f'angle of {prefix}'}: "
+            f"{ranked(groups, '.3g')}"
+            for prefix, groups in self.positions.items()
             if set(groups) != {"out"}
         ]
         clip = (
@@ -99,8 +103,8 @@ def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit
             for label in np.unique(labels)
         }
 
-    def positions(inside: np.ndarray, angle: np.ndarray) -> dict[str, float]:
-        labels = [f"{a:g} deg" if i else "out" for i, a in zip(inside, np.round(angle, 3), strict=True)]
+    def angles(at: Position) -> dict[str, float]:
+        labels = [f"{a:g} deg" if i else "out" for i, a in zip(at.inside, np.round(at.angle, 3), strict=True)]
         return grouped(np.array(labels))
 
     per_point = square.sum(axis=(1, 2)) / np.maximum(k * used.sum(axis=1), 1)
@@ -111,7 +115,7 @@ def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit
         camera=dict(zip(names, (square.sum(axis=(0, 1)) / used.sum()).tolist(), strict=True)),
         kind=grouped(e.kind),
         filter=grouped(e.filter),
-        calibration_plate=positions(e.chwp_in, e.chwp_angle),
+        positions={prefix: angles(at) for prefix, at in e.positions.items() if prefix != POLARISER},
         matrix_element=_matrix_elements(likelihood, residual),
         worst_exposure=(int(e.exposure[exposure.argmax()]), float(exposure.max())),
         worst_point=(
@@ -121,7 +125,6 @@ def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit
             float(per_point[worst]),
         ),
         outliers=float(outlying(likelihood, residual).sum() / max(used.sum(), 1)),
-        elements={prefix: positions(one.inside, one.angle) for prefix, one in e.moving.items()},
     )
 
 
@@ -132,8 +135,9 @@ def _matrix_elements(likelihood: Likelihood, residual: Float[np.ndarray, "p e k"
     pairs = likelihood.model.template.cameras.pairs
     elements = matrix_elements(len(pairs))
     squares: dict[str, list[float]] = {name: [] for name in elements}
+    plate = e.position(CALIBRATION_PLATE)
     setting = np.array(
-        [f"{f}/{a if i else 'out'}" for f, i, a in zip(e.filter, e.chwp_in, e.chwp_angle, strict=True)]
+        [f"{f}/{a if i else 'out'}" for f, i, a in zip(e.filter, plate.inside, plate.angle, strict=True)]
     )
     for label in np.unique(setting[e.clp_in]):
         use = np.flatnonzero(e.clp_in & (setting == label) & used.any(axis=0))

@@ -17,7 +17,7 @@ from typing import Any
 import tomlkit
 
 from walop_jax.data.merge import parts_of
-from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet, Sources
+from walop_jax.data.records import POLARISER, CalibrationSet, Sources
 from walop_jax.data.settings import Settings
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
@@ -222,7 +222,7 @@ def base_model(
         raise ValueError(
             f"{instrument.name} has {len(instrument.cameras)} cameras, the data have {calset.cameras}"
         )
-    present = Settings.of(calset.exposures, (CALIBRATION_PLATE, *calset.exposures.moving))
+    present = Settings.of(calset.exposures, [p for p in calset.exposures.positions if p != POLARISER])
     present.check_moving(instrument.patched().moving())
     instrument = adapted(
         instrument,
@@ -241,7 +241,7 @@ def base_model(
         model = model.change(p.name, scale=p.scale * level / LEVEL, loose=level)
     for name in gauges(model, has_known_flux(calset)):
         model = model.change(name, free=False)
-    if not ((calset.exposures.kind == "moon") & ~calset.exposures.clp_in).any():
+    if not calset.exposures.direct("moon").any():
         model = model.change("sky.depolarisation", free=False)
     return model
 
@@ -252,7 +252,7 @@ def _level(calset: CalibrationSet) -> float:
     A camera gets half of the unpolarised light: N = T/2.
     """
     for part, points, exposures in parts_of(calset):
-        known = calset.exposures.kind[exposures] == "flux"
+        known = calset.exposures.flux_known[exposures]
         for start in range(0, len(points) if known.any() else 0, limits.LEVEL_POINTS):
             block = part.block(start, min(start + limits.LEVEL_POINTS, len(points)))
             counts = block.counts[block.used & known]
@@ -298,7 +298,7 @@ def standard_names(sources: Sources) -> tuple[str, ...]:
 
 def has_known_flux(calset: CalibrationSet) -> bool:
     """True if any exposure is of KIND `flux`, so that the overall scale of the throughput is measured."""
-    return bool((calset.exposures.kind == "flux").any())
+    return bool(calset.exposures.flux_known.any())
 
 
 def model_for(

@@ -118,8 +118,8 @@ def _gradients(likelihood: Likelihood, values: Vector) -> Iterator[tuple[str, Fl
 def states(calset: CalibrationSet) -> Int[np.ndarray, " e"]:
     """Number of the state of every exposure: same time, kind and positions of everything that moves, any filter."""
     e = calset.exposures
-    columns = [e.kind, e.mjd, np.where(e.clp_in, e.clp_angle, np.nan), e.temp, e.rotator]
-    columns += [np.where(at.inside, at.angle, np.nan) for at in map(e.position, e.moving)]
+    columns = [e.kind, e.mjd, e.temp, e.rotator]
+    columns += [np.where(at.inside, at.angle, np.nan) for at in e.positions.values()]
     return _labels(np.array(["/".join(map(str, row)) for row in zip(*columns, strict=True)]))
 
 

@@ -10,11 +10,13 @@ import platform
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+from types import ModuleType
 from typing import TypeVar
 
 from walop_jax.io.errors import fail
 
 T = TypeVar("T")
+_OF_USERS = "walop_jax_own_"  # modules made of files of users
 
 
 def classes_of(path: str | os.PathLike[str], base: type[T], advice: str) -> dict[str, type[T]]:
@@ -22,10 +24,20 @@ def classes_of(path: str | os.PathLike[str], base: type[T], advice: str) -> dict
 
     The file is run. Raises `DataError`, with `advice` where there is no such file, and if it fails when it is run.
     """
+    module = run_file(path, advice)
+    return {
+        name: value
+        for name, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, base) and value.__module__ == module.__name__
+    }
+
+
+def run_file(path: str | os.PathLike[str], advice: str) -> ModuleType:
+    """A Python file of a user, run as a module. Raises `DataError` as `classes_of` does."""
     path = Path(path)
     if not path.is_file():
         raise fail("there is no such file", file=path, advice=advice)
-    module_name = f"walop_jax_own_{path.stem}"
+    module_name = f"{_OF_USERS}{path.stem}"
     specification = importlib.util.spec_from_file_location(module_name, path)
     if specification is None or specification.loader is None:
         raise fail("is no Python file", file=path, advice=advice)
@@ -35,11 +47,17 @@ def classes_of(path: str | os.PathLike[str], base: type[T], advice: str) -> dict
         specification.loader.exec_module(module)
     except Exception as error:
         raise fail(f"cannot be run: {type(error).__name__}: {error}", file=path) from error
-    return {
-        name: value
-        for name, value in vars(module).items()
-        if isinstance(value, type) and issubclass(value, base) and value.__module__ == module_name
-    }
+    return module
+
+
+def files_of_users() -> tuple[str, ...]:
+    """Absolute paths of the Python files of users that were run: another process must run them before it unpickles."""
+    modules = [
+        getattr(module, "__file__", None)
+        for name, module in sys.modules.items()
+        if name.startswith(_OF_USERS)
+    ]
+    return tuple(sorted(str(Path(file).resolve()) for file in modules if file is not None))
 
 
 def blank(kind: type[T]) -> T:

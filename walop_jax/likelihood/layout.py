@@ -291,7 +291,7 @@ class PointReader:
     def _moon(self) -> tuple[np.ndarray, Vector, Vector]:
         """Rows of the exposures of the Moon sky, and where the Moon stands then."""
         e: Exposures = self.calset.exposures
-        rows = np.flatnonzero((e.kind == "moon") & ~e.clp_in)
+        rows = np.flatnonzero(e.direct("moon"))
         if not rows.size:
             return rows, np.zeros(0), np.zeros(0)
         return rows, *_moon_at(tuple(e.mjd[rows].tolist()), self.calset.site)

@@ -266,7 +266,7 @@ def stokes(instrument: Instrument, sight: Sight) -> Float[Array, "e 4"]:
 
 def indoors(instrument: Instrument, sight: Sight) -> Bool[Array, " e"]:
     """True for light that enters behind the telescope."""
-    sources = (source.shines(sight) for source in instrument.sources if not source.from_sky)
+    sources = (source.shines(sight) for source in instrument.sources if not source.facts.from_sky)
     return functools.reduce(jnp.logical_or, sources, jnp.zeros(sight.source.shape, bool))
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from walop_jax.data.records import CALIBRATION_PLATE, Exposures
+from walop_jax.data.records import POLARISER, Exposures
 from walop_jax.model.compiled import array
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import Conditions
@@ -72,8 +72,8 @@ def exposure_arrays(
         exptime=array(exposures.exptime),
         moving={  # NaN where they are out
             prefix: array(np.deg2rad(np.where(at.inside, at.angle, np.nan)))
-            for prefix in (CALIBRATION_PLATE, *exposures.moving)
-            if (at := exposures.position(prefix)).inside.any()
+            for prefix, at in exposures.positions.items()
+            if prefix != POLARISER and at.inside.any()
         },
         kinds=known,
     )

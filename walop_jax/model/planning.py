@@ -39,7 +39,7 @@ def plan_for(
     own = Settings.of(exposures, instrument.patched().moving())
     each, stars = np.arange(len(exposures)), 0 if sources is None else len(sources)
     # A row for every exposure, for light of no star; then those of the stars, which may have a colour of their own.
-    of_stars = np.flatnonzero((exposures.kind == "standard") & ~exposures.clp_in) if stars else each[:0]
+    of_stars = np.flatnonzero(exposures.direct("standard")) if stars else each[:0]
     row = np.concatenate([each, np.repeat(of_stars, stars)])
     settings = own[row]
     if sources is not None and of_stars.size:
@@ -52,9 +52,11 @@ def plan_for(
         table[of_stars, 1:] = band[len(each) :].reshape(of_stars.size, stars)
         return table
 
-    known = [source.kind for source in instrument.sources if source.flux_known]
+    known = [source.kind for source in instrument.sources if source.facts.flux_known]
     arrays = exposure_arrays(exposures, instrument.kinds, known)
-    steady = np.isin(exposures.kind, [source.kind for source in instrument.sources if source.flux_shared])
+    steady = np.isin(
+        exposures.kind, [source.kind for source in instrument.sources if source.facts.flux_shared]
+    )
     if instrument.cameras.split or steady.any():
         arrays = _sharing(arrays, own, steady, split=instrument.cameras.split)
     return _plan(instrument, settings, hours_of(exposures)[row], filters, arrays, band_of)

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from walop_jax.data.records import KINDS, ExposureKind
 from walop_jax.model.parameters import Component, number, param
 from walop_jax.model.ray import NotPlannedError
 
@@ -78,16 +79,13 @@ class Sight(NamedTuple):
 class Source(Component):
     """Light of one KIND of exposures: its polarisation ahead of the instrument, per unit of flux.
 
-    `kind` is what EXPOSURES says, `flux_known` whether its flux is one (KIND `flux`) or unknown, `flux_shared` whether
-    an unknown one is the same in all exposures of a filter (KIND `steady`), `from_sky` whether it comes through the
-    telescope; `reference` says where what is assumed of it comes from.
+    `kind` is what EXPOSURES says, `facts` what is true of all its exposures; `reference` is the source of what is
+    assumed about it.
     """
 
     name: ClassVar[str] = ""
     kind: ClassVar[str] = ""
-    flux_known: ClassVar[bool] = False
-    flux_shared: ClassVar[bool] = False
-    from_sky: ClassVar[bool] = True
+    facts: ClassVar[ExposureKind] = ExposureKind()
     reference: ClassVar[str] = ""
 
     def shines(self, sight: Sight) -> Bool[Array, " e"]:
@@ -191,7 +189,7 @@ class Lamp(Source):
 
     name: ClassVar[str] = "lamp"
     kind: ClassVar[str] = "lamp"
-    from_sky: ClassVar[bool] = False
+    facts: ClassVar[ExposureKind] = KINDS[kind]
 
 
 class KnownFlux(Source):
@@ -199,8 +197,7 @@ class KnownFlux(Source):
 
     name: ClassVar[str] = "flux"
     kind: ClassVar[str] = "flux"
-    flux_known: ClassVar[bool] = True
-    from_sky: ClassVar[bool] = False
+    facts: ClassVar[ExposureKind] = KINDS[kind]
 
 
 class Steady(Source):
@@ -208,8 +205,7 @@ class Steady(Source):
 
     name: ClassVar[str] = "steady"
     kind: ClassVar[str] = "steady"
-    flux_shared: ClassVar[bool] = True
-    from_sky: ClassVar[bool] = False
+    facts: ClassVar[ExposureKind] = KINDS[kind]
 
 
 SOURCES: tuple[type[Source], ...] = (MoonSky, Standards, ThroughPolariser, Lamp, KnownFlux, Steady)

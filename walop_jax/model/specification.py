@@ -212,7 +212,7 @@ def make_model(
 
 def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
     """Facts about a data set for effects: its Moon exposures, its standards, how many exposures."""
-    moon = np.flatnonzero((exposures.kind == "moon") & ~exposures.clp_in)
+    moon = np.flatnonzero(exposures.direct("moon"))
     return Context(
         exposures=len(exposures),
         moon=tuple(moon.tolist()),

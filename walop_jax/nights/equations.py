@@ -88,6 +88,11 @@ class Night:
         """Names of the parameters, candidates last."""
         return tuple(p.name for p in self.parameters)
 
+    @property
+    def key(self) -> tuple[str, int]:
+        """Hash of the data, and the night."""
+        return self.sha256, self.number
+
 
 # ------------------------------------------------------------------------------------------------ nights of a set
 

@@ -10,8 +10,8 @@ import functools
 import hashlib
 import math
 import os
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
@@ -20,12 +20,9 @@ from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_calibration, write_calibration
-from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.schema import EXPOSURES, Column, Place
-from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.user_tables import InputTable, in_memory, numeric_column, read_input_table
-from walop_jax.fit.model_file import model_like
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import STATED, Doubt, Quality
 from walop_jax.io.errors import DataError, fail
@@ -34,22 +31,18 @@ from walop_jax.io.names import NIGHTS, PRODUCT, REFERENCE, SURVEY, TRACKS
 from walop_jax.io.text import check_input, parse_toml, read_json, read_text
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.laws import Law, laws_of, resolved
-from walop_jax.model.specification import Model, effect_context
+from walop_jax.model.specification import effect_context
 from walop_jax.nights.algebra import Solution, UndeterminedError
 from walop_jax.nights.breaks import Break, at_solution, part_of, solved
 from walop_jax.nights.breaks import find as breaks_of
 from walop_jax.nights.equations import (
-    Candidates,
     Night,
     Together,
-    candidates_of,
     data_hash,
-    model_hash,
-    night_equations,
     source_of,
     together,
-    with_candidates_of,
 )
+from walop_jax.nights.making import Data, Maker, Makers, Task
 from walop_jax.nights.night_file import nights_in, read_nights, write_nights
 from walop_jax.nights.survey import Survey
 from walop_jax.posterior.files import Run
@@ -61,10 +54,6 @@ LONG = 60.0  # days without a night that are worth a remark
 FAR = 0.02  # standard errors from the solution up to which a night need not be linearised again
 EXACT = 1e-3  # standard errors by which linearising all nights again may move the solution at most
 ROUNDS = 6
-SKETCH, COPIED = (
-    512,
-    0.02,
-)  # measurements by which sets are compared, and their share that no two have by chance
 MANY = 20  # sets from which on programs are better compiled for longer
 FILES = (NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY)
 """The files of a survey."""
@@ -72,107 +61,14 @@ PARTIAL = "partial"
 """Folder of the nights that are made, until all are."""
 
 
-class _Data(NamedTuple):
-    """Data that nights can be made of at any values: reader, hash, and model (None: that of `like`)."""
-
-    read: Callable[[], CalibrationSet]
-    sha256: str
-    model: Model | None = None
-
-
 class _Opened(NamedTuple):
     """Nights as given, or data that they can be made of, with what comes with them."""
 
     nights: list[Night]
-    data: _Data | None = None
+    data: Data | None = None
     fit: Calibration | FitResult | None = None
     breaks: tuple[Break, ...] = ()
     events: tuple[tuple[float, str], ...] = ()
-
-
-@dataclasses.dataclass
-class _Maker:
-    """Makes nights of data, and keeps them in a folder, if there is one: what is there already is not made again."""
-
-    like: Calibration | None
-    folder: Path | None
-    few: bool = True
-    candidates: dict[tuple[str, ...], Candidates] = dataclasses.field(default_factory=dict)
-    sets: dict[str, tuple[CalibrationSet, Model]] = dataclasses.field(default_factory=dict)
-    noise: dict[int, str] = dataclasses.field(default_factory=dict)
-
-    def nights(self, data: _Data) -> list[Night]:
-        """The nights of data, as they are kept or linearised near their own minimum, from the values of `like` on."""
-        if self.like is None:
-            raise fail(
-                f"{source_of(data.read())} is a set, and nothing says at which values to linearise it",
-                advice="give --like RUN, a fit of the same model (like= in Python)",
-            )
-        place = None
-        if self.folder is not None:
-            named = f"{data.sha256} {model_hash(data.model or self.like.model)}"
-            place = self.folder / f"night-{hashlib.sha256(named.encode()).hexdigest()[:16]}.fits"
-            if place.exists():
-                return read_nights(place)
-        calset, model = self._set_and_model(data)
-        values = dict(zip(self.like.model.names, self.like.values.tolist(), strict=True))
-        known = self._candidates(model, calset)
-        found = night_equations(calset, model, values, known, own=True, once=self.few)
-        if place is not None:
-            place.parent.mkdir(parents=True, exist_ok=True)
-            write_nights(place, found, overwrite=True)
-        return found
-
-    def again(
-        self, data: _Data, night: Night, values: Mapping[str, float], *, candidates: bool = False
-    ) -> Night:
-        """A night linearised at other values; its candidates as well, or they follow (`with_candidates_of`)."""
-        calset, model = self._set_and_model(data)
-        known = self._candidates(model, calset) if candidates else {}
-        if not candidates:  # a gauge stays where its column was made
-            cut = len(night.names) - night.candidates
-            values = {**values, **dict(zip(night.names[cut:], night.reference[cut:].tolist(), strict=True))}
-        (made,) = night_equations(calset, model, values, known, number=night.number, once=self.few)
-        return with_candidates_of(made, night)
-
-    def _set_and_model(self, data: _Data) -> tuple[CalibrationSet, Model]:
-        assert self.like is not None
-        if (kept := self.sets.get(data.sha256)) is not None:
-            return kept
-        calset = data.read()
-        made = calset, data.model or model_like(calset, self.like.model)
-        if isinstance(calset.intensities, TableIntensities):
-            self._refuse_copies(calset, calset.intensities)
-            self.sets[data.sha256] = made
-        return made
-
-    def _refuse_copies(self, calset: CalibrationSet, table: TableIntensities) -> None:
-        """Refuse a set that has measurements of an earlier one, whatever times they bear.
-
-        Held against each other are the smallest of the numbers that hashes of (X, Y, counts) are: the same ones of the
-        same measurements (MinHash, Broder 1997).
-        """
-        rows = table.used & (calset.exposures.kind != "flux")[table.exposure]
-        point = table.point[rows]
-        places = np.column_stack([calset.points.x[point], calset.points.y[point], table.counts[rows]])
-        hashes = np.zeros(len(places), np.uint64)
-        for bits in np.ascontiguousarray(places).view(np.uint64).T:
-            hashes = (hashes ^ bits) * np.uint64(0x9E3779B97F4A7C15)
-            hashes ^= hashes >> np.uint64(29)
-        smallest = np.unique(hashes)[:SKETCH].tolist()
-        here = source_of(calset)
-        seen = Counter(self.noise[one] for one in smallest if one in self.noise)
-        if seen and (number := seen.most_common(1)[0])[1] > COPIED * len(smallest):
-            share = f"{100 * number[1] / len(smallest):.0f} % of its measurements are in {number[0]} as well"
-            raise fail(share, file=here, advice="leave one out: repeated data would shrink the errors")
-        self.noise |= dict.fromkeys(smallest, here)
-
-    def _candidates(self, model: Model, calset: CalibrationSet) -> Candidates:
-        # They depend on cameras, standards and the effects of the model alone: listing them takes a while.
-        key = (*model.names, *model.effect_names)
-        if key not in self.candidates:
-            self.candidates[key] = candidates_of(model, calset.exposures, model.catalogue)
-        return self.candidates[key]
 
 
 def stack(
@@ -183,6 +79,7 @@ def stack(
     find: bool = True,
     events: Any = None,
     partial: Path | None = None,
+    executor: Executor | None = None,
     tell: Callable[[str], None] = lambda text: None,
     catalogue: Sequence[type[Effect]] = EFFECTS,
 ) -> Survey:
@@ -193,7 +90,8 @@ def stack(
     parameter without one is shared by all nights. `like` is a calibration of their model, by default the first that is
     given. Sets and fits are linearised again at the common solution until none is far from it; kept nights cannot be.
     With `find` breaks are looked for in three nights and more, and become laws. `events` is a table of what was done to
-    the instrument (MJD, WHAT); `partial` is a folder that nights are kept in while others are made.
+    the instrument (MJD, WHAT); `partial` is a folder that nights are kept in while others are made,
+    `executor` makes them in other processes, to the same result (`nights.making`).
 
     Raises `DataError` for nights that do not belong together, that do not determine a parameter under its law, and for
     nights without a filter in common; ValueError for laws that are wrong, or of what does not exist.
@@ -201,15 +99,17 @@ def stack(
     opened = [_opened(one, catalogue) for one in nights]
     fits = [one for one in (like, *(some.fit for some in opened)) if one is not None]
     held = [Calibration.from_fit(one) if isinstance(one, FitResult) else one for one in fits[:1]]
-    maker = _Maker(held[0].rebuilt() if held else None, partial, len(opened) < MANY)
+    maker = Maker(held[0].rebuilt() if held else None, partial, len(opened) < MANY)
+    makers = Makers(maker, executor)
     made: list[Night] = []
-    at_hand: dict[tuple[str, int], _Data] = {}
+    at_hand: dict[tuple[str, int], Data] = {}
+    new = makers.make([Task(one.data) for one in opened if one.data is not None])
     for k, one in enumerate(opened):
         some = one.nights
         if one.data is not None:
             tell(f"{k + 1} of {len(opened)}")
-            some = maker.nights(one.data)
-            at_hand |= {(night.sha256, night.number): one.data for night in some}
+            some = next(new)
+            at_hand |= {night.key: one.data for night in some}
         made += some
     data = together(made)
     doubts = [*_about_fits(fits), *_about_time(data.nights)]
@@ -227,17 +127,17 @@ def stack(
             carried = functools.partial(_carried, maker.like, catalogue) if maker.like is not None else None
             found, chosen, _ = breaks_of(data, chosen, catalogue, carried)
             breaks += found
-        data, solution, settled = _settled(data, chosen, at_hand, maker)
+        data, solution, settled = _settled(data, chosen, at_hand, makers)
         if at_hand and any(law is not None for law in chosen[len(chosen) - data.candidates :]):
             # What takes part in the solution is to be known there, not only what is left of it.
-            data = _with_candidates_anew(data, solution, at_hand, maker)
-            data, solution, settled = _settled(data, chosen, at_hand, maker)
+            data = _with_candidates_anew(data, solution, at_hand, makers)
+            data, solution, settled = _settled(data, chosen, at_hand, makers)
     except UndeterminedError as error:
         raise _undetermined(data, error) from None
     if not settled:
         what = "the solution has not settled: the nights differ by more than their laws and the breaks that were found"
         doubts.append(Doubt(Quality.NOT_CONVERGED, what))
-    if kept := sum((night.sha256, night.number) not in at_hand for night in data.nights):
+    if kept := sum(night.key not in at_hand for night in data.nights):
         what = f"{kept} of {len(data.nights)} nights stay as they were linearised: their data are not at hand"
         doubts.append(Doubt(Quality(0), what, blocking=False))
     happened = {event for some in opened for event in some.events} | set(
@@ -313,9 +213,9 @@ def _opened(one: Given, catalogue: Sequence[type[Effect]]) -> _Opened:
     if isinstance(one, Night):
         return _Opened([one])
     if isinstance(one, FitResult):
-        return _Opened([], _Data(lambda: one.calset, data_hash(one.calset), one.model), one)
+        return _Opened([], Data(one.calset, data_hash(one.calset), one.model), one)
     if isinstance(one, CalibrationSet):
-        return _Opened([], _Data(lambda: one, data_hash(one)))
+        return _Opened([], Data(one, data_hash(one)))
     path = one.folder if isinstance(one, Run) else Path(one)
     if path.is_dir() and (not (path / PRODUCT).exists() or (path / NIGHTS).exists()):
         fit = read_calibration(path / REFERENCE, catalogue) if (path / REFERENCE).exists() else None
@@ -331,18 +231,16 @@ def _opened(one: Given, catalogue: Sequence[type[Effect]]) -> _Opened:
         return _Opened(read_nights(path))
     if path.is_dir() or "PRODVERS" in keywords:
         run = one if isinstance(one, Run) else Run(path if path.is_dir() else path.parent, catalogue)
-        return _Opened([], _Data(lambda: run.calset, data_hash(run.calset)), run.calibration)
+        return _Opened([], Data(run, data_hash(run.calset)), run.calibration)
     with check_input(path).open("rb") as raw:
-        return _Opened(
-            [], _Data(lambda: read_calibration_set(path), hashlib.file_digest(raw, "sha256").hexdigest())
-        )
+        return _Opened([], Data(path.resolve(), hashlib.file_digest(raw, "sha256").hexdigest()))
 
 
 def _settled(
     data: Together,
     laws: Sequence[Law | None],
-    at_hand: Mapping[tuple[str, int], _Data],
-    maker: _Maker,
+    at_hand: Mapping[tuple[str, int], Data],
+    makers: Makers,
 ) -> tuple[Together, Solution, bool]:
     """Linearise nights at the common solution until that would not move it by `EXACT` errors; whether it would not.
 
@@ -357,7 +255,7 @@ def _settled(
         away = (np.abs(values - data.reference) / sigma)[:, data.has_value].max(axis=1)
         again = [
             u for u in np.argsort(-away, kind="stable")
-            if away[u] > FAR and (data.nights[u].sha256, data.nights[u].number) in at_hand
+            if away[u] > FAR and data.nights[u].key in at_hand
         ]  # fmt: skip
         if not again or (enough and not set(again) & set(anew)):
             return data, solution, True
@@ -365,20 +263,25 @@ def _settled(
             break
         farthest = float(away.max())
         nights, anew, enough = list(data.nights), [], False
-        for number, u in enumerate(again, start=1):
-            seeing = number.bit_count() == 1  # the first, second, fourth …: solving costs time as well
+        for begin in (0, *(2**k for k in range(len(again).bit_length()))):
+            if not (some := again[begin : max(1, 2 * begin)]):
+                break
+            there = [dict(zip(data.names, values[u].tolist(), strict=True)) for u in some]
+            tasks = [Task(at_hand[nights[u].key], nights[u], at) for u, at in zip(some, there, strict=True)]
+            *made, (last,) = makers.make(tasks)
+            for u, (night,) in zip(some, made, strict=False):
+                nights[u] = night
+            seeing = len(some) == max(1, begin)  # the first, second, fourth …: solving costs time as well
             before = values
-            if seeing and number > 1:
+            if seeing and begin > 0:
                 before, _ = _in_units(one := together(nights), solved(one, laws))
-            night, there = nights[u], dict(zip(data.names, values[u].tolist(), strict=True))
-            nights[u] = maker.again(at_hand[night.sha256, night.number], night, there)
-            anew.append(u)
-            if seeing or number == len(again):
-                data = together(nights)
-                solution = solved(data, laws)
+            nights[u := some[-1]] = last
+            anew += some
+            data = together(nights)
+            solution = solved(data, laws)
             if seeing:
                 after, _ = _in_units(data, solution)
-                rest = np.full((len(nights), 1), len(again) - number)
+                rest = np.full((len(nights), 1), len(again) - begin - len(some))
                 rest[u] = min(rest[u], 1)  # what is its own moves with no other night
                 if enough := bool(np.all(rest * np.abs(after - before) <= EXACT * sigma)):
                     break
@@ -386,15 +289,16 @@ def _settled(
 
 
 def _with_candidates_anew(
-    data: Together, solution: Solution, at_hand: Mapping[tuple[str, int], _Data], maker: _Maker
+    data: Together, solution: Solution, at_hand: Mapping[tuple[str, int], Data], makers: Makers
 ) -> Together:
     """The nights linearised at the solution, with their candidates."""
     values, _ = _in_units(data, solution)
-    nights = []
-    for night, own in zip(data.nights, values.tolist(), strict=True):
-        if (one := at_hand.get((night.sha256, night.number))) is not None:
-            night = maker.again(one, night, dict(zip(data.names, own, strict=True)), candidates=True)
-        nights.append(night)
+    nights = list(data.nights)
+    some = [u for u, night in enumerate(nights) if night.key in at_hand]
+    there = [dict(zip(data.names, values[u].tolist(), strict=True)) for u in some]
+    tasks = [Task(at_hand[nights[u].key], nights[u], at, True) for u, at in zip(some, there, strict=True)]
+    for u, (night,) in zip(some, makers.make(tasks), strict=True):
+        nights[u] = night
     return together(nights)
 
 

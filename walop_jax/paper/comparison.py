@@ -24,7 +24,7 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import LARGEST_P, STARS, sample_stars
 from walop_jax.calibration.thresholds import GOAL, SMALLEST_DETERMINANT
-from walop_jax.data.records import CalibrationSet
+from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet
 from walop_jax.data.settings import DEFAULT_FILTER, Settings
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError
@@ -316,11 +316,11 @@ def _moon(
 ) -> dict[str, Any] | None:
     """Verdicts on the Moon patches, and the errors that the full-Moon scheme leaves at the grid points."""
     e = calset.exposures
-    if not np.any((e.kind == "moon") & ~e.clp_in):
+    if not np.any(e.direct("moon")):
         return None
     patches = judge_patches(calset, calibration)
     document = patches.document(e.exposure)
-    weight = patches.weight[~e.chwp_in[patches.exposure]]
+    weight = patches.weight[~e.position(CALIBRATION_PLATE).inside[patches.exposure]]
     try:
         schemes = {
             "equal_weights": full_moon_scheme(calset, paper),

@@ -33,7 +33,7 @@ from scipy.interpolate import RegularGridInterpolator
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import sample_stars
-from walop_jax.data.records import Block, CalibrationSet
+from walop_jax.data.records import CALIBRATION_PLATE, Block, CalibrationSet
 from walop_jax.data.settings import DEFAULT_FILTER, Settings
 from walop_jax.io.errors import DataError
 from walop_jax.model.conventions import EXTINCTION
@@ -109,7 +109,7 @@ def polariser_exposures(calset: CalibrationSet, filter_name: str = DEFAULT_FILTE
     Raises `DataError` if there are fewer than five: the polynomial has five coefficients.
     """
     e = calset.exposures
-    rows = np.flatnonzero(e.clp_in & ~e.chwp_in & (e.filter == filter_name))
+    rows = np.flatnonzero(e.clp_in & ~e.position(CALIBRATION_PLATE).inside & (e.filter == filter_name))
     angles = len(np.unique(np.round(np.mod(e.clp_angle[rows], 180.0), 6)))
     if angles < len(TERMS):
         raise DataError(
@@ -241,7 +241,7 @@ def judge_patches(calset: CalibrationSet, calibration: Calibration) -> Patches:
     Raises `DataError` if there is none.
     """
     e = calset.exposures
-    moon = np.flatnonzero((e.kind == "moon") & ~e.clp_in)
+    moon = np.flatnonzero(e.direct("moon"))
     if moon.size == 0:
         raise DataError("EXPOSURES: there is no full-Moon exposure (KIND moon, polariser out)")
     block = calset.intensities.block(0, len(calset.points))
@@ -320,8 +320,8 @@ def full_moon_scheme(
     """
     e = calset.exposures
     block = calset.intensities.block(0, len(calset.points))
-    moon = np.flatnonzero((e.kind == "moon") & ~e.clp_in & ~e.chwp_in)
-    standard = np.flatnonzero((e.kind == "standard") & ~e.clp_in & ~e.chwp_in)
+    moon = np.flatnonzero(e.direct("moon") & ~e.position(CALIBRATION_PLATE).inside)
+    standard = np.flatnonzero(e.direct("standard") & ~e.position(CALIBRATION_PLATE).inside)
     centre_x, centre_y = box_centres()
     grid = _positions(block, paper.x, paper.y)
     middle = _positions(block, centre_x, centre_y)

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap
 from walop_jax.calibration.thresholds import GOAL
-from walop_jax.data.records import CalibrationSet
+from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet
 from walop_jax.fit.model_file import instrument_of
 from walop_jax.io.text import two_digits, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
@@ -157,7 +157,7 @@ def modulation_figure(
     Two arms measure q_m and u_m; an ideal instrument would follow cos 2θ and sin 2θ, the grey lines.
     """
     e = calset.exposures
-    shown = np.flatnonzero(e.clp_in & ~e.chwp_in)
+    shown = np.flatnonzero(e.clp_in & ~e.position(CALIBRATION_PLATE).inside)
     block = calset.intensities.block(0, len(calset.points))
     names = names or instrument_of(calset).cameras.names
     arms = len(names) // 2

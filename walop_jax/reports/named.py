@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from walop_jax.data.records import CALIBRATION_PLATE
 from walop_jax.io.errors import fail, nearest
 from walop_jax.io.names import FIGURE_DATA, LIMITS, POSTERIOR, PRODUCT
 from walop_jax.paper.polynomial import TERMS
@@ -95,7 +96,7 @@ def _cameras(source: FigureSource) -> tuple[str, ...] | None:
 
 def _modulation(source: FigureSource) -> AnyFigure:
     exposures, points = source.calset.exposures, source.calset.points
-    behind = np.flatnonzero(exposures.clp_in & ~exposures.chwp_in)
+    behind = np.flatnonzero(exposures.clp_in & ~exposures.position(CALIBRATION_PLATE).inside)
     seen = source.calset.intensities.block(0, len(points)).used[:, behind].any(axis=1)
     if not seen.any():
         raise fail("no field point was seen behind the polariser", file=source.folder, advice="plot matrix")
@@ -128,7 +129,7 @@ def _angles(fewest: int) -> Callable[[FigureSource], bool]:
 
     def enough(source: FigureSource) -> bool:
         e = source.stored.exposures
-        rows = e.clp_in & ~e.chwp_in & (e.filter == source.maps.filter)
+        rows = e.clp_in & ~e.position(CALIBRATION_PLATE).inside & (e.filter == source.maps.filter)
         return _small(source) and len(np.unique(np.round(e.clp_angle[rows] % 180.0, 6))) >= fewest
 
     return enough

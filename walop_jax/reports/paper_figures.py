@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.thresholds import GOAL
-from walop_jax.data.records import CalibrationSet
+from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_file import instrument_of
 from walop_jax.io.errors import DataError
@@ -132,7 +132,7 @@ def transmission_figure(
     With the model of Paper II, a constant plus terms in q and u of the polariser, and what it leaves below.
     """
     e = calset.exposures
-    rows = np.flatnonzero(e.clp_in & ~e.chwp_in & (e.filter == filter_name))
+    rows = np.flatnonzero(e.clp_in & ~e.position(CALIBRATION_PLATE).inside & (e.filter == filter_name))
     if len(np.unique(np.mod(e.clp_angle[rows], 180.0))) < 3:
         raise DataError(
             f"EXPOSURES: fewer than 3 polariser angles in {filter_name}: nothing to draw a curve through"

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.records import CALIBRATION_PLATE, POLARISER
 from walop_jax.fit.parameter_table import PRIOR_ONLY
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import probability, rounded, some, value_and_error, with_error, with_minus_sign
@@ -143,12 +144,16 @@ def data_in_words(product: Calibration) -> list[tuple[str, str]]:
         ("Exposures", f"{len(e)} ({kinds})"),
         ("Field", with_minus_sign(f"X {low_x:+.2f} to {high_x:+.2f}°, Y {low_y:+.2f} to {high_y:+.2f}°")),
         ("Polariser angles", _angles(e.clp_angle[e.clp_in])),
-        ("Calibration plate", _settings(e.chwp_angle[e.chwp_in], bool((~e.chwp_in).any()))),
     ]
     rows += [
-        (prefix, _settings(p.angle[p.inside], bool((~p.inside).any()))) for prefix, p in e.moving.items()
+        (
+            "Calibration plate" if prefix == CALIBRATION_PLATE else prefix,
+            _settings(p.angle[p.inside], bool((~p.inside).any())),
+        )
+        for prefix, p in e.positions.items()
+        if prefix != POLARISER
     ]
-    moon = (e.kind == "moon") & ~e.clp_in
+    moon = e.direct("moon")
     places = {(round(float(a), 3), round(float(d), 3)) for a, d in zip(e.ra[moon], e.dec[moon], strict=True)}
     listed = some([str(name) for name in product.sources.name], _MANY)
     rows += [

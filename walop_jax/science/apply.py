@@ -19,13 +19,13 @@ from scipy import special
 
 from walop_jax.calibration.analysis_vectors import COLOURS, COOLEST, AnalysisVectors, colour_weights
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data.catalogue import Catalogue
 from walop_jax.data.settings import Settings
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError, rows_text
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
 from walop_jax.model.parameters import with_values
+from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, CatalogueSearch
 from walop_jax.science.detectors import detector_slopes, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate

@@ -34,13 +34,13 @@ from scipy import special
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data.catalogue import Catalogue
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.science.apply import residuals_of
+from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_check import ALARM, RIVAL, threshold
 from walop_jax.science.star_residuals import (
     ABOUT_GAINS,

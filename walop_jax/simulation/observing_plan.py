@@ -18,7 +18,16 @@ import tomlkit
 from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.checks import checked_curve
-from walop_jax.data.records import Exposures, FilterCurve, Points, Position, Site
+from walop_jax.data.records import (
+    CALIBRATION_PLATE,
+    KINDS,
+    POLARISER,
+    Exposures,
+    FilterCurve,
+    Points,
+    Position,
+    Site,
+)
 from walop_jax.data.schema import Place
 from walop_jax.data.settings import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
 from walop_jax.instruments.description import Reader, default_name, described, shipped
@@ -36,7 +45,9 @@ NARROW_BANDS: Mapping[str, float] = {"NB-580": 0.580, "NB-660": 0.660}  # centre
 _SPACING = 0.004  # d between exposures
 _GOLDEN = 0.5 * (3.0 - np.sqrt(5.0))  # of a turn: spreads any number of angles evenly
 _STANDARD_EDGE = 0.8  # of the field: 5 × 5 centres of boxes that fill it
-EXPOSED: Mapping[str, float] = {"clp": 30.0, "lamp": 30.0, "moon": 60.0, "standard": 60.0}
+EXPOSED: Mapping[str, float] = {
+    name: kind.seconds for name, kind in KINDS.items() if kind.seconds is not None
+}
 """The usual exposure time (s) of each kind, in which a camera sees `ObservingPlan.electrons`."""
 _MOON_ROTATOR, _STAR_ROTATOR = (0.0, 40.0, 90.0, 135.0), (0.0, 30.0, 75.0, 120.0)
 
@@ -318,8 +329,6 @@ class ObservingPlan:
         number = np.array([stop.number for stop in taken])
         moon, star = np.flatnonzero(kind == "moon"), np.flatnonzero(kind == "standard")
         sky = np.append(moon, star)
-        angle = np.array([NAN if stop.polariser_angle is None else stop.polariser_angle for stop in taken])
-        plate = [stop.plate for stop in taken]
         mjd = self.start + _SPACING * (np.arange(n) - (sky.min() if len(sky) else n))
         ra, dec, rotator = np.full((3, n), NAN)
         if len(moon):
@@ -339,23 +348,18 @@ class ObservingPlan:
             mjd=mjd,
             exptime=np.array([EXPOSED[s.kind] if s.seconds is None else s.seconds for s in taken]),
             filter=np.array([stop.filter for stop in taken]),
-            clp_in=np.isfinite(angle),
-            clp_angle=angle,
-            chwp_in=np.array([p is not None for p in plate], bool),
-            chwp_angle=np.array([NAN if p is None else p for p in plate], float),
             temp=np.linspace(*self.temperature, n),
             ha=ha,
             ra=ra,
             dec=dec,
             rotator=rotator,
             teff=np.full(n, self.teff),
-            moving={p: self._position([stop.moving.get(p) for stop in taken]) for p in self.moving},
+            positions={
+                POLARISER: Position.at(stop.polariser_angle for stop in taken),
+                CALIBRATION_PLATE: Position.at(stop.plate for stop in taken),
+                **{prefix: Position.at(stop.moving.get(prefix) for stop in taken) for prefix in self.moving},
+            },
         )
-
-    @staticmethod
-    def _position(angles: list[float | None]) -> Position:
-        angle = np.array([NAN if a is None else a for a in angles], float)
-        return Position(np.isfinite(angle), angle)
 
     def _patches(
         self, mjd: Float[np.ndarray, " m"], order: Int[np.ndarray, " m"]

@@ -8,14 +8,14 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence, Sized
-from typing import Protocol, runtime_checkable
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.schema import EXPOSURES, Column, Place, check, finite
 from walop_jax.data.settings import TEMPERATURE, Settings
+from walop_jax.data.table_intensities import equal_rows
 from walop_jax.data.user_tables import (
     MISSING,
     InputTable,
@@ -26,6 +26,7 @@ from walop_jax.data.user_tables import (
     vector_column,
 )
 from walop_jax.io.errors import rows_text
+from walop_jax.model.instrument import Instrument
 
 _NEGATIVE = 5.0  # sigma: what noise about a subtracted background may do, and no more
 _SINGLE = 1  # point: it may lie outside without a doubt about its unit
@@ -48,45 +49,6 @@ POINT_COLUMNS: Mapping[str, Column] = {
 }
 
 
-@runtime_checkable
-class NamedCameras(Sized, Protocol):
-    """Cameras as a table needs to know them."""
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Their names, in order."""
-        ...
-
-    @property
-    def pairs(self) -> Sized:
-        """Those of the arms with two: a row of the matrix each."""
-        ...
-
-
-@runtime_checkable
-class InstrumentOfTables(Protocol):
-    """The instrument of a table, as that needs to know it; the field reaches to ±`field_limit` (deg)."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        ...
-
-    @property
-    def field_limit(self) -> float:
-        """Largest |X|, |Y| (deg)."""
-        ...
-
-    @property
-    def cameras(self) -> NamedCameras:
-        """Its cameras."""
-        ...
-
-    def moving(self) -> tuple[str, ...]:
-        """Column prefixes of its moving elements behind the polariser."""
-        ...
-
-
 @dataclasses.dataclass(frozen=True)
 class FieldPoints:
     """Field points, and the optical settings there, for which an instrument matrix is asked.
@@ -105,7 +67,7 @@ class FieldPoints:
 
 def field_points(
     source: InputTable,
-    instrument: InstrumentOfTables,
+    instrument: Instrument,
     always_in: Collection[str] = (),
     never_in: Collection[str] = (),
 ) -> FieldPoints:
@@ -184,7 +146,7 @@ def _doubt_radians(source: InputTable, name: str, angle: Float[np.ndarray, " n"]
 
 
 def true_matrices(
-    path: str | os.PathLike[str], instrument: InstrumentOfTables
+    path: str | os.PathLike[str], instrument: Instrument
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
     """X, Y (deg) and M21, M22, … of a table of true matrices, three for each arm.
 
@@ -245,7 +207,7 @@ class Catalogue:
 
 def read_catalogue(
     source: InputTable,
-    instrument: InstrumentOfTables,
+    instrument: Instrument,
     saturation: float = np.inf,
     *,
     always_in: Collection[str] = (),
@@ -396,14 +358,14 @@ def _copies(
     Noise does not repeat to the digits of a float32 in all cameras: such rows are one measurement.
     """
     measured = np.isfinite(counts).any(axis=1)
-    same = _groups([*counts.T, *sigma.T, points.x, points.y])
+    same = equal_rows([*counts.T, *sigma.T, points.x, points.y])
     copy = repeated = np.zeros(len(star), bool)
     if np.bincount(same[measured], minlength=1).max() < 2:
         return copy, repeated
     settings = points.settings
     angles = [np.mod(angle, 360.0) for angle in (*settings.positions.values(), rotator)]
     _, band = np.unique(settings.filter, return_inverse=True)
-    first = np.unique(_groups([same, star, band.reshape(-1), *angles]), return_index=True)[1]
+    first = np.unique(equal_rows([same, star, band.reshape(-1), *angles]), return_index=True)[1]
     copy = measured & ~np.isin(np.arange(len(star)), first)
     repeated = measured & (np.bincount(same[measured & ~copy], minlength=len(star))[same] > 1)
     if copy.any():
@@ -414,19 +376,3 @@ def _copies(
         what = "the same place and counts under another ID or setting: they are one measurement"
         source.remarks.append(f"{which}: {what}")
     return copy, repeated
-
-
-def _groups(columns: Sequence[np.ndarray]) -> Int[np.ndarray, " n"]:
-    """Number of the group of equal rows of columns, floats as float32, that every row is in."""
-    mixed = np.full(len(columns[0]), 0x9E3779B97F4A7C15, np.uint64)
-    for column in columns:  # a hash of 64 bits: of a million rows two collide in one of 10⁷ tables
-        if column.dtype.kind == "f":
-            single = np.where(
-                np.isnan(column), np.float32(np.nan), column.astype(np.float32) + np.float32(0.0)
-            )
-            words = single.astype(np.float32).view(np.uint32).astype(np.uint64)
-        else:
-            words = column.astype(np.uint64)
-        mixed = (mixed ^ words) * np.uint64(0xBF58476D1CE4E5B9)
-        mixed ^= mixed >> np.uint64(29)
-    return np.unique(mixed, return_inverse=True)[1].reshape(-1)

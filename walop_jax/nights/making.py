@@ -1,0 +1,244 @@
+"""Nights made of data: linearised near their own minimum first, at a common solution later; here or on other machines.
+
+`make` needs nothing but its arguments, so that any `concurrent.futures.Executor` runs it: one of processes, or that of
+a Dask cluster (`distributed.Client.get_executor`). Nights depend neither on the process nor on their order. The file
+of a night appears in `folder`, whole or not at all; a night with a file is not made again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import importlib
+import importlib.util
+import pickle
+from collections import Counter
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.records import CalibrationSet
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.fit.model_file import model_like
+from walop_jax.io.code import files_of_users, run_file
+from walop_jax.io.errors import DataError, fail
+from walop_jax.model.specification import Model
+from walop_jax.nights.equations import (
+    Candidates,
+    Night,
+    candidates_of,
+    model_hash,
+    night_equations,
+    source_of,
+    with_candidates_of,
+)
+from walop_jax.nights.night_file import read_nights, write_nights
+from walop_jax.posterior.files import Run
+
+SKETCH = 512  # measurements by which sets are compared
+COPIED = 0.02  # their share that no two sets have in common by chance
+
+
+class Data(NamedTuple):
+    """Data that nights can be made of at any values: a set, its file or a RUN; hash; model (None: that of `like`)."""
+
+    source: CalibrationSet | Path | Run
+    sha256: str
+    model: Model | None = None
+
+    def read(self) -> CalibrationSet:
+        """The set."""
+        if isinstance(self.source, CalibrationSet):
+            return self.source
+        return self.source.calset if isinstance(self.source, Run) else read_calibration_set(self.source)
+
+
+class Task(NamedTuple):
+    """Nights to be made of `data`: those near their own minimum, or `night` once more, at `values`."""
+
+    data: Data
+    night: Night | None = None
+    values: Mapping[str, float] = {}
+    candidates: bool = False
+    """True: those of `night` are linearised at `values` as well."""
+
+
+class Made(NamedTuple):
+    """The nights of a task, with the source and a sketch of their measurements (empty: not computed)."""
+
+    nights: list[Night]
+    source: str = ""
+    sketch: frozenset[int] = frozenset()
+    error: DataError | None = None
+    """Why there are no nights of data that have been read: copies of other data are told first."""
+
+
+@dataclasses.dataclass
+class Maker:
+    """Makes nights of data, with the model and about the values of `like`."""
+
+    like: Calibration | None
+    folder: Path | None
+    few: bool = True
+    """True: programs are compiled for a few nights."""
+    _candidates: dict[tuple[str, ...], Candidates] = dataclasses.field(default_factory=dict)
+    _sets: dict[str, tuple[CalibrationSet, Model]] = dataclasses.field(default_factory=dict)
+
+    def make(self, task: Task) -> Made:
+        """The nights of a task. Raises `DataError` as `read_calibration_set` and `night_equations` do."""
+        return self._first(task.data) if task.night is None else self._again(task.night, task)
+
+    def _first(self, data: Data) -> Made:
+        if self.like is None:
+            raise fail(
+                f"{source_of(data.read())} is a set, and nothing says at which values to linearise it",
+                advice="give --like RUN, a fit of the same model (like= in Python)",
+            )
+        place = None
+        if self.folder is not None:
+            named = f"{data.sha256} {model_hash(data.model or self.like.model)}"
+            place = self.folder / f"night-{hashlib.sha256(named.encode()).hexdigest()[:16]}.fits"
+            if place.exists():
+                return Made(read_nights(place))
+        calset, model = self._set_and_model(data)
+        values = dict(zip(self.like.model.names, self.like.values.tolist(), strict=True))
+        candidates = self._candidates_of(model, calset)
+        table = calset.intensities
+        measured = sketch(calset, table) if isinstance(table, TableIntensities) else frozenset[int]()
+        try:
+            nights = night_equations(calset, model, values, candidates, own=True, once=self.few)
+        except DataError as error:
+            return Made([], source_of(calset), measured, error)
+        if place is not None:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            write_nights(place, nights, overwrite=True)
+        return Made(nights, source_of(calset), measured)
+
+    def _again(self, night: Night, task: Task) -> Made:
+        """The night linearised at other values; its candidates as well, or they follow (`with_candidates_of`)."""
+        calset, model = self._set_and_model(task.data)
+        candidates = self._candidates_of(model, calset) if task.candidates else {}
+        values = dict(task.values)
+        if not task.candidates:  # a gauge stays where its column was made
+            cut = len(night.names) - night.candidates
+            values |= dict(zip(night.names[cut:], night.reference[cut:].tolist(), strict=True))
+        (made,) = night_equations(calset, model, values, candidates, number=night.number, once=self.few)
+        return Made([with_candidates_of(made, night)])
+
+    def _set_and_model(self, data: Data) -> tuple[CalibrationSet, Model]:
+        assert self.like is not None
+        if (kept := self._sets.get(data.sha256)) is not None:
+            return kept
+        calset = data.read()
+        read = calset, data.model or model_like(calset, self.like.model)
+        if isinstance(calset.intensities, TableIntensities):
+            self._sets[data.sha256] = read
+        return read
+
+    def _candidates_of(self, model: Model, calset: CalibrationSet) -> Candidates:
+        # They depend on cameras, standards and the effects of the model alone: listing them takes a while.
+        key = (*model.names, *model.effect_names)
+        if key not in self._candidates:
+            self._candidates[key] = candidates_of(model, calset.exposures, model.catalogue)
+        return self._candidates[key]
+
+
+class Makers:
+    """A `Maker` here, or one in every process of an executor; sets that are copies of each other are refused."""
+
+    def __init__(self, maker: Maker, executor: Executor | None = None) -> None:
+        """Make nights by `executor`, or here where there is none."""
+        self.like, self._maker, self._executor = maker.like, maker, executor
+        self._seen: dict[int, str] = {}
+
+    def make(self, tasks: Sequence[Task]) -> Iterator[list[Night]]:
+        """The nights of each task, in their order.
+
+        Raises `DataError` as `Maker.make` does, and for measurements that are in the data of an earlier task as well.
+        """
+        for made in self._made(tasks):
+            if made.sketch:
+                self._refuse_copies(made.source, made.sketch)
+            if made.error is not None:
+                raise made.error
+            yield made.nights
+
+    def _made(self, tasks: Sequence[Task]) -> Iterable[Made]:
+        if self._executor is None:
+            return map(self._maker.make, tasks)
+        recipe = pickle.dumps((self.like, self._maker.folder, self._maker.few))
+        given = [(files_of_users(), recipe, pickle.dumps(task)) for task in tasks]
+        return self._executor.map(make, *zip(*given, strict=True)) if given else ()
+
+    def _refuse_copies(self, here: str, smallest: frozenset[int]) -> None:
+        seen = Counter(self._seen[number] for number in smallest if number in self._seen)
+        if seen and (most := seen.most_common(1)[0])[1] > COPIED * len(smallest):
+            share = f"{100 * most[1] / len(smallest):.0f} % of its measurements are in {most[0]} as well"
+            raise fail(share, file=here, advice="leave one out: repeated data would shrink the errors")
+        self._seen |= dict.fromkeys(smallest, here)
+
+
+def make(code: tuple[str, ...], recipe: bytes, task: bytes) -> Made:
+    """The nights of a pickled `Task`, made in any process by `Maker(*recipe)`; the files of `code` are run first."""
+    return _maker(code, recipe).make(pickle.loads(task))
+
+
+@functools.lru_cache(maxsize=1)
+def _maker(code: tuple[str, ...], recipe: bytes) -> Maker:
+    """The maker of a worker process, with the sets that it has read and the candidates that it has listed."""
+    for path in code:
+        run_file(path, "start the workers where this file can be read")
+    return Maker(*pickle.loads(recipe))
+
+
+@contextlib.contextmanager
+def executor_of(
+    workers: int | None = None, scheduler: str | Executor | None = None
+) -> Generator[Executor | None, None, None]:
+    """Executor of the workers of a Dask scheduler (or as given), or of new processes of this machine; None without.
+
+    A worker makes one night at a time. Tasks of a worker that is lost go to another one. Raises `DataError` where
+    `distributed` is not installed, and where no scheduler answers.
+    """
+    if workers is None and (scheduler is None or isinstance(scheduler, Executor)):
+        yield scheduler
+        return
+    if importlib.util.find_spec("distributed") is None:
+        raise fail("Dask is not installed", advice="pip install 'walop-jax[cluster]'")
+    dask = importlib.import_module("distributed")
+    with contextlib.ExitStack() as hold:
+        if scheduler is None:
+            own = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None}
+            address = hold.enter_context(dask.LocalCluster(**own))
+        else:
+            address = scheduler
+        try:
+            client = hold.enter_context(dask.Client(address, timeout="20s"))
+        except OSError as error:
+            raise fail(
+                f"no Dask scheduler answers at {scheduler}: {error}", advice="start dask scheduler"
+            ) from None
+        yield hold.enter_context(client.get_executor(pure=False, retries=3))
+
+
+def sketch(calset: CalibrationSet, table: TableIntensities) -> frozenset[int]:
+    """Sketch of the measurements of a set, whatever their times: the same ones have the same hashes (MinHash).
+
+    The smallest of the hashes of (X, Y, counts); the share that two sketches have in common is that of the sets
+    (Broder 1997).
+    """
+    rows = table.used & ~calset.exposures.flux_known[table.exposure]
+    point = table.point[rows]
+    places = np.column_stack([calset.points.x[point], calset.points.y[point], table.counts[rows]])
+    hashes = np.zeros(len(places), np.uint64)
+    for bits in np.ascontiguousarray(places).view(np.uint64).T:
+        hashes = (hashes ^ bits) * np.uint64(0x9E3779B97F4A7C15)
+        hashes ^= hashes >> np.uint64(29)
+    return frozenset(np.unique(hashes)[:SKETCH].tolist())
