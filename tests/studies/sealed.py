@@ -1,6 +1,6 @@
 """Physics that the search has never seen: is what a diagnosis hands on right, star by star and element by element?
 
-    python tests/studies/sealed.py [--sets 400] [--first 0] [--seed 53] [--side 8] [--refit-only]
+    python tests/studies/sealed.py [--sets 400] [--first 0] [--seed 53] [--side 8] [--budget MINUTES] [--refit-only]
 
 What is hidden in a set depends on its number and the seed alone, and is drawn from a grammar of its own. It shares no
 line with the sentences of a diagnosis (kinds, places and factors are other ones), and its light path is that of
@@ -622,11 +622,14 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=53)
     parser.add_argument("--side", type=int, default=8)
     parser.add_argument("--minutes", type=float, default=3.0)
+    parser.add_argument("--budget", type=float, default=np.inf, help="minutes after which no set is begun")
     parser.add_argument("--refit-only", action="store_true")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    found = []
+    found, end = [], time.monotonic() + 60.0 * options.budget
     for number in range(options.first, options.first + options.sets):
+        if time.monotonic() > end:
+            break
         found.append(outcome(number, options))
         print(line(number, found[-1]), flush=True)
     print(table(found))
