@@ -14,7 +14,7 @@ def laid(columns, data, prior_of=()):
     priors = np.eye(columns.shape[1])[list(prior_of)]
     rows, values = np.vstack([-columns, -priors]), np.concatenate([data, np.zeros(len(priors))])
     best = np.linalg.lstsq(-rows, values, rcond=None)[0]
-    return rows, values + rows @ best, len(data) - columns.shape[1] + len(priors)
+    return rows, values + rows @ best, len(data) - columns.shape[1] + len(priors), 1.0
 
 
 def by_hand(columns, data, kind, prior_of):
@@ -50,3 +50,15 @@ def test_what_stands_in_for_something_else_is_contradicted():
     assert true[2] > 3.0
     off = gains_of_units(UNIT, base, laid(np.hstack([common, wrong]), data, [1]))
     assert off[1] < -3.0
+
+
+def test_errors_that_a_fit_has_scaled_make_its_densities_as_broad():
+    """The same residuals in units of five times the errors: as probable, where χ² is what those errors say."""
+    rng = np.random.default_rng(7)
+    columns, data = np.ones((300, 1)), rng.standard_normal(300)
+    rows, residual, free, _ = laid(columns, data)
+    scaled = rows / 5.0, residual / 5.0, free, 5.0
+    loss = gains_of_units(UNIT, (rows, residual, free, 1.0), scaled)
+    # ½ Σ r² − n ln 5 − ½ Σ r²/25, nearly: a unit of 100 rows is predicted by 200.
+    squares = np.array([np.sum(residual[kind == UNIT] ** 2) for kind in np.unique(UNIT)])
+    np.testing.assert_allclose(loss, 0.5 * squares * (1 - 1 / 25) - 100 * np.log(5.0), rtol=0.02)

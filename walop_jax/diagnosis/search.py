@@ -40,7 +40,7 @@ from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import Model, model_without, with_effects
 
-LaidOut = tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, " _"], int]
+LaidOut = tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, " _"], int, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -342,16 +342,20 @@ def gains_by_kind(before: Design, after: Design) -> dict[str, float]:
     names = np.unique(kinds)
     if len(names) < 2:
         return {}
-    one, other = ((d.jacobian, d.residual, d.projector.free) for d in (before, after))
+    one, other = ((d.jacobian, d.residual, d.projector.free, d.fit.noise_scale) for d in (before, after))
     return dict(zip(map(str, names), gains_of_units(kinds, one, other).tolist(), strict=True))
 
 
 def gains_of_units(unit: np.ndarray, before: LaidOut, after: LaidOut) -> Float[np.ndarray, " u"]:
     """Gain in ln p of each unit of the data rows, as all others predict it, of one model over another.
 
-    Of each model the Jacobian, the residuals at its minimum, priors last, and its degrees of freedom.
+    Of each model the Jacobian, the residuals at its minimum, priors last, its degrees of freedom, and the factor on the
+    errors in whose units the data rows are.
     """
-    found = [_predictions(rows, residual, unit, free)[:, 0] for rows, residual, free in (before, after)]
+    count, found = np.unique(unit, return_counts=True)[1], []
+    for rows, residual, free, noise in (before, after):
+        density = _predictions(rows, residual, unit, free)[:, 0]
+        found.append(density - count * free / len(unit) * np.log(noise))
     return found[1] - found[0]
 
 
