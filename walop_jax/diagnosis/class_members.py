@@ -30,7 +30,7 @@ from walop_jax.calibration.matrix import (
     sample_stars,
 )
 from walop_jax.diagnosis.class_average import distinct, moved, probabilities
-from walop_jax.diagnosis.class_product import ClassOf, Member, Sum
+from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.hidden_mistakes import of_matrix, usual_exposure
 from walop_jax.diagnosis.score import Projector, log_bayes
@@ -141,7 +141,7 @@ class _Laid:
         ]
         return ClassOf(name, at, tuple(members), *self._spread(members))
 
-    def _spread(self, members: Sequence[Member]) -> tuple[float, float, float]:
+    def _spread(self, members: Sequence[Likeness]) -> tuple[float, float, float]:
         """Error of p of stars between members, that of the fit, and how far the farthest lies off (`ClassOf`)."""
         weights = np.array([member.probability for member in members])
         away = np.stack([member.change for member in members])
@@ -176,7 +176,7 @@ class _Step:
         self.projector = Projector(self.jacobian, design.eliminated)
         self.left = self.projector(design.residual + self.lost)
 
-    def told(self, name: str, sums: tuple[Sum, ...]) -> Member:
+    def told(self, name: str, sums: tuple[Sum, ...]) -> Likeness:
         """The member that was added, as the fit has it."""
         fit, design, floor = self.laid.fit, self.laid.design, self.laid.state.floor
         positions = fit.model.free[self.at]
@@ -187,12 +187,12 @@ class _Step:
         widths = np.array([p.scale if p.prior is None else p.prior[1] for p in parameters])
         evidence = log_bayes(own.T @ own, own.T @ self.left, widths) / floor**2
         nothing = np.zeros(len(fit.model.free))
-        return Member(
+        return Likeness(
             name, evidence, sums, np.zeros(0), np.zeros((0, 0)), nothing, np.zeros((len(nothing), 0)),
             np.zeros_like(self.laid.matrix),
         )  # fmt: skip
 
-    def candidates(self, told: float) -> Iterator[Member]:
+    def candidates(self, told: float) -> Iterator[Likeness]:
         """Candidates that are not improbable beside what was added, the most probable first."""
         state, design = self.laid.state, self.laid.design
         own = self.projector(design.jacobian[:, self.at])
@@ -215,7 +215,7 @@ class _Step:
                 column = design.stacked([state.columns[number[probe.name]]])
                 yield self._member(probe.name, evidence, sums, column, square, along_residual, probe.widths)
 
-    def in_other_kinds(self, member: Member) -> Member | None:
+    def in_other_kinds(self, member: Likeness) -> Likeness | None:
         """A member that is about exposures of one KIND, in all others instead; None for any other."""
         each = [_kinds_of(sentence) for one in member.sums for _, sentence in one]
         exposures, design = self.laid.fit.calset.exposures, self.laid.design
@@ -248,7 +248,7 @@ class _Step:
         square: Matrix,
         along: Vector,
         widths: Vector,
-    ) -> Member:
+    ) -> Likeness:
         laid = self.laid
         covariance = np.linalg.inv(square + np.diag(widths**-2.0))
         amplitudes = -covariance @ along
@@ -261,7 +261,7 @@ class _Step:
         vectors, added = added_to_starlight(laid.columns, sums, laid.usual)
         change = of_matrix(vectors, added @ amplitudes, laid.template.cameras.pairs)
         change = change.reshape(laid.matrix.shape) + laid.slopes @ values
-        return Member(name, evidence, sums, amplitudes, covariance, values, slopes, change)
+        return Likeness(name, evidence, sums, amplitudes, covariance, values, slopes, change)
 
     def _can_be_said(self, sums: Sequence[Sum]) -> bool:
         """True if a model can hold all sentences."""

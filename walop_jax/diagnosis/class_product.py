@@ -35,7 +35,7 @@ FAR = 3.0  # errors of the product that no plausible member may lie from an elem
 _SHOWN = 4  # members that are told in a sentence
 
 
-class Member(NamedTuple):
+class Likeness(NamedTuple):
     """One member of a class: its words, ln B against the model without what was added, its amplitudes in sentences.
 
     `values` is the change of the free parameters of the fit, where those of what was added become 0, `slopes` is that
@@ -63,7 +63,7 @@ class ClassOf(NamedTuple):
 
     added: str
     at: Int[np.ndarray, " a"]
-    members: tuple[Member, ...]
+    members: tuple[Likeness, ...]
     spread: float
     stated: float
     off: float

@@ -407,7 +407,7 @@ class Refit:
         return state, _and(dataclasses.replace(nameless, p_value=state.table.p_global), _LEFT_OUT)
 
     def _worse(self, first: Examination, last: Examination) -> str:
-        """What the final model predicts worse than the first, in words; empty: nothing."""
+        """Exposures that the final model predicts worse than the first, in words; empty: none."""
         if kinds := self._contradicted(first.design, last.design):
             return f"exposures of {kinds}, as all others predict them"
         before, after = (held_out(one.design, "exposures") for one in (first, last))

@@ -112,7 +112,7 @@ def _side(prefix: str) -> Factor:
 
     def value(at: Any, _: Units) -> Any:
         angle = at.angle(prefix)
-        xp = np if isinstance(angle, np.ndarray) else jnp
+        xp: Any = np if isinstance(angle, np.ndarray) else jnp
         hours = xp.broadcast_to(at.hours, angle.shape)
         order = xp.argsort(hours, axis=-1)
         turned = xp.diff(xp.take_along_axis(angle, order, axis=-1), axis=-1)
