@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from builders import NAN, exposures, monochromatic
 
-from walop_jax.calibration.calibration import Calibration, ListedModel
+from walop_jax.calibration.calibration import Product
 from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.calibration.product import write_calibration
 from walop_jax.data.calset import empty_sources
@@ -67,13 +66,6 @@ DIAGNOSIS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def listed(calibration: Calibration, **changes: Any) -> Calibration:
-    """A calibration with its model as a file holds it, with changes of that."""
-    c = calibration
-    model = ListedModel(c.fitted.name, c.fitted.parameters, c.maps, c.model_lines, c.description)
-    return dataclasses.replace(c, fitted=model._replace(**changes))
-
-
 def parameters(*rows: tuple[str, str, float, tuple[float, float] | None, bool]) -> tuple[Parameter, ...]:
     """Parameters typed by hand: name, unit, start, prior, free."""
     return tuple(
@@ -82,7 +74,7 @@ def parameters(*rows: tuple[str, str, float, tuple[float, float] | None, bool]) 
     )
 
 
-def product() -> Calibration:
+def product() -> Product:
     entries = SUMMARY["parameters"]
     sigma = np.array([entry["sigma"] for entry in entries.values()])
     priors = ((15.63, 0.05), (-0.23, 0.001), None, (0.0, 0.1), None)
@@ -93,8 +85,11 @@ def product() -> Calibration:
         (name, entry["unit"], NAN if prior is None else prior[0], prior, entry["sigma"] > 0)
         for (name, entry), prior in zip(entries.items(), priors, strict=True)
     ]
-    return Calibration(
-        fitted=ListedModel("WALOP-SOUTH", parameters(*rows), maps, ("[model]",)),
+    return Product(
+        instrument="WALOP-SOUTH",
+        parameters=parameters(*rows),
+        maps=maps,
+        model_lines=("[model]",),
         values=np.array([entry["value"] for entry in entries.values()]),
         site=Site("SAAO", -32.38, 20.81, 1798.0),
         origin="a hand",

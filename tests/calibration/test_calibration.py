@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from between_points import WORST, between_points
-from handmade_run import listed
 from science.truth import TrueInstrument, chance
 from small_run import WITH_PLATE, small_fit_with_plate
 
@@ -89,7 +88,7 @@ def test_what_was_read_is_written_again_byte_for_byte(calibration, product_file,
     write_calibration(tmp_path / "again.fits", back)
     assert (tmp_path / "again.fits").read_bytes() == product_file.read_bytes()
     anew = dataclasses.replace(back)
-    assert anew.model_lines == back.model_lines
+    assert anew.product.model_lines == back.product.model_lines
     np.testing.assert_allclose(anew.maps.values, back.maps.values, rtol=0, atol=1e-14)
     assert calibration.content_hash() == back.content_hash()
 
@@ -210,10 +209,11 @@ def test_effects_and_their_choices_survive_the_product(result, tmp_path):
 
 def test_parameters_of_a_product_go_by_name(calibration, tmp_path):
     """A product whose parameters stand in another order, as another version may have written it."""
-    parameters = calibration.fitted.parameters
+    parameters = calibration.parameters
     order = np.random.default_rng(2).permutation(len(parameters))
     shuffled = dataclasses.replace(
-        listed(calibration, parameters=tuple(parameters[i] for i in order)),
+        calibration.product,
+        parameters=tuple(parameters[i] for i in order),
         values=calibration.values[order],
         covariance=calibration.covariance[order][:, order],
     )
@@ -270,11 +270,12 @@ def test_quality_bits_follow_the_fit(result):
 
 
 def test_a_product_of_other_physics_is_refused(calibration):
-    first, *others = calibration.fitted.parameters
-    changed = listed(calibration, parameters=(dataclasses.replace(first, name="sky.colour"), *others))
+    first, *others = calibration.parameters
+    named = dataclasses.replace(first, name="sky.colour"), *others
+    changed = dataclasses.replace(calibration.product, parameters=named)
     with pytest.raises(DataError, match=r"sky\.colour"):
         changed.rebuilt()
-    twice = listed(calibration, parameters=(others[0], *others))
+    twice = dataclasses.replace(calibration.product, parameters=(others[0], *others))
     with pytest.raises(DataError, match=first.name):
         twice.rebuilt()
 

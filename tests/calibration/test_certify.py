@@ -7,9 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 from handmade_run import parameters
-from test_other_products import maps, product_of
+from test_other_products import product_of
 
-from walop_jax.calibration.calibration import ListedModel
 from walop_jax.calibration.certify import certify
 from walop_jax.data.calset import read_calibration_set
 
@@ -32,7 +31,7 @@ def checked(two_cameras):
         covariance[0, 2] = covariance[2, 0] = r * first * 0.5
         product = dataclasses.replace(
             product_of(calset, 2, {}),
-            fitted=ListedModel(calset.instrument, three, maps(2, {}), ("[model]",)),
+            parameters=three,
             values=np.array([0.5, 1.0, 0.25]),
             covariance=covariance,
         )

@@ -12,9 +12,9 @@ from handmade_run import parameters
 from same_record import assert_same
 
 import walop_jax.calibration.product
-from walop_jax.calibration.calibration import Calibration, ListedModel
+from walop_jax.calibration.calibration import Product
 from walop_jax.calibration.matrix import MatrixMaps
-from walop_jax.calibration.product import read_calibration, write_calibration
+from walop_jax.calibration.product import read_product, write_calibration
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import Position
@@ -80,7 +80,7 @@ TOLD = (*HEADS, *(f"{GROWS.get(factor, 'retardance q behind half1.plate')} * {fa
 
 
 @pytest.fixture
-def product(handmade) -> Calibration:
+def product(handmade) -> Product:
     calset = read_calibration_set(handmade.write())
     rng = np.random.default_rng(5)
     root = rng.standard_normal((3, 3)) * 1e-3
@@ -93,8 +93,11 @@ def product(handmade) -> Calibration:
     )
     maps = MatrixMaps(grid, "SDSS-r", rng.random((6, 3, 4)), rng.random((6, 3, 4)))
     lines = ("[model]", 'instrument = "WALOP-SOUTH"', "# a comment")
-    return Calibration(
-        fitted=ListedModel(calset.instrument, three, maps, lines),
+    return Product(
+        instrument=calset.instrument,
+        parameters=three,
+        maps=maps,
+        model_lines=lines,
         values=np.array([15.63, 1.0 / 3.0, 0.5]),
         site=calset.site,
         origin=calset.origin,
@@ -134,22 +137,25 @@ def test_parameters_of_every_description_come_back(product, tmp_path):
     assert len(set(names)) == len(TOLD)
     n = len(names)
     path, lines = tmp_path / "found.fits", tuple(map(in_ascii, render(model).splitlines()))
-    described = product.fitted._replace(parameters=tuple(model[name] for name in names), lines=lines)
-    found = dataclasses.replace(product, fitted=described, values=np.arange(n) / 7.0, covariance=np.eye(n))
+    found = dataclasses.replace(
+        product,
+        parameters=tuple(model[name] for name in names),
+        model_lines=lines,
+        values=np.arange(n) / 7.0,
+        covariance=np.eye(n),
+    )
     write_calibration(path, found)
-    again = read_calibration(path, rebuild=False)
-    assert list(again.fitted.names) == names
+    again = read_product(path)
+    assert list(again.names) == names
     carried = model_without_data("WALOP-SOUTH", "\n".join(again.model_lines), standards=STARS)
     assert carried.names == model.names
     assert carried.start == pytest.approx(model.start)
 
 
 def test_a_name_that_could_not_be_read_is_not_written(product, tmp_path):
-    first, second, third = product.fitted.parameters
-    named = product.fitted._replace(
-        parameters=(first, dataclasses.replace(second, name="collimator q"), third)
-    )
-    odd = dataclasses.replace(product, fitted=named)
+    first, second, third = product.parameters
+    named = first, dataclasses.replace(second, name="collimator q"), third
+    odd = dataclasses.replace(product, parameters=named)
     with pytest.raises(DataError, match="'collimator q' is not a parameter name"):
         write_calibration(tmp_path / "odd.fits", odd)
 
@@ -160,7 +166,7 @@ def assert_equal(one, other):
 
 
 def test_round_trip_is_exact(product, path):
-    back = read_calibration(path, rebuild=False)
+    back = read_product(path)
     assert_equal(product, back)
     assert back.content_hash() == product.content_hash()
 
@@ -186,7 +192,7 @@ def test_no_sources_no_warnings_no_inputs(product, tmp_path):
     verdict = dataclasses.replace(product.verdict, against=bits)
     bare = dataclasses.replace(product, verdict=verdict, inputs=())
     write_calibration(tmp_path / "bare.fits", bare)
-    assert_equal(bare, read_calibration(tmp_path / "bare.fits", rebuild=False))
+    assert_equal(bare, read_product(tmp_path / "bare.fits"))
 
 
 def test_the_hash_is_of_the_content(product):
@@ -245,26 +251,26 @@ def rewrite(path, change):
 def test_what_is_not_as_written_is_refused(path, change, message):
     rewrite(path, change)
     with pytest.raises(DataError, match=message) as caught:
-        read_calibration(path, rebuild=False)
+        read_product(path)
     assert str(path) in str(caught.value)
 
 
 def test_a_calibration_set_is_not_a_product(handmade):
     with pytest.raises(DataError, match="walop-jax refit"):
-        read_calibration(handmade.write(), rebuild=False)
+        read_product(handmade.write())
 
 
 def test_missing_truncated_and_alien_files(path, tmp_path):
     with pytest.raises(DataError, match="no such file"):
-        read_calibration(tmp_path / "none.fits", rebuild=False)
+        read_product(tmp_path / "none.fits")
     whole = path.read_bytes()
     for length in (0, 100, 2880, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:length])
         with pytest.raises(DataError):
-            read_calibration(path, rebuild=False)
+            read_product(path)
     path.write_text("not FITS at all")
     with pytest.raises(DataError, match="FITS"):
-        read_calibration(path, rebuild=False)
+        read_product(path)
 
 
 def test_flipped_bytes_never_change_the_answer(product, path):
@@ -275,7 +281,7 @@ def test_flipped_bytes_never_change_the_answer(product, path):
         broken[place] ^= int(rng.integers(1, 256))
         path.write_bytes(bytes(broken))
         try:
-            back = read_calibration(path, rebuild=False)
+            back = read_product(path)
         except DataError:
             continue
         assert back.content_hash() == product.content_hash()
@@ -301,7 +307,7 @@ def test_inputs_with_foreign_letters(product, tmp_path):
     entry = dataclasses.replace(product.inputs[0], path=tmp_path / "Säugling Ω.fits")
     write_calibration(tmp_path / "p.fits", dataclasses.replace(product, inputs=(entry,)))
     shutil.move(tmp_path / "p.fits", tmp_path / "Straße.fits")
-    assert "S\\xe4ugling" in str(read_calibration(tmp_path / "Straße.fits", rebuild=False).inputs[0].path)
+    assert "S\\xe4ugling" in str(read_product(tmp_path / "Straße.fits").inputs[0].path)
 
 
 def test_shapes_are_checked(product):

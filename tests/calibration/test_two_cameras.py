@@ -116,7 +116,7 @@ def calibration(model) -> Calibration:
     )  # fmt: skip
     verdict = Verdict(1.0, 1, 16, 1.0, converged=True)
     return Calibration(
-        fitted=model,
+        model=model,
         values=np.asarray(values_of(model.template)),
         covariance=np.diag(sigma**2),
         verdict=verdict,

@@ -13,8 +13,8 @@ from astropy.io import fits
 from astropy.table import Table
 
 import walop_jax as walop
-from walop_jax.calibration.matrix import p_errors, sample_stars
-from walop_jax.calibration.product import read_calibration
+from walop_jax.calibration.accuracy import p_errors, sample_stars
+from walop_jax.calibration.product import read_calibration, read_product
 from walop_jax.data.settings import Settings
 
 SUMMARY_KEYS = (
@@ -41,8 +41,8 @@ def test_refit_writes_product_and_summary(run, calset_file):
     assert summary["converged"] is True
     assert summary["trusted"] is True
     assert 0.8 < summary["chi2"] / summary["dof"] < 1.2
-    product = read_calibration(run / "calibration.fits", rebuild=False)
-    assert list(summary["parameters"]) == list(product.fitted.names)
+    product = read_product(run / "calibration.fits")
+    assert list(summary["parameters"]) == list(product.names)
     entry = summary["parameters"]["half1.plate.quartz"]
     assert entry["unit"] == "um"
     assert abs(entry["value"] - 2407.0) < 5 * entry["sigma"] + 5
@@ -76,7 +76,7 @@ def test_a_misfit_is_written_but_not_trusted(call, spoilt_file, tmp_path):
     assert "not trusted\n" in result.stdout
     assert "does not explain the data" in result.stderr
     assert "disagreement in the matrix" in result.stderr
-    product = read_calibration(tmp_path / "run" / "calibration.fits", rebuild=False)
+    product = read_product(tmp_path / "run" / "calibration.fits")
     assert not product.verdict.trusted
     assert product.verdict.converged
     assert product.verdict.quality & 8192
@@ -167,7 +167,7 @@ def test_matrix_adds_columns(call, run, tmp_path, suffix):
     assert table.colnames[:6] == ["ID", "X", "Y", "TEFF", "CHWP_IN", "CHWP_ANGLE"]
     names = ["M21", "M22", "M23", "M31", "M32", "M33"]
     assert table.colnames[6:] == [*names, *(f"{name}_ERR" for name in names), "P_ERR", "FLAG"]
-    calibration = read_calibration(run / "calibration.fits", rebuild=False).rebuilt()
+    calibration = read_calibration(run / "calibration.fits")
     settings = dataclasses.replace(
         Settings.default(20).at(CHWP=np.where(np.arange(20) % 3 == 0, 45.0, np.nan)),
         teff=np.where(np.arange(20) % 2, 5772.0, np.nan),
@@ -182,7 +182,7 @@ def test_matrix_adds_columns(call, run, tmp_path, suffix):
 def test_matrix_behind_a_plate_that_stands_in_the_beam(call, run, tmp_path):
     """One point on the command line, in Python, and a table: the plate at 45° turns q into −q."""
     place = ("--x", 0.1, "--y", -0.05, "--teff", 5772)
-    known = read_calibration(run / "calibration.fits", rebuild=False).rebuilt()
+    known = read_calibration(run / "calibration.fits")
     sun = dataclasses.replace(Settings.default(1).at(CHWP=45.0), teff=np.array([5772.0]))
     expected = known.matrix(np.array([0.1]), np.array([-0.05]), sun)[0][0]
     found = json.loads(call("matrix", run, *place, "--at", "CHWP=45", "--json").stdout)["matrix"]

@@ -14,7 +14,7 @@ from astropy.io import fits
 from frames_file import write_frames
 
 from walop_jax.calibration.matrix import residual_names
-from walop_jax.calibration.product import read_calibration, write_calibration
+from walop_jax.calibration.product import read_product, write_calibration
 from walop_jax.data.frames import Grid
 from walop_jax.likelihood import limits
 from walop_jax.reports import figures
@@ -60,7 +60,7 @@ def test_the_calibration_carries_a_residual_map(finished):
     folder, summary = finished
     assert sorted(entry.name for entry in folder.iterdir()) == ["calibration.fits", "summary.json"]
     assert summary["converged"]
-    residuals = read_calibration(folder / "calibration.fits", rebuild=False).residuals
+    residuals = read_product(folder / "calibration.fits").residuals
     assert summary["residual_map"]["cells"] == [9, 9]
     assert residuals.values.shape == (len(residual_names(2)), 9, 9)
     # Nothing is hidden in this set.
@@ -80,7 +80,7 @@ def test_the_calibration_carries_a_residual_map(finished):
 
 @pytest.mark.long
 def test_the_map_stays_with_the_calibration(finished, tmp_path):
-    product = read_calibration(finished[0] / "calibration.fits", rebuild=False)
+    product = read_product(finished[0] / "calibration.fits")
     again = product.rebuilt()
     assert again.content_hash() == product.content_hash()
     # A copy forgets how the file held it: its maps are computed anew, by a program that came another way.
@@ -88,7 +88,7 @@ def test_the_map_stays_with_the_calibration(finished, tmp_path):
     np.testing.assert_allclose(fresh.values, product.maps.values, rtol=0, atol=1e-14)
     np.testing.assert_allclose(fresh.errors, product.maps.errors, rtol=1e-9, atol=0)
     write_calibration(tmp_path / "copy.fits", again)
-    copy = read_calibration(tmp_path / "copy.fits", rebuild=False)
+    copy = read_product(tmp_path / "copy.fits")
     assert copy.content_hash() == again.content_hash()
     np.testing.assert_array_equal(copy.residuals.values, product.residuals.values)
     figure = figures.residual_map_figure(product.residuals, ("O1", "E1", "O2", "E2"))

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from handmade_run import listed
 
 import walop_jax as walop
-from walop_jax.calibration.product import read_calibration, write_calibration
+from walop_jax.calibration.product import read_product, write_calibration
 from walop_jax.data.settings import Settings, builtin_filter
 from walop_jax.io.errors import DataError
 from walop_jax.model.trace import Sightline, trace
@@ -20,9 +19,9 @@ from .conftest import FittedSet
 
 
 def test_a_certificate_fails_closed(fitted: FittedSet, tmp_path: Path):
-    product = read_calibration(fitted.run / "calibration.fits", rebuild=False)
+    product = read_product(fitted.run / "calibration.fits")
     changed = dataclasses.replace(product.maps, values=product.maps.values + 1e-3)
-    write_calibration(tmp_path / "c.fits", listed(product, maps=changed))
+    write_calibration(tmp_path / "c.fits", dataclasses.replace(product, maps=changed))
     found = walop.certify(tmp_path / "c.fits")
     assert [check.name for check in found.failed] == ["maps"]
     assert found.document()["valid"] is False

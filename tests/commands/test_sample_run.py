@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from walop_jax.calibration.product import read_calibration
+from walop_jax.calibration.product import read_product
 from walop_jax.commands.refit import refit
 from walop_jax.commands.sample import OUTPUTS, sample
 from walop_jax.fit.refit import FitResult, covariance
@@ -51,7 +51,7 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_been(
         sample(caller, **OPTIONS)
     found = sample(caller, **OPTIONS, resume=True)
     assert not found.trusted
-    assert read_calibration(caller / "calibration.fits", rebuild=False).verdict.covariance_from == "fit"
+    assert read_product(caller / "calibration.fits").verdict.covariance_from == "fit"
     assert_same_files(command, caller, but=("sampling", "summary.json"))
 
     with pytest.raises(DataError, match=r"holds posterior\.nc already"):
@@ -71,7 +71,7 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_been(
     assert {name: (caller / name).read_bytes() for name in before} == before
     found = sample(caller, **more, resume=True)
     assert found.trusted
-    product = read_calibration(caller / "calibration.fits", rebuild=False)
+    product = read_product(caller / "calibration.fits")
     assert product.verdict.covariance_from == "posterior"
     np.testing.assert_array_equal(product.covariance, found.covariance)
 
@@ -79,11 +79,11 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_been(
 @pytest.mark.long
 def test_a_posterior_has_the_errors_of_a_fit_that_leaves_too_much(spoilt_file: Path, tmp_path: Path):
     refit(spoilt_file, output=tmp_path / "RUN")
-    before = read_calibration(tmp_path / "RUN" / "calibration.fits", rebuild=False)
+    before = read_product(tmp_path / "RUN" / "calibration.fits")
     assert before.verdict.errors_from.startswith("residuals")
     found = sample(tmp_path / "RUN", **(OPTIONS | {"maximum_steps": 100_000}))
     assert found.trusted
-    after = read_calibration(tmp_path / "RUN" / "calibration.fits", rebuild=False)
+    after = read_product(tmp_path / "RUN" / "calibration.fits")
     assert after.verdict.errors_from == before.verdict.errors_from == found.errors_from
     free = before.sigma > 0
     ratio = after.sigma[free] / before.sigma[free]

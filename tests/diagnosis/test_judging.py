@@ -9,7 +9,7 @@ from matrix_at import matrix_at
 from scenes import PLAN
 from scipy import integrate, stats
 
-from walop_jax.calibration.matrix import largest_change
+from walop_jax.calibration.accuracy import largest_change
 from walop_jax.data.records import Position
 from walop_jax.diagnosis import search, workflow
 from walop_jax.diagnosis.design import Design, Measured, strata

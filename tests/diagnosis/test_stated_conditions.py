@@ -12,8 +12,9 @@ from quick import quick
 from scipy import stats
 from small_run import SEED, SMALL, small_fit, small_fit_with_plate
 
+from walop_jax.calibration.accuracy import change_of_qu
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import change_of_qu, first_setting, matrix_slopes
+from walop_jax.calibration.matrix import first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import stated_conditions as conditions

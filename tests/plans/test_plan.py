@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from walop_jax.calibration.accuracy import p_errors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import matrix_slopes, sample_stars
+from walop_jax.calibration.matrix import matrix_slopes
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import in_memory
 from walop_jax.diagnosis.trust import examined
@@ -24,7 +25,6 @@ from walop_jax.plans.exposures import Illumination, candidates
 from walop_jax.plans.plan import plan_from
 from walop_jax.plans.wanted import FieldErrors, field_errors, wanted
 from walop_jax.reports.page import kind_of_run, render_other
-from walop_jax.science.field_accuracy import p_errors
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, plan_text, read_plan
 from walop_jax.simulation.simulate import PhotonNoise, effect_from_text, simulate
 
@@ -64,7 +64,7 @@ def test_the_promise_is_the_error_of_a_fit(small, field):
     total += families[2].basis[0, [1, 1, 0]].sum(axis=0)
     promised = field.error(np.linalg.pinv(total, rcond=1e-14, hermitian=True)[None])[0]
     matrix, covariance = calibration.matrix(field.x, field.y)
-    found = p_errors(matrix, covariance, sample_stars())
+    found = p_errors(matrix, covariance)
     seen = np.isfinite(promised)
     assert 0.5 < seen.mean() < 1.0
     np.testing.assert_allclose(promised[seen], found[seen], rtol=0.02)

@@ -75,7 +75,7 @@ def test_it_is_no_go_and_not_fit_for_use(product):
     assert not found.go
     assert "telescope_polarisation.q" in found.missing[0]
     assert "standards" in found.missing[0]
-    (failed,) = [check for check in certify(product) if not check.passed and check.name != "parents"]
+    (failed,) = [check for check in certify(product.product) if not check.passed and check.name != "parents"]
     assert failed.name == "measured"
     assert "telescope_polarisation" in failed.found
 

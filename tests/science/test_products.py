@@ -8,7 +8,6 @@ import json
 import numpy as np
 import pytest
 from astropy.io import fits
-from handmade_run import listed
 from scipy import stats
 from small_run import SMALL
 from typer.testing import CliRunner
@@ -47,7 +46,7 @@ def product(first, tmp_path_factory):
 
     path = tmp_path_factory.mktemp("sets") / "first.fits"
     write_calibration_set(path, simulate(SMALL, seed=5).calset)
-    return listed(calibrate(read_calibration_set(path)))
+    return calibrate(read_calibration_set(path)).product
 
 
 def failed(product):
@@ -83,10 +82,10 @@ def test_what_is_wrong_is_named(product):
     assert "validity" in failed(changed(exposures=exposures))
     assert failed(changed(inputs=())) == ["parents"]
     maps = dataclasses.replace(product.maps, values=product.maps.values + 1e-5)
-    assert failed(listed(product, maps=maps)) == ["maps"]
-    assert failed(listed(product, lines=("[model]", 'effects = ["no_such"]'))) == ["model"]
+    assert failed(changed(maps=maps)) == ["maps"]
+    assert failed(changed(model_lines=("[model]", 'effects = ["no_such"]'))) == ["model"]
     values = product.values.copy()
-    values[product.fitted.names.index("half1.efficiency")] = 1.2  # analyses more light than there is
+    values[product.names.index("half1.efficiency")] = 1.2  # analyses more light than there is
     assert "physics" in failed(changed(values=values))
 
 

@@ -40,9 +40,9 @@ from astropy.table import Table  # noqa: E402
 from handmade_run import parameters  # noqa: E402
 from handmade_set import Handmade  # noqa: E402
 
-from walop_jax.calibration.calibration import Calibration, ListedModel  # noqa: E402
+from walop_jax.calibration.calibration import Product  # noqa: E402
 from walop_jax.calibration.matrix import MatrixMaps  # noqa: E402
-from walop_jax.calibration.product import read_calibration, write_calibration  # noqa: E402
+from walop_jax.calibration.product import read_product, write_calibration  # noqa: E402
 from walop_jax.data.calset import read_calibration_set  # noqa: E402
 from walop_jax.data.frames import Grid  # noqa: E402
 from walop_jax.data.user_tables import read_input_table  # noqa: E402
@@ -117,7 +117,7 @@ def _read_set(path: Path) -> Answer:
 
 
 def _read_product(path: Path) -> Answer:
-    product = read_calibration(path, rebuild=False)
+    product = read_product(path)
     return Answer(digest(dataclasses.replace(product, inputs=(), path=None)))
 
 
@@ -136,8 +136,11 @@ def _product(folder: Path) -> bytes:
         ("throughput.n0.p00", "", 0.5, None, False),
     )
     maps = MatrixMaps(grid, "SDSS-r", rng.random((6, 3, 4)), rng.random((6, 3, 4)))
-    product = Calibration(
-        fitted=ListedModel(calset.instrument, three, maps, ("[model]", 'instrument = "WALOP-SOUTH"')),
+    product = Product(
+        instrument=calset.instrument,
+        parameters=three,
+        maps=maps,
+        model_lines=("[model]", 'instrument = "WALOP-SOUTH"'),
         values=np.array([15.63, 1.0 / 3.0, 0.5]), site=calset.site, origin="by hand", date="2026-11-21T10:00:00",
         verdict=Verdict(3e4, 33000, 44000, 1.0, True),
         covariance=root @ root.T,

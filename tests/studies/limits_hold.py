@@ -29,7 +29,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 from matrix_at import matrix_at  # noqa: E402
 from score_draws import alarms, noise_scores  # noqa: E402
 
-from walop_jax.calibration.matrix import change_of_qu  # noqa: E402
+from walop_jax.calibration.accuracy import change_of_qu  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
 from walop_jax.diagnosis import candidates  # noqa: E402
 from walop_jax.diagnosis.candidates import Probe, probes  # noqa: E402

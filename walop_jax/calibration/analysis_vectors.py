@@ -17,25 +17,20 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import acting_effects, acts_in, turn_of, with_effect
-from walop_jax.calibration.matrix import in_chunks, sky_vectors
+from walop_jax.calibration.matrix import sky_vectors, vector_slopes
 from walop_jax.data.settings import Settings
-from walop_jax.likelihood import optics
 from walop_jax.likelihood.field_table import FieldTable, accurate_table, held_out
-from walop_jax.likelihood.optics import linearised, plain_positions, through_series
-from walop_jax.model import chebyshev, light
+from walop_jax.likelihood.optics import plain_positions, through_series
+from walop_jax.model import chebyshev
 from walop_jax.model.chebyshev import Rectangle
-from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import Effect
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import series_indices
@@ -73,23 +68,6 @@ class Local(NamedTuple):
 
     plain: Float[np.ndarray, "p k 3 o"]
     throughput: Float[np.ndarray, "p k 3 k"]
-
-
-def _derivatives(
-    instrument: Instrument, plan: Plan, x: Float[Array, ""], y: Float[Array, ""]
-) -> Float[Array, "d b k 3"]:
-    """Derivatives to the plain parameters, then to the local throughputs."""
-    to_instrument = with_values(instrument)
-
-    def vectors(values: Float[Array, " n"], local: Float[Array, " k"]) -> Float[Array, "b k 3"]:
-        there, rows = to_instrument(values), optics.band_rows(values, instrument, plan, x, y)
-        return (light.camera_vectors(there, rows, local, x, y) @ light.telescope(there, x, y))[..., :3]
-
-    found = linearised(instrument, vectors, instrument.throughput.at(x, y))
-    return jnp.concatenate([found.plain, found.local])
-
-
-_derivatives_at = compiled(jax.vmap(_derivatives, in_axes=(None, None, 0, 0)))
 
 
 class AnalysisVectors:
@@ -267,7 +245,7 @@ class AnalysisVectors:
 
         def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
             """Derivatives in the order point, (colour, camera, Stokes, parameter)."""
-            (values,) = in_chunks(lambda a, b: (_derivatives_at(self.instrument, plan, a, b),), x, y)
+            values = vector_slopes(self.instrument, plan, x, y)
             return np.moveaxis(values[:, wanted][:, :, bands], 1, -1).reshape(len(x), -1)
 
         def error(found: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p f"]) -> float:

@@ -11,11 +11,12 @@ import functools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from walop_jax.calibration.accuracy import p_errors
 from walop_jax.calibration.could_hide import hidden_errors
 from walop_jax.calibration.matrix import (
     MatrixMaps,
@@ -24,9 +25,7 @@ from walop_jax.calibration.matrix import (
     matrix_draws,
     matrix_names,
     of_structure,
-    p_errors,
     planned_matrices,
-    sample_stars,
     slopes_over_field,
 )
 from walop_jax.data.frames import Grid
@@ -74,46 +73,15 @@ def now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", "")
 
 
-class ListedModel(NamedTuple):
-    """The model of a calibration as its file holds it, not rebuilt: parameters, and what follows from the model.
+@dataclasses.dataclass(frozen=True, repr=False, kw_only=True)
+class Contents:
+    """Contents of a calibration, in memory or in a file: values and covariance of all parameters, and their origin.
 
-    `name` is that of the instrument; `maps` are of the matrix; `lines` those of the model file of the fit,
-    `description` those of the description of an instrument that does not come with the package; `catalogue` are the
-    effects that the model may have.
+    `field` is (smallest x, largest x, smallest y, largest y) in degrees of the points that were used. `residuals` are
+    those of the model over the field, `hidden` are mistakes that would not have been detected; `date` is UTC,
+    `versions` name the software.
     """
 
-    name: str
-    parameters: tuple[Parameter, ...]
-    maps: MatrixMaps
-    lines: tuple[str, ...]
-    description: tuple[str, ...] = ()
-    catalogue: tuple[type[Effect], ...] = EFFECTS
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return tuple(p.name for p in self.parameters)
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class Calibration(Fitted):
-    """An instrument as fitted: model, values and covariance of all parameters, and where they come from.
-
-    `field` is (smallest x, largest x, smallest y, largest y) in degrees of the points that were used. `residuals` is
-    what the model leaves over the field, `hidden` are mistakes that would not have been found; `date` is UTC,
-    `versions` name the software. With `draws` of a posterior, matrices and their covariance are means over these
-    instead of the linear propagation of `covariance`.
-
-    `fitted` is the model, a `ListedModel` where it was not rebuilt from its file (`rebuilt`). `listed` is how the file
-    held a model that was rebuilt, `content` its content hash; `dataclasses.replace` forgets both, and maps, texts and
-    hash are made anew. Raises ValueError for shapes that do not belong together.
-
-    >>> m, covariance = walop.Calibration.from_fit(result).matrix(0.1, -0.05)
-    >>> m.shape, covariance.shape
-    ((6,), (6, 6))
-    """
-
-    fitted: Model | ListedModel
     values: Vector
     covariance: Matrix
     verdict: Verdict
@@ -128,22 +96,133 @@ class Calibration(Fitted):
     hidden: Hidden | None = None
     date: str = dataclasses.field(default_factory=now)
     versions: Mapping[str, str] = dataclasses.field(default_factory=software_versions)
-    draws: Float[np.ndarray, "d n"] | None = None
     path: Path | None = None
-    listed: dataclasses.InitVar[ListedModel | None] = None
+
+    @property
+    def sigma(self) -> Vector:
+        """Standard errors of all parameters."""
+        return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences if the calibration is not to be trusted, not checked, or lacks something that matters to stars."""
+        where = "" if self.path is None else f"{self.path}: "
+        if self.verdict.trusted:
+            unchecked = (UNCHECKED,) if UNCHECKED in self.verdict.warnings else ()
+            unseen = () if self.hidden is None else self.hidden.not_measured()
+            unmeasured = (NOT_MEASURED.format("; ".join(unseen)),) if unseen else ()
+            return tuple(f"{where}{sentence}" for sentence in (*unchecked, *unmeasured))
+        why = "; ".join(self.verdict.warnings) or "see WARNINGS"
+        return (f"{where}this calibration is not trusted: {why}",)
+
+
+def _contents(of: Contents) -> dict[str, Any]:
+    return {entry.name: getattr(of, entry.name) for entry in dataclasses.fields(Contents)}
+
+
+@dataclasses.dataclass(frozen=True, repr=False, kw_only=True)
+class Product(Contents):
+    """Contents of `calibration.fits`: the model as a list of parameters and texts, and maps of its matrix.
+
+    `instrument` is a name, `model_lines` are those of the model file of the fit, `description` those of the description
+    of an instrument that does not come with the package. `content` is the content hash of the file that it was read
+    from, which `dataclasses.replace` forgets. Raises ValueError for shapes that do not belong together.
+    """
+
+    instrument: str
+    parameters: tuple[Parameter, ...]
+    maps: MatrixMaps
+    model_lines: tuple[str, ...]
+    description: tuple[str, ...] = ()
     content: dataclasses.InitVar[str] = ""
 
-    def __post_init__(self, listed: ListedModel | None, content: str) -> None:
-        vars(self)["_content"] = content
-        n = len(self.fitted.parameters)
-        if self.covariance.shape != (n, n):
-            raise ValueError(f"covariance has shape {self.covariance.shape}, there are {n} parameters")
-        held = self.fitted if isinstance(self.fitted, ListedModel) else listed
-        if held is None:
-            return
-        vars(self).update(maps=held.maps, model_lines=held.lines, description=held.description)
-        if self.residuals is not None and self.residuals.arms != held.maps.arms:
-            raise ValueError(f"a residual map of {self.residuals.arms} arms, the matrix has {held.maps.arms}")
+    def __post_init__(self, content: str) -> None:
+        _check_shape(self.covariance, self.parameters)
+        if self.residuals is not None and self.residuals.arms != self.maps.arms:
+            raise ValueError(f"a residual map of {self.residuals.arms} arms, the matrix has {self.maps.arms}")
+        object.__setattr__(self, "_content", content)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def design(self) -> Instrument:
+        """The instrument as designed: from the description in the file, or the one that comes with the package.
+
+        Its kinds of elements are those of the package and those that this process has defined. Raises `DataError`, with
+        the class that is missing, for another kind.
+        """
+        if not self.description:
+            return nominal_instrument(self.instrument)
+        name = f"the description of {self.instrument} in the product"
+        return build(parsed("\n".join(self.description), name), elements=defined_elements())
+
+    def rebuilt(self, catalogue: tuple[type[Effect], ...] = EFFECTS) -> Calibration:
+        """The calibration, its model rebuilt from `model_lines`; parameters go by name.
+
+        `catalogue` are the effects that the model may have. Raises ValueError if it cannot be rebuilt, or has other
+        parameters than the file lists.
+        """
+        sources, names = self.sources, self.names
+        standards = list(zip(standard_names(sources), sources.q.tolist(), sources.u.tolist(), strict=True))
+        context = effect_context(adapted(self.design, standards=standards), self.exposures)
+        text = "\n".join(self.model_lines)
+        model = model_without_data(
+            self.design, text, standards=standards, context=context, catalogue=catalogue
+        )
+        if sorted(model.names) != sorted(names):
+            odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]
+            raise DataError(
+                f"the model of the product has other parameters than it lists ({', '.join(odd[:3])}): it was "
+                "made by a version with other physics; fit again"
+            )
+        order = np.array([names.index(name) for name in model.names])
+        contents: dict[str, Any] = _contents(self) | {
+            "values": self.values[order],
+            "covariance": self.covariance[np.ix_(order, order)],
+        }
+        if self.hidden is not None:
+            contents["hidden"] = dataclasses.replace(self.hidden, changes=self.hidden.changes[:, order])
+        return Calibration(model=model, file=self, **contents)
+
+    def content_hash(self) -> str:
+        """The content hash of the file that it was read from, or of the one that it would be written as.
+
+        SHA-256 of all that a calibration says of the instrument: not of dates, paths and versions.
+        """
+        from walop_jax.calibration.product import content_of, hdus_of
+
+        return vars(self)["_content"] or content_of(hdus_of(self, self.path))
+
+
+def _check_shape(covariance: Matrix, parameters: Sequence[Parameter]) -> None:
+    n = len(parameters)
+    if covariance.shape != (n, n):
+        raise ValueError(f"covariance has shape {covariance.shape}, there are {n} parameters")
+
+
+@dataclasses.dataclass(frozen=True, repr=False, kw_only=True)
+class Calibration(Contents, Fitted):
+    """An instrument as fitted: model, values and covariance of all parameters, and where they come from.
+
+    With `draws` of a posterior, matrices and their covariance are means over these instead of the linear propagation of
+    `covariance`. `file` is the product that it was read from: maps and texts are those of its file, until
+    `dataclasses.replace`, which forgets it. Raises ValueError for shapes that do not belong together.
+
+    >>> m, covariance = walop.Calibration.from_fit(result).matrix(0.1, -0.05)
+    >>> m.shape, covariance.shape
+    ((6,), (6, 6))
+    """
+
+    model: Model
+    draws: Float[np.ndarray, "d n"] | None = None
+    file: dataclasses.InitVar[Product | None] = None
+
+    def __post_init__(self, file: Product | None) -> None:
+        _check_shape(self.covariance, self.model.parameters)
+        object.__setattr__(self, "_file", file)
 
     @classmethod
     def from_fit(cls, result: FitResult, residuals: ResidualMap | None = None) -> Calibration:
@@ -154,7 +233,7 @@ class Calibration(Fitted):
         """
         calset = result.calset
         return cls(
-            fitted=result.model,
+            model=result.model,
             values=result.values,
             covariance=0.5 * (result.covariance + result.covariance.T),
             verdict=result.checked_verdict(),
@@ -169,39 +248,6 @@ class Calibration(Fitted):
             hidden=result.hidden,
         )
 
-    def rebuilt(self) -> Calibration:
-        """The calibration with its model rebuilt from the lines of its file; parameters go by name.
-
-        Raises ValueError if it cannot be rebuilt, or has other parameters than the file lists.
-        """
-        if isinstance(self.fitted, Model):
-            return self
-        sources, names = self.sources, self.fitted.names
-        standards = list(zip(standard_names(sources), sources.q.tolist(), sources.u.tolist(), strict=True))
-        context = effect_context(adapted(self.design, standards=standards), self.exposures)
-        text = "\n".join(self.model_lines)
-        model = model_without_data(
-            self.design, text, standards=standards, context=context, catalogue=self.fitted.catalogue
-        )
-        if sorted(model.names) != sorted(names):
-            odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]
-            raise DataError(
-                f"the model of the product has other parameters than it lists ({', '.join(odd[:3])}): it was "
-                "made by a version with other physics; fit again"
-            )
-        order, hidden = np.array([names.index(name) for name in model.names]), self.hidden
-        return dataclasses.replace(
-            self,
-            fitted=model,
-            values=self.values[order],
-            covariance=self.covariance[np.ix_(order, order)],
-            hidden=hidden
-            if hidden is None
-            else dataclasses.replace(hidden, changes=hidden.changes[:, order]),
-            listed=self.fitted,
-            content=self.content_hash(),
-        )
-
     def with_covariance(self, covariance: Matrix, errors_from: str) -> Calibration:
         """The calibration with the covariance of a posterior, made of errors from `errors_from`, as made now."""
         verdict = dataclasses.replace(self.verdict, covariance_from="posterior", errors_from=errors_from)
@@ -212,57 +258,17 @@ class Calibration(Fitted):
     @property
     def instrument(self) -> str:
         """Name of the instrument."""
-        return self.fitted.name
+        return self.model.name
 
     @property
-    def model(self) -> Model:
-        """The model; RuntimeError where it was not rebuilt."""
-        if not isinstance(self.fitted, Model):
-            raise RuntimeError(
-                "the model of this calibration was not rebuilt: ask the one that `rebuilt` returns"
-            )
-        return self.fitted
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parameters of the model."""
+        return self.model.parameters
 
     @property
     def design(self) -> Instrument:
-        """The instrument as designed: from the description in the file, or the one that comes with the package.
-
-        Its kinds of elements are those of the package and those that this process has defined. Raises `DataError`, with
-        the class that is missing, for another kind.
-        """
-        if isinstance(self.fitted, Model):
-            return self.fitted.template
-        if not self.description:
-            return nominal_instrument(self.fitted.name)
-        name = f"the description of {self.fitted.name} in the product"
-        return build(parsed("\n".join(self.description), name), elements=defined_elements())
-
-    @functools.cached_property
-    def model_lines(self) -> tuple[str, ...]:
-        """The model file of the fit, line by line in ASCII."""
-        return _lines(render(self.model))
-
-    @functools.cached_property
-    def description(self) -> tuple[str, ...]:
-        """The description file of an instrument that does not come with the package, line by line in ASCII."""
-        return _lines(self.model.template.description)
-
-    @property
-    def prior_width(self) -> dict[str, float]:
-        """Standard deviations of the priors by parameter, NaN where there is none."""
-        return {p.name: np.nan if p.prior is None else p.prior[1] for p in self.fitted.parameters}
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Sentences if the calibration is not to be trusted, not checked, or lacks something that matters to stars."""
-        where = "" if self.path is None else f"{self.path}: "
-        if self.verdict.trusted:
-            unchecked = (UNCHECKED,) if UNCHECKED in self.verdict.warnings else ()
-            unseen = () if self.hidden is None else self.hidden.not_measured()
-            unmeasured = (NOT_MEASURED.format("; ".join(unseen)),) if unseen else ()
-            return tuple(f"{where}{sentence}" for sentence in (*unchecked, *unmeasured))
-        why = "; ".join(self.verdict.warnings) or "see WARNINGS"
-        return (f"{where}this calibration is not trusted: {why}",)
+        """The instrument as designed."""
+        return self.model.template
 
     @staticmethod
     def read(path: str | os.PathLike[str]) -> Calibration:
@@ -473,9 +479,25 @@ class Calibration(Fitted):
         return MatrixMaps(grid, name, flat.T.reshape(planes), errors.T.reshape(planes), settings[:1].inside())
 
     @functools.cached_property
+    def product(self) -> Product:
+        """Contents of its file: those of the one that it was read from, or made anew."""
+        return vars(self)["_file"] or Product(
+            **_contents(self),
+            instrument=self.instrument,
+            parameters=self.model.parameters,
+            maps=self.new_maps(),
+            model_lines=_lines(render(self.model)),
+            description=_lines(self.model.template.description),
+        )
+
+    @property
     def maps(self) -> MatrixMaps:
-        """The maps of the file that it was read from, or made anew."""
-        return self.new_maps()
+        """The maps of its file."""
+        return self.product.maps
+
+    def content_hash(self) -> str:
+        """As `Product.content_hash`."""
+        return self.product.content_hash()
 
     # ------------------------------------------------------------------------------- tables and contents
 
@@ -520,33 +542,10 @@ class Calibration(Fitted):
             columns[f"{name}_ERR"] = column, f"standard error of {name}"
         if len(names) == 6:
             known = np.full(len(x), np.nan)
-            known[inside] = p_errors(there, covariance, sample_stars())
+            known[inside] = p_errors(there, covariance)
             columns["P_ERR"] = known, "error of p of a star with p <= 5 %, of the calibration alone"
         columns["FLAG"] = flag, "16 high cross-talk, 32 beyond the calibrated field, 64 filter or temperature"
         return columns
-
-    def parameter_columns(self) -> dict[str, np.ndarray]:
-        """The columns of PARAMETERS, priors NaN where there are none."""
-        parameters = self.fitted.parameters
-        priors = np.array([p.prior or (np.nan, np.nan) for p in parameters]).reshape(-1, 2)
-        return {
-            "NAME": np.array([p.name for p in parameters]),
-            "VALUE": np.asarray(self.values),
-            "SIGMA": self.sigma,
-            "UNIT": np.array([p.unit for p in parameters]),
-            "PRIOR_MEAN": priors[:, 0],
-            "PRIOR_WIDTH": priors[:, 1],
-            "FREE": np.array([p.free and p.tie is None for p in parameters]),
-        }
-
-    def content_hash(self) -> str:
-        """The content hash of the file that it was read from, or of the one that it would be written as.
-
-        SHA-256 of all that a calibration says of the instrument: not of dates, paths and versions.
-        """
-        from walop_jax.calibration.product import content_hash
-
-        return vars(self).get("_content") or content_hash(self)
 
 
 def _lines(text: str) -> tuple[str, ...]:

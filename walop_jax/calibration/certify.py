@@ -14,11 +14,12 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.calibration.calibration import UNCHECKED, Calibration
+from walop_jax.calibration.calibration import UNCHECKED, Calibration, Product
 from walop_jax.calibration.could_hide import could_hide, off_by, unmeasured
 from walop_jax.data.settings import BUILTIN_FILTERS, Settings
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import rounded
+from walop_jax.model.effects import EFFECTS, Effect
 
 MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine
 DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
@@ -46,7 +47,7 @@ class Validity(NamedTuple):
     temperature: tuple[float, float]
 
 
-def validity(product: Calibration) -> Validity:
+def validity(product: Product) -> Validity:
     """Dates, filters and temperatures of the exposures that a calibration was made from; NaN where none are known."""
     e = product.exposures
     return Validity(_range(e.mjd), tuple(np.unique(e.filter).tolist()), _range(e.temp))
@@ -57,8 +58,11 @@ def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
     return (float(known.min()), float(known.max())) if known.size else (float("nan"), float("nan"))
 
 
-def certify(product: Calibration) -> list[Check]:
-    """All checks of a product that could be read, in a fixed order; those behind a failed one may be missing."""
+def certify(product: Product, catalogue: tuple[type[Effect], ...] = EFFECTS) -> list[Check]:
+    """All checks of a product that could be read, in a fixed order; those behind a failed one may be missing.
+
+    `catalogue` are the effects that its model may have.
+    """
     checks = [
         *_content(product),
         *_verdict(product),
@@ -67,19 +71,19 @@ def certify(product: Calibration) -> list[Check]:
         _parents(product),
     ]
     try:
-        calibration = product.rebuilt()
+        calibration = product.rebuilt(catalogue)
     except ValueError as error:
         return [*checks, Check("model", False, f"cannot be rebuilt: {error}")]
     checks.append(Check("model", True, f"{len(calibration.model.names)} parameters rebuilt by name"))
     return [*checks, _maps(product, calibration), _physics(calibration), *_protection(calibration)]
 
 
-def _content(product: Calibration) -> list[Check]:
+def _content(product: Product) -> list[Check]:
     """A failure for products of an earlier rule; the content of others was checked when they were read."""
     return [Check("content", False, UNCHECKED)] if UNCHECKED in product.verdict.warnings else []
 
 
-def _verdict(product: Calibration) -> list[Check]:
+def _verdict(product: Product) -> list[Check]:
     v, bits = product.verdict, product.verdict.quality
     unexplained, ill = bool(bits & Quality.UNEXPLAINED), bool(bits & Quality.ILL_CONDITIONED)
     reached = "the minimum was reached" if v.converged else "no"
@@ -91,13 +95,13 @@ def _verdict(product: Calibration) -> list[Check]:
     ]
 
 
-def _covariance(product: Calibration) -> Check:
+def _covariance(product: Product) -> Check:
     """Of the free parameters: those that are held, or tied to others, have no errors of their own."""
-    free = [i for i, p in enumerate(product.fitted.parameters) if p.free and p.tie is None]
+    free = [i for i, p in enumerate(product.parameters) if p.free and p.tie is None]
     c, sigma = product.covariance[np.ix_(free, free)], product.sigma[free]
     from_what = f"made from {product.verdict.errors_from}"
     if not np.all(sigma > 0):
-        name = product.fitted.names[free[int(np.argmin(sigma))]]
+        name = product.names[free[int(np.argmin(sigma))]]
         return Check("covariance", False, f"the error of the free parameter {name} is 0; {from_what}")
     correlation = c / np.outer(sigma, sigma)
     lowest = float(np.linalg.eigvalsh(0.5 * (correlation + correlation.T)).min(initial=1.0))
@@ -108,7 +112,7 @@ def _covariance(product: Calibration) -> Check:
     return Check("covariance", good, f"{what}{' (singular)' if lowest <= SINGULAR else ''}; {from_what}")
 
 
-def _validity(product: Calibration) -> Check:
+def _validity(product: Product) -> Check:
     known = validity(product)
     unknown = [name for name in known.filters if name not in product.filters and name not in BUILTIN_FILTERS]
     good = bool(np.isfinite(known.mjd[0])) and not unknown
@@ -118,7 +122,7 @@ def _validity(product: Calibration) -> Check:
     return Check("validity", good, found + (f"; no curve of {', '.join(unknown)}" if unknown else ""))
 
 
-def _parents(product: Calibration) -> Check:
+def _parents(product: Product) -> Check:
     bad = [entry for entry in product.inputs if not re.fullmatch(r"[0-9a-f]{64}", entry.sha256)]
     good = bool(product.inputs) and not bad
     return Check(
@@ -126,7 +130,7 @@ def _parents(product: Calibration) -> Check:
     )
 
 
-def _maps(product: Calibration, calibration: Calibration) -> Check:
+def _maps(product: Product, calibration: Calibration) -> Check:
     again = calibration.new_maps(product.maps.values.shape[1])
     if again.grid != product.maps.grid or again.positions != product.maps.positions:
         return Check("maps", False, "are not of the grid and setting that this program makes")

@@ -23,7 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.matrix import LARGEST_P, change_of_qu, matrix_slopes, planned_matrices
+from walop_jax.calibration.accuracy import LARGEST_P, change_of_qu
+from walop_jax.calibration.matrix import matrix_slopes, planned_matrices
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.io.text import rounded, two_digits

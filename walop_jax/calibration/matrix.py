@@ -3,9 +3,6 @@
 Elements     three for each arm, m21, m22, m23, m31, … of `light.instrument_matrix`: band integrated, with throughput.
 Covariance   C_m = J C_θ Jᵀ with the exact J; the throughput series enters through its local values.
 Derivatives  to all parameters, and to the amplitudes of effects that are not there yet.
-
-Impact       m = m₀ + A s with s = (q, u), so a star that is calibrated with (m₀, A) while (m₀ + δm₀, A + δA) is true
-comes out wrong by A⁻¹ (δm₀ + δA s), at most |A⁻¹ δm₀| + p ‖A⁻¹ δA‖.
 """
 
 from __future__ import annotations
@@ -14,6 +11,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +19,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.data.frames import Grid
 from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
@@ -29,7 +26,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import Structure
 from walop_jax.likelihood import limits, optics
 from walop_jax.likelihood.field_table import Vector, accurate_table
-from walop_jax.likelihood.optics import linearised, to_all
+from walop_jax.likelihood.optics import linearised, plain_positions, through_series
 from walop_jax.likelihood.runner import usual_threads
 from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
@@ -39,7 +36,10 @@ from walop_jax.model.instrument import Instrument, Scalar
 from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan, with_numbers
 from walop_jax.model.planning import plan_for_settings
-from walop_jax.model.specification import Model
+from walop_jax.model.specification import Model, series_indices
+
+_MARK = 2.0**40
+"""A value that no parameter has: it finds the amplitudes of effects among all parameters."""
 
 
 def matrix_names(arms: int) -> tuple[str, ...]:
@@ -132,10 +132,7 @@ class ResidualMap:
         return float((squares.sum() - squares.size) / np.sqrt(2.0 * max(squares.size, 1)))
 
 
-# ----------------------------------------------------------------------------------------------------------- the matrix
-
-
-STARS, LARGEST_P = 100, 0.05
+# ------------------------------------------------------------------------------------ vectors and their derivatives
 
 
 def point_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
@@ -144,42 +141,38 @@ def point_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> F
     return light.camera_vectors(instrument, rows, instrument.throughput.at(x, y), x, y)
 
 
-def point_sky_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
-    """Analysis vectors (band, camera, Stokes) at a field point for light from the sky, inside a computation."""
-    return point_vectors(instrument, plan, x, y) @ light.telescope(instrument, x, y)
-
-
-def point_matrix(
-    instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
-) -> tuple[Float[Array, "b a 3"], Float[Array, "b a 3 n"]]:
-    """Instrument matrices of a field point and their derivatives with respect to all parameters."""
-    to_instrument = with_values(instrument)
-
-    def matrix(values: Float[Array, " n"], local: Float[Array, " k"]) -> Float[Array, "b a 3"]:
-        there, rows = to_instrument(values), optics.band_rows(values, instrument, plan, x, y)
-        vectors = light.camera_vectors(there, rows, local, x, y)
-        return light.instrument_matrix(vectors @ light.telescope(there, x, y), there.cameras.pairs)
-
-    m, plain, local = linearised(instrument, matrix, instrument.throughput.at(x, y))
-    return m, to_all(instrument, plain, local, instrument.throughput.basis(x, y)[None])
+def _vectors_at(
+    instrument: Instrument, plan: Plan, x: Float[Array, " p"], y: Float[Array, " p"]
+) -> tuple[Float[Array, "p b k 4"], Float[Array, "p 4 4"]]:
+    """Analysis vectors for light behind the telescope, and the Mueller matrix of the telescope."""
+    vectors = jax.vmap(functools.partial(point_vectors, instrument, plan))(x, y)
+    return vectors, jax.vmap(functools.partial(light.telescope, instrument))(x, y)
 
 
 def _slopes_at(
     instrument: Instrument, plan: Plan, *columns: Float[Array, " p"]
-) -> tuple[Float[Array, "p m"], Float[Array, "p m n"]]:
-    """At rows of x, y (deg), colour temperature (0: flat), temperature and hour angle; the plan has one band."""
+) -> tuple[Float[Array, "p b k 3"], Float[Array, "p d b k 3"]]:
+    """Analysis vectors for light from the sky, and their derivatives.
 
-    def one(x: Scalar, y: Scalar, *numbers: Scalar) -> tuple[Float[Array, "b a 3"], Float[Array, "b a 3 n"]]:
-        return point_matrix(instrument, with_numbers(plan, *numbers), x, y)
+    At rows of x, y (deg), and of colour temperature (0: flat), temperature and hour angle if these are not those of the
+    plan. Derivatives are in all parameters but the terms of the throughput, then in the throughputs at the place.
+    """
 
-    m, slopes = jax.vmap(one)(*columns)
-    size = m.shape[2] * 3
-    return m[:, 0].reshape(len(m), size), slopes[:, 0].reshape(len(m), size, slopes.shape[-1])
+    def one(x: Scalar, y: Scalar, *numbers: Scalar) -> tuple[Float[Array, "b k 3"], Float[Array, "d b k 3"]]:
+        here, to_instrument = with_numbers(plan, *numbers) if numbers else plan, with_values(instrument)
+
+        def vectors(values: Float[Array, " n"], local: Float[Array, " k"]) -> Float[Array, "b k 3"]:
+            there, rows = to_instrument(values), optics.band_rows(values, instrument, here, x, y)
+            return (light.camera_vectors(there, rows, local, x, y) @ light.telescope(there, x, y))[..., :3]
+
+        found = linearised(instrument, vectors, instrument.throughput.at(x, y))
+        return found.value, jnp.concatenate([found.plain, found.local])
+
+    return jax.vmap(one)(*columns)
 
 
+_vectors = compiled(_vectors_at, kept_as="vectors")
 _slopes = compiled(_slopes_at, kept_as="slopes")
-_vectors = compiled(jax.vmap(point_vectors, in_axes=(None, None, 0, 0)), kept_as="vectors")
-_sky_vectors = compiled(jax.vmap(point_sky_vectors, in_axes=(None, None, 0, 0)), kept_as="sky_vectors")
 
 
 def analysis_vectors(
@@ -194,17 +187,74 @@ def analysis_vectors(
 
     For light behind the telescope, or `from_sky`, which passes the telescope first.
     """
-    program, once = _sky_vectors if from_sky else _vectors, len(x) <= limits.MATRICES_ONCE
-    return in_chunks(lambda a, b: (program(instrument, plan, a, b, once=once),), x, y)[0]
+    once = len(x) <= limits.MATRICES_ONCE
+    vectors, telescope = in_chunks(lambda a, b: _vectors(instrument, plan, a, b, once=once), x, y)
+    return vectors @ telescope[:, None] if from_sky else vectors
 
 
 sky_vectors = functools.partial(analysis_vectors, from_sky=True)
 """Analysis vectors for light from the sky."""
 
 
+def vector_slopes(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Float[np.ndarray, "p d b k 3"]:
+    """Derivatives of `sky_vectors` in all parameters but the terms of the throughput, then in the throughputs there."""
+    return in_chunks(lambda a, b: _slopes(instrument, plan, a, b), x, y)[1]
+
+
+def in_chunks(
+    function: Callable[..., tuple[Array | np.ndarray, ...]], *columns: Float[np.ndarray, " p"]
+) -> tuple[np.ndarray, ...]:
+    """Apply a compiled function to slices of the columns, padded to `limits.MATRIX_POINTS` rows."""
+    count, size = len(columns[0]), limits.MATRIX_POINTS
+
+    def solved(start: int) -> list[np.ndarray]:
+        slices = [column[start : start + size] for column in columns]
+        missing = size - len(slices[0])
+        # Padding with the last row keeps the arithmetic as tame as that of the data.
+        result = function(*(array(np.pad(part, (0, missing), mode="edge")) for part in slices))
+        return [np.asarray(part)[: size - missing] for part in result]
+
+    # The first slice compiles; a slice keeps one core busy.
+    parts = [solved(0)]
+    with ThreadPoolExecutor(usual_threads()) as pool:
+        parts += pool.map(solved, range(size, count, size))
+    return tuple(np.concatenate(parts) for parts in zip(*parts, strict=True))
+
+
+# ----------------------------------------------------------------------------------------------------------- the matrix
+
+
 def planned_matrices(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Float[np.ndarray, "p a 3"]:
     """Instrument matrices at field positions (deg) in the one setting of a plan."""
     return light.instrument_matrix(sky_vectors(instrument, plan, x, y)[:, 0], instrument.cameras.pairs)
+
+
+def _matrix_and_slopes(
+    instrument: Instrument, plan: Plan, *, once: bool
+) -> Callable[..., tuple[Float[np.ndarray, "p a 3"], Float[np.ndarray, "p a 3 n"]]]:
+    """A function of rows as those of `_slopes_at`: matrices, and their derivatives in all parameters.
+
+    m = (a₁ − a₂) / (a₁₀ + a₂₀) in the one band of the plan, a₁, a₂ the analysis vectors of the cameras of an arm.
+    """
+    first, second = (np.array([pair[i] for pair in instrument.cameras.pairs], int) for i in (0, 1))
+    plain, series = plain_positions(instrument), series_indices(instrument)
+    size = values_of(instrument).size
+
+    def at(*columns: Array) -> tuple[np.ndarray, np.ndarray]:
+        vectors, slopes = (
+            np.asarray(part)[..., 0, :, :] for part in _slopes(instrument, plan, *columns, once=once)
+        )
+        a, b = (np.moveaxis(slopes[..., arms, :], 1, -1) for arms in (first, second))
+        total = (vectors[:, first, :1] + vectors[:, second, :1])[..., None]
+        m = light.instrument_matrix(vectors, instrument.cameras.pairs)
+        change = (a - b - m[..., None] * (a[..., :1, :] + b[..., :1, :])) / total
+        basis = instrument.throughput.basis(*map(np.asarray, columns[:2]))[:, None, None, None]
+        result = np.empty((*m.shape, size))
+        result[..., plain] = change[..., : len(plain)]
+        result[..., series] = through_series(change[..., None, len(plain) :], basis)
+        return m, result
+
+    return at
 
 
 def matrices(
@@ -222,12 +272,12 @@ def matrices(
     """
     size = 3 * len(instrument.cameras.pairs)
     values, errors = np.empty((len(x), size)), np.empty((len(x), size, size))
-    once = len(x) <= limits.MATRICES_ONCE
     for layout, rows in settings.layouts():
         plan = plan_for_settings(instrument, layout, filters)
+        exact = _matrix_and_slopes(instrument, plan, once=len(x) <= limits.MATRICES_ONCE)
 
-        def part(*columns: Array, plan: Plan = plan) -> tuple[np.ndarray, np.ndarray]:
-            found, slopes = map(np.asarray, _slopes(instrument, plan, *columns, once=once))
+        def part(*columns: Array, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
+            found, slopes = (one.reshape(len(one), size, *one.shape[3:]) for one in exact(*columns))
             return found, slopes @ covariance @ np.swapaxes(slopes, 1, 2)
 
         values[rows], errors[rows] = in_chunks(part, x[rows], y[rows], *_numbers(settings[rows]))
@@ -257,26 +307,6 @@ def matrix_draws(
     return result
 
 
-def in_chunks(
-    function: Callable[..., tuple[Array | np.ndarray, ...]], *columns: Float[np.ndarray, " p"]
-) -> tuple[np.ndarray, ...]:
-    """Apply a compiled function to slices of the columns, padded to `limits.MATRIX_POINTS` rows."""
-    count, size = len(columns[0]), limits.MATRIX_POINTS
-
-    def solved(start: int) -> list[np.ndarray]:
-        slices = [column[start : start + size] for column in columns]
-        missing = size - len(slices[0])
-        # Padding with the last row keeps the arithmetic as tame as that of the data.
-        result = function(*(array(np.pad(part, (0, missing), mode="edge")) for part in slices))
-        return [np.asarray(part)[: size - missing] for part in result]
-
-    # The first slice compiles; a slice keeps one core busy.
-    parts = [solved(0)]
-    with ThreadPoolExecutor(usual_threads()) as pool:
-        parts += pool.map(solved, range(size, count, size))
-    return tuple(np.concatenate(parts) for parts in zip(*parts, strict=True))
-
-
 # ------------------------------------------------------------------------------------------ derivatives
 
 
@@ -291,10 +321,9 @@ def matrix_slopes(
         return np.zeros((len(x), 0, 3)), np.zeros((len(x), 0, 3, values_of(instrument).size))
     plan = plan_for_settings(instrument, setting, filters)
     numbers = (np.broadcast_to(number, len(x)) for number in _numbers(setting))
-    once = len(x) <= limits.MATRICES_ONCE
-    values, slopes = in_chunks(lambda *at: _slopes(instrument, plan, *at, once=once), x, y, *numbers)
-    arms = (len(x), values.shape[1] // 3, 3)
-    return values.reshape(arms), slopes.reshape(*arms, slopes.shape[-1])
+    exact = _matrix_and_slopes(instrument, plan, once=len(x) <= limits.MATRICES_ONCE)
+    matrix, slopes = in_chunks(exact, x, y, *numbers)
+    return matrix, slopes
 
 
 def slopes_over_field(
@@ -347,60 +376,6 @@ def of_structure(structure: Structure, values: Float[np.ndarray, "p m"]) -> Floa
     return added
 
 
-def errors_of_changes(
-    matrix: Float[np.ndarray, "p a 3"],
-    slopes: Float[np.ndarray, "p a 3 n"],
-    changes: Float[np.ndarray, "c n"],
-) -> Float[np.ndarray, "c p"]:
-    """`change_of_qu` of every change of all parameters, to first order."""
-    return np.array([change_of_qu(matrix, matrix + slopes @ change) for change in changes])
-
-
-def change_of_qu(
-    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
-) -> Float[np.ndarray, " p"]:
-    """Largest error of q and u at each field point for stars polarised by up to `p`; NaN where not measured."""
-    found = np.full(len(assumed), np.nan)
-    if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
-        return found
-    good = np.abs(np.linalg.det(assumed[:, :, 1:])) > SMALLEST_DETERMINANT
-    inverse = np.linalg.inv(assumed[good, :, 1:])
-    change = (true - assumed)[good]
-    offset = np.linalg.norm(inverse @ change[:, :, :1], axis=(1, 2))
-    found[good] = offset + p * np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
-    return found
-
-
-def sample_stars(count: int = STARS, seed: int = 0) -> Float[np.ndarray, "n 2"]:
-    """(q, u) of sources with p evenly up to `LARGEST_P` and any angle."""
-    rng = np.random.default_rng(seed)
-    p, angle = rng.uniform(0.0, LARGEST_P, count), rng.uniform(0.0, np.pi, count)
-    return np.stack([p * np.cos(2 * angle), p * np.sin(2 * angle)], axis=1)
-
-
-def p_errors(
-    matrix: Float[np.ndarray, "p 6"], covariance: Float[np.ndarray, "p 6 6"], stars: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, " p"]:
-    """Error of p for stars (q, u), rms over them, from the six elements of the matrix and their covariance."""
-    form = p_forms(matrix, stars)
-    variance = np.einsum("pni,pij,pnj->pn", form, covariance, form, optimize=True)
-    return np.sqrt(np.mean(variance, axis=1))
-
-
-def p_forms(
-    matrix: Float[np.ndarray, "p 6"], stars: Float[np.ndarray, "*b n 2"]
-) -> Float[np.ndarray, "p n 6"]:
-    """δp = −e · M⁻¹ · (δm s) of every star as a linear form of the six elements; the same stars (q, u), or of each."""
-    stars = np.broadcast_to(stars, (len(matrix), *stars.shape[-2:]))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        (a, b), (c, d) = matrix[:, 1:3].T, matrix[:, 4:].T
-        inverse = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], 1) / (a * d - b * c)[:, None, None]
-        along = stars / np.hypot(stars[..., :1], stars[..., 1:])
-        s = np.concatenate([np.ones((*stars.shape[:2], 1)), stars], axis=2)
-        left = np.einsum("pnc,pcr->pnr", along, inverse)
-        return np.einsum("pnr,pns->pnrs", left, s).reshape(*stars.shape[:2], 6)
-
-
 def effect_slopes(
     instrument: Instrument,
     setting: Settings,
@@ -415,28 +390,12 @@ def effect_slopes(
     """
     if not effects:
         return np.zeros((len(x), len(instrument.cameras.pairs), 3, 0))
-    there = dataclasses.replace(instrument, effects=(*instrument.effects, *effects))
-    plan = plan_for_settings(there, setting, filters)
-    return in_chunks(lambda a, b: (_effect_slopes(instrument, plan, effects, a, b),), x, y)[0][:, 0]
-
-
-def _point_effect_slopes(
-    instrument: Instrument, plan: Plan, effects: tuple[Effect, ...], x: Scalar, y: Scalar
-) -> Float[Array, "b a 3 e"]:
     neutral, put = with_amplitudes(instrument, effects)
-
-    def matrix(amplitudes: list[Float[Array, ...]]) -> Float[Array, "b a 3"]:
-        there = put(amplitudes)
-        return light.instrument_matrix(point_sky_vectors(there, plan, x, y), there.cameras.pairs)
-
-    _, push = jax.linearize(matrix, neutral)
     flat, to_tree = ravel_pytree(neutral)
-    return jnp.moveaxis(jax.vmap(lambda one: push(to_tree(one)))(jnp.eye(flat.size)), 0, -1)
-
-
-_effect_slopes = compiled(
-    jax.vmap(_point_effect_slopes, in_axes=(None, None, None, 0, 0)), kept_as="effect_slopes"
-)
+    marks = _MARK + np.arange(flat.size)
+    order = np.asarray(values_of(put(to_tree(jnp.asarray(marks)))))
+    at = [int(np.flatnonzero(order == mark)[0]) for mark in marks]
+    return matrix_slopes(put(neutral), setting, filters, x, y)[1][..., at]
 
 
 # ----------------------------------------------------------------------------------------- at the field points of a fit
@@ -453,11 +412,3 @@ def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
     instrument, calset = result.model.instrument(result.values), result.calset
     plan = plan_for_settings(instrument, first_setting(calset, instrument), calset.filters)
     return planned_matrices(instrument, plan, calset.points.x, calset.points.y)
-
-
-def largest_change(
-    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
-) -> float:
-    """Largest of `change_of_qu` over the field; NaN when no point holds both q and u."""
-    found = change_of_qu(assumed, true, p)
-    return float(np.nanmax(found)) if np.isfinite(found).any() else float("nan")

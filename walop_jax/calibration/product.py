@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 import numpy as np
 from astropy.io import fits
 
-from walop_jax.calibration.calibration import UNCHECKED, Calibration, ListedModel
+from walop_jax.calibration.calibration import UNCHECKED, Calibration, Product
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap, matrix_names, residual_names
 from walop_jax.data import schema
 from walop_jax.data.calset import empty_sources
@@ -62,6 +62,16 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
 """Tables and their columns, EXPOSURES apart, whose columns depend on the instrument."""
 
 _RESIDUALS = {"RESIDUAL": "values", "RESIDUAL_ERR": "errors", "RESIDUAL_CHI2": "chi2"}
+_MISTAKE: Mapping[str, tuple[str, Any]] = {
+    "HIDE": ("names", ""),
+    "SIZE": ("sizes", None),
+    "UNIT": ("units", ""),
+    "HKIND": ("kinds", DATA),
+    "CURE": ("remedies", ""),
+    "ACTS": ("acts", ""),
+    "SEEN": ("measured", True),
+}
+"""Numbered words of HIDDEN: the field of `Hidden` that each one is, and its value where it is absent."""
 _FIELD = ("FIELDXMI", "FIELDXMA", "FIELDYMI", "FIELDYMA")
 _MATRIX_IMAGE = re.compile(r"M([1-9][0-9]{0,2})[123](_ERR)?")
 _LONGEST_SOFTWARE_LIST = 30
@@ -76,6 +86,7 @@ _WORDS = re.compile(
 )
 """Words of headers that CONTHASH covers: all that are read, but for structure (FITS), date and software."""
 _AGAIN = "make the product again"
+_NEWER = "use a newer walop-jax, or make the product again with this one"
 
 Cards = dict[str, tuple[Any, str]]
 
@@ -84,25 +95,21 @@ Cards = dict[str, tuple[Any, str]]
 
 
 def write_calibration(
-    path: str | os.PathLike[str], calibration: Calibration, *, overwrite: bool = False
+    path: str | os.PathLike[str], calibration: Calibration | Product, *, overwrite: bool = False
 ) -> None:
-    """Write a calibration with checksums; the file appears whole or not at all.
+    """Write a calibration, or what was read of one, with checksums; the file appears whole or not at all.
 
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only, and for a
     parameter whose name could not be read again.
     """
-    for name in calibration.fitted.names:
+    product = calibration if isinstance(calibration, Product) else calibration.product
+    for name in product.names:
         if not NAME.fullmatch(name):
             raise Place(path, "PARAMETERS").fail(f"{name!r} is not a parameter name", "NAME")
-    hdus = _hdus(calibration, path)
+    hdus = hdus_of(product, path)
     hdus[0].header["CONTHASH"] = content_of(hdus)
     with atomic_path(path, overwrite=overwrite) as temporary:
         sign_and_write(hdus, temporary)
-
-
-def content_hash(calibration: Calibration) -> str:
-    """CONTHASH of the product that a calibration is written as."""
-    return content_of(_hdus(calibration, calibration.path or PRODUCT))
 
 
 def content_of(hdus: Iterable[Any]) -> str:
@@ -133,9 +140,10 @@ def content_of(hdus: Iterable[Any]) -> str:
     return digest.hexdigest()
 
 
-def _hdus(c: Calibration, path: object) -> list[Any]:
+def hdus_of(c: Product, path: object) -> list[Any]:
+    """The extensions of a file, as they are written but for CONTHASH; `path` is for messages."""
     tables = {
-        "PARAMETERS": c.parameter_columns(),
+        "PARAMETERS": _parameter_columns(c),
         "FILTERS": filter_columns(c.filters),
         "MODEL": {"LINE": _strings(c.model_lines)},
         "INSTRUMENT": {"LINE": _strings(c.description)},
@@ -166,17 +174,31 @@ def _hdus(c: Calibration, path: object) -> list[Any]:
     return [_primary(c, version), parameters, *images, filters, exposures, *made.values()]
 
 
+def _parameter_columns(c: Product) -> dict[str, np.ndarray]:
+    """The columns of PARAMETERS, priors NaN where there are none."""
+    priors = np.array([p.prior or (np.nan, np.nan) for p in c.parameters]).reshape(-1, 2)
+    return {
+        "NAME": np.array(c.names),
+        "VALUE": np.asarray(c.values),
+        "SIGMA": c.sigma,
+        "UNIT": np.array([p.unit for p in c.parameters]),
+        "PRIOR_MEAN": priors[:, 0],
+        "PRIOR_WIDTH": priors[:, 1],
+        "FREE": np.array([p.free and p.tie is None for p in c.parameters]),
+    }
+
+
 def _strings(values: Iterable[str]) -> np.ndarray:
     return np.array(list(values), dtype=np.str_)
 
 
-def _version(c: Calibration) -> int:
+def _version(c: Product) -> int:
     """The oldest version of the format that can hold a calibration."""
     newer = c.maps.arms != 2 or c.exposures.further or c.instrument not in shipped()
     return 2 if newer or np.isin(c.exposures.kind, ("lamp", "steady")).any() else 1
 
 
-def _primary(c: Calibration, version: int) -> fits.PrimaryHDU:
+def _primary(c: Product, version: int) -> fits.PrimaryHDU:
     """The primary header: verdict, validity, software, content hash."""
     verdict, site = c.verdict, c.site
     cards: Cards = {
@@ -226,7 +248,7 @@ def _primary(c: Calibration, version: int) -> fits.PrimaryHDU:
     return primary
 
 
-def _validity_cards(c: Calibration) -> Cards:
+def _validity_cards(c: Product) -> Cards:
     """Dates, temperatures and filters that the product may be applied to, for a look: EXPOSURES says the same."""
     cards: Cards = {}
     for values, names, comment in (
@@ -268,35 +290,36 @@ def _residual_hdus(residuals: ResidualMap) -> list[fits.ImageHDU]:
 def _hidden_hdu(hidden: Hidden) -> fits.ImageHDU:
     """An image (mistake, parameter) of what each mistake does to the parameters; no data where there is none."""
     hdu = fits.ImageHDU(hidden.changes if len(hidden) else None, name="HIDDEN")
-    for number, (name, size, unit) in enumerate(hidden.each()):
-        hdu.header[f"HIDE{number + 1}"] = in_ascii(name)
-        hdu.header[f"SIZE{number + 1}"] = size
-        hdu.header[f"UNIT{number + 1}"] = in_ascii(unit)
-        hdu.header[f"HKIND{number + 1}"] = hidden.kinds[number]
-        hdu.header[f"CURE{number + 1}"] = in_ascii(hidden.remedies[number])
-        if hidden.acts[number]:
-            hdu.header[f"ACTS{number + 1}"] = in_ascii(hidden.acts[number])
-        hdu.header[f"SEEN{number + 1}"] = hidden.measured[number]
+    for number in range(len(hidden)):
+        for word, (attribute, usual) in _MISTAKE.items():
+            value = getattr(hidden, attribute)[number]
+            if word != "ACTS" or value != usual:
+                hdu.header[f"{word}{number + 1}"] = in_ascii(value) if isinstance(value, str) else value
     return hdu
 
 
 # ------------------------------------------------------------------------------------------------- reading
 
 
-def read_calibration(
-    run: str | os.PathLike[str], catalogue: Sequence[type[Effect]] = EFFECTS, *, rebuild: bool = True
-) -> Calibration:
+def read_calibration(run: str | os.PathLike[str], catalogue: Sequence[type[Effect]] = EFFECTS) -> Calibration:
     """Read and check a calibration, given by its file or by the folder of a run.
 
-    `catalogue` are the effects that its model may have; without `rebuild` the model is left as the file lists it.
-    Raises `DataError`, with advice, for a file that is damaged, of another kind, from a newer version of the
-    format, or changed since it was written, and if the model cannot be rebuilt.
+    `catalogue` are the effects that its model may have. Raises `DataError` as `read_product` does, and if the model
+    cannot be rebuilt.
     """
-    path = product_path(run)
-    with open_fits(path, _AGAIN) as opened:
-        found = _Reader(opened).calibration(tuple(catalogue))
-    with errors_naming(path):
-        return found.rebuilt() if rebuild else found
+    product = read_product(run)
+    with errors_naming(product.path):
+        return product.rebuilt(tuple(catalogue))
+
+
+def read_product(run: str | os.PathLike[str]) -> Product:
+    """Read and check the product of a fit, given by its file or by the folder of a run.
+
+    Raises `DataError`, with advice, for a file that is damaged, of another kind, from a newer version of the format, or
+    changed since it was written.
+    """
+    with open_fits(product_path(run), _AGAIN) as opened:
+        return _Reader(opened).product()
 
 
 def product_path(run: str | os.PathLike[str]) -> Path:
@@ -311,7 +334,7 @@ class _Reader:
     def __init__(self, opened: OpenFile) -> None:
         self.path, self.header, self.opened = opened.path, opened.hdus[0].header, opened.hdus
         self.primary = Place(self.path, "PRIMARY")
-        self.version = self._version()
+        self._check_version()
         self.hdus: dict[str, Any] = {}
         for hdu in opened.hdus[1:]:
             name = hdu.name.strip().upper()
@@ -319,8 +342,8 @@ class _Reader:
                 raise fail("is there twice", file=self.path, extension=name, advice="remove one")
             self.hdus[name] = hdu
 
-    def calibration(self, catalogue: tuple[type[Effect], ...]) -> Calibration:
-        """The calibration as the file lists it, its content hash checked."""
+    def product(self) -> Product:
+        """The contents of the file, its content hash checked."""
         covariance = self.image("COVARIANCE")
         maps = self.maps()
         table = self.table("PARAMETERS")
@@ -333,15 +356,13 @@ class _Reader:
         sources, inputs = self.table("SOURCES", optional=True), self.table("INPUTS", optional=True)
         warnings, description = self.table("WARNINGS", optional=True), self.table("INSTRUMENT", optional=True)
         exposures, place = self.table("EXPOSURES"), Place(self.path, "EXPOSURES")
-        return Calibration(
-            fitted=ListedModel(
-                name=instrument_name(self.header.get("INSTRUME", ""), self.primary),
-                parameters=_listed(table, model_lines),
-                maps=maps,
-                lines=model_lines,
-                description=tuple(description["LINE"].tolist()) if description else (),
-                catalogue=catalogue,
-            ),
+        low_x, high_x, low_y, high_y = map(self.number, _FIELD)
+        return Product(
+            instrument=instrument_name(self.header.get("INSTRUME", ""), self.primary),
+            parameters=_listed(table, model_lines),
+            maps=maps,
+            model_lines=model_lines,
+            description=tuple(description["LINE"].tolist()) if description else (),
             values=table["VALUE"],
             covariance=covariance,
             verdict=Verdict.recorded(
@@ -365,12 +386,7 @@ class _Reader:
             sources=make_sources(sources, Place(self.path, "SOURCES")) if sources else empty_sources(),
             site=site,
             origin=self.text("ORIGIN"),
-            field=(
-                self.number(_FIELD[0]),
-                self.number(_FIELD[1]),
-                self.number(_FIELD[2]),
-                self.number(_FIELD[3]),
-            ),
+            field=(low_x, high_x, low_y, high_y),
             inputs=tuple(InputFile(Path(p), s) for p, s in zip(inputs["PATH"], inputs["SHA256"], strict=True))
             if inputs
             else (),
@@ -391,11 +407,10 @@ class _Reader:
             advice = "a product is not edited by hand: fit again, with a model file for what should differ"
             raise self.primary.fail("the content is not what was written", "CONTHASH", advice)
         if rule not in (None, HASHRULE):
-            advice = "use a newer walop-jax, or make the product again with this one"
-            raise self.primary.fail(f"is {rule!r}, this program knows {HASHRULE}", "HASHRULE", advice)
+            raise self.primary.fail(f"is {rule!r}, this program knows {HASHRULE}", "HASHRULE", _NEWER)
         return held
 
-    def _version(self) -> int:
+    def _check_version(self) -> None:
         version = self.header.get("PRODVERS")
         if version is None and "CALVERS" in self.header:
             what, advice = "this is a calibration set, not a calibration product", "run walop-jax refit on it"
@@ -404,18 +419,14 @@ class _Reader:
         elif isinstance(version, bool) or not isinstance(version, int) or version < 1:
             what, advice = f"is {version!r}, not a version", _AGAIN
         elif version > PRODVERS:
-            what = f"is {version}, this program reads up to {PRODVERS}"
-            advice = "use a newer walop-jax, or make the product again with this one"
+            what, advice = f"is {version}, this program reads up to {PRODVERS}", _NEWER
         else:
-            return version
+            return
         raise self.primary.fail(what, "PRODVERS", advice)
 
     def number(self, name: str, missing: float | None = None) -> float:
         """A number; `missing` where it is absent, if that may be."""
-        value = self.header.get(name, missing)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.primary.fail(f"is {value!r}, not a number", name, _AGAIN)
-        return float(value)
+        return _number(self.header, name, self.primary, missing)
 
     def flag(self, name: str) -> bool:
         """T or F."""
@@ -483,9 +494,9 @@ class _Reader:
         return found
 
     def maps(self) -> MatrixMaps:
-        """The maps of the matrix: of two arms in version 1, of as many as there are images later on."""
+        """The maps of the matrix, of as many arms as there are images."""
         rows = [int(match[1]) for name in self.hdus if (match := _MATRIX_IMAGE.fullmatch(name))]
-        names = matrix_names(2 if self.version == 1 else max([1, *(row - 1 for row in rows)]))
+        names = matrix_names(max([1, *(row - 1 for row in rows)]))
         errors = tuple(f"{name}_ERR" for name in names)
         images = {name: self.image(name) for name in (*names, *errors)}
         grid = self.grid(names[0])
@@ -527,23 +538,18 @@ class _Reader:
         if "HIDDEN" not in self.hdus:
             return None
         header, place = self.hdus["HIDDEN"].header, Place(self.path, "HIDDEN")
-        names, sizes, kept, further = [], [], [], []
-        while (number := len(names) + 1) and f"HIDE{number}" in header:
-            size = header.get(f"SIZE{number}")
-            if isinstance(size, bool) or not isinstance(size, int | float):
-                raise place.fail(f"is {size!r}, not a number", f"SIZE{number}", _AGAIN)
-            names.append(str(header[f"HIDE{number}"]))
-            sizes.append(float(size))
-            kept.append(str(header.get(f"UNIT{number}", "")))
-            kind, cure, acts = (
-                str(header.get(f"{key}{number}", usual))
-                for key, usual in (("HKIND", DATA), ("CURE", ""), ("ACTS", ""))
-            )
-            further.append((kind, cure, acts, header.get(f"SEEN{number}", True) is not False))
-        changes = self.image("HIDDEN") if names else np.zeros((0, parameters))
-        if changes.shape != (len(names), parameters):
-            raise place.fail(f"has shape {changes.shape}, not {(len(names), parameters)}", advice=_AGAIN)
-        return Hidden(tuple(names), tuple(sizes), tuple(kept), changes, *zip(*further, strict=True))
+        columns: dict[str, list[Any]] = {attribute: [] for attribute, _ in _MISTAKE.values()}
+        while f"HIDE{(number := len(columns['names']) + 1)}" in header:
+            for word, (attribute, usual) in _MISTAKE.items():
+                name = f"{word}{number}"
+                value = _number(header, name, place) if usual is None else header.get(name, usual)
+                columns[attribute].append(str(value) if isinstance(usual, str) else value)
+        count = len(columns["names"])
+        changes = self.image("HIDDEN") if count else np.zeros((0, parameters))
+        if changes.shape != (count, parameters):
+            raise place.fail(f"has shape {changes.shape}, not {(count, parameters)}", advice=_AGAIN)
+        columns["measured"] = [value is not False for value in columns["measured"]]
+        return Hidden(changes=changes, **{name: tuple(values) for name, values in columns.items()})
 
     def check_parameters(self, table: Mapping[str, Any], covariance: np.ndarray) -> None:
         """Raise `DataError` for parameters that are none, and a covariance that is not theirs."""
@@ -565,6 +571,13 @@ class _Reader:
             self.fail("COVARIANCE", "is not a covariance: not symmetric, or negative variances")
         if not np.allclose(np.sqrt(variance), table["SIGMA"], rtol=1e-12, atol=0):
             self.fail("COVARIANCE", "does not agree with SIGMA of PARAMETERS")
+
+
+def _number(header: fits.Header, name: str, place: Place, missing: float | None = None) -> float:
+    value = header.get(name, missing)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise place.fail(f"is {value!r}, not a number", name, _AGAIN)
+    return float(value)
 
 
 def _listed(table: Mapping[str, Any], model_lines: Sequence[str]) -> tuple[Parameter, ...]:

@@ -66,17 +66,17 @@ def certify(job: Job, calibration: Product, effects: Effects = None) -> Outcome[
     from walop_jax import Calibration, FitResult
     from walop_jax.calibration.certify import certify as checks_of
     from walop_jax.calibration.certify import validity
-    from walop_jax.calibration.product import product_path, read_calibration
+    from walop_jax.calibration.product import product_path, read_product
 
     job.tell("checking")
     if isinstance(calibration, Calibration | FitResult):
         there = Calibration.from_fit(calibration) if isinstance(calibration, FitResult) else calibration
-        path, product = Path(IN_MEMORY), there
+        path, product, catalogue = Path(IN_MEMORY), there.product, there.model.catalogue
     else:
         path = product_path(folder_of(calibration))
-        product = read_calibration(path, catalogue_of(effects), rebuild=False)
+        product, catalogue = read_product(path), catalogue_of(effects)
     with errors_naming(path):
-        checks = tuple(checks_of(product))
+        checks = tuple(checks_of(product, catalogue))
     parents = tuple(entry.sha256 for entry in product.inputs)
     found = Certificate(path, checks, validity(product), product.content_hash(), parents)
     why = "; ".join(f"{check.name} ({check.found})" for check in found.failed)

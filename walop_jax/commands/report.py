@@ -110,7 +110,7 @@ def _accuracy(run: Any) -> tuple[Any, tuple[str, ...]]:
     if run.product is None:
         return None, ()
     try:
-        found = field_accuracy(run.product.rebuilt())
+        found = field_accuracy(run.source.rebuilt)
     except ValueError as error:
         return None, (f"The accuracy of p over the field is not known: {error}.",)
     lacking = ("The instrument has a single arm: the accuracy of p depends on how stars are observed.",)

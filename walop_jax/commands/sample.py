@@ -124,12 +124,12 @@ def _sampled_run(
     if found and not (job.overwrite or resume):
         raise fail(f"holds {found[0]} already", file=folder, advice="go on with --resume, or --overwrite it")
     with output_folder(folder, OUTPUTS, overwrite=True) as out:
-        product = read_calibration(folder / PRODUCT, run.catalogue, rebuild=False)
+        product = read_calibration(folder / PRODUCT, run.catalogue)
         result = run.fit(text)
         if job.overwrite and not resume:
             Chain(folder / CHAINS, {}).path.unlink(missing_ok=True)
         posterior = sample_fit(result, options, folder=folder / CHAINS, resume=resume, report=tell)
-        fitted = digest_of_fit(product.inputs, product.fitted.names, product.values)
+        fitted = digest_of_fit(product.inputs, product.model.names, product.values)
         posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)
         with out.filled(((PRODUCT,) if posterior.trusted else ()) + OUTPUTS) as temporary:
             for name, write in _writers(product, posterior).items():
@@ -160,6 +160,6 @@ def _writers(product: Calibration, posterior: PosteriorSample) -> Writers:
         "sample.json": lambda path: path.write_text(json_text(posterior.document()), encoding="utf-8"),
     }
     if posterior.trusted:
-        better = product.rebuilt().with_covariance(posterior.covariance, posterior.errors_from)
+        better = product.with_covariance(posterior.covariance, posterior.errors_from)
         writers[PRODUCT] = lambda path: write_calibration(path, better)
     return writers

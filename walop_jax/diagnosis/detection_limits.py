@@ -35,9 +35,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special
 
+from walop_jax.calibration.accuracy import change_of_qu
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import could_hide, hidden_errors
-from walop_jax.calibration.matrix import change_of_qu, effect_slopes, first_setting, matrix_slopes
+from walop_jax.calibration.matrix import effect_slopes, first_setting, matrix_slopes
 from walop_jax.diagnosis.candidates import Probe, applicable, fringes_of
 from walop_jax.diagnosis.candidates import probes as all_probes
 from walop_jax.diagnosis.design import Design

@@ -21,8 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from walop_jax.calibration.accuracy import LARGEST_P, change_of_qu
 from walop_jax.calibration.could_hide import as_text, change_by_effect, moves_with, turn_of
-from walop_jax.calibration.matrix import LARGEST_P, change_of_qu, first_setting, matrix_slopes
+from walop_jax.calibration.matrix import first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.diagnosis.candidates import Probe

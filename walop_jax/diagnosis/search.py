@@ -26,7 +26,8 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.matrix import instrument_matrices, largest_change
+from walop_jax.calibration.accuracy import largest_change
+from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis.candidates import said_by
 from walop_jax.diagnosis.design import Design, held_out
 from walop_jax.diagnosis.examination import Evidence, Ranked, explains, leaders

@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.calibration.matrix import instrument_matrices, largest_change
+from walop_jax.calibration.accuracy import largest_change
+from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import candidates
 from walop_jax.diagnosis.alternatives import mixups_of, other_descriptions, refusal

@@ -36,13 +36,9 @@ class ParameterValue(NamedTuple):
 class Fitted(Result):
     """A model with values and a covariance of all its parameters, and what these say by name and as a table."""
 
+    model: Model
     values: Vector
     covariance: Float[np.ndarray, "n n"]
-
-    @property
-    def model(self) -> Model:
-        """The model."""
-        raise NotImplementedError
 
     @property
     def sigma(self) -> Vector:

@@ -85,7 +85,7 @@ class FitResult(Fitted):
         return fit(likelihood, noise_scale=noise_scale)
 
     @property
-    def model(self) -> Model:
+    def model(self) -> Model:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The model that was fitted."""
         return self.likelihood.model
 

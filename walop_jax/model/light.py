@@ -340,7 +340,7 @@ def detected(
 
 
 def instrument_matrix(
-    vectors: Float[Any, "... k 4"], pairs: tuple[tuple[int, int], ...]
+    vectors: Float[Any, "... k s"], pairs: tuple[tuple[int, int], ...]
 ) -> Float[Any, "... a 3"]:
     """Rows (m21, m22, m23), (m31, m32, m33), … of the instrument matrix from analysis vectors, one for each arm.
 

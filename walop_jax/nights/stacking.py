@@ -99,7 +99,7 @@ def stack(
     opened = [_opened(one, catalogue) for one in nights]
     fits = [one for one in (like, *(some.fit for some in opened)) if one is not None]
     held = [Calibration.from_fit(one) if isinstance(one, FitResult) else one for one in fits[:1]]
-    maker = Maker(held[0].rebuilt() if held else None, partial, len(opened) < MANY)
+    maker = Maker(held[0] if held else None, partial, len(opened) < MANY)
     makers = Makers(maker, executor)
     made: list[Night] = []
     at_hand: dict[tuple[str, int], Data] = {}

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.calibration.accuracy import measures_u, p_errors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.matrix import p_errors, sample_stars
 from walop_jax.calibration.thresholds import GOAL
 from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Displayed
@@ -37,7 +37,7 @@ from walop_jax.nights.algebra import Solution
 from walop_jax.nights.breaks import Break, part_of, shape_of
 from walop_jax.nights.changes import scan
 from walop_jax.nights.equations import Together, night_numbers
-from walop_jax.science.field_accuracy import NODES, SIZE, TOLERANCE, judged, measures_u, reached
+from walop_jax.science.field_accuracy import NODES, SIZE, TOLERANCE, judged, reached
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]
@@ -144,7 +144,7 @@ class Survey(Displayed):
         assert self._matrix is not None
         matrix, slopes, structure, _ = self._matrix
         covariance = slopes @ self._product(mjd).covariance @ slopes.swapaxes(1, 2) + structure
-        return reached(p_errors(matrix, covariance, sample_stars()))
+        return reached(p_errors(matrix, covariance))
 
     @functools.cached_property
     def _matrix(
@@ -166,7 +166,7 @@ class Survey(Displayed):
         x, y = product.raster(SIZE)
         matrix, covariance, slopes = product.over_field(x, y, settings, NODES, TOLERANCE)
         structure = covariance - slopes @ product.covariance @ slopes.swapaxes(1, 2)
-        seen = measures_u(matrix)
+        seen = measures_u(matrix.reshape(-1, 2, 3))
         return (matrix[seen], slopes[seen], structure[seen], float(np.mean(~seen))) if seen.any() else None
 
     @property

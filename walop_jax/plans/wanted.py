@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from walop_jax.calibration.matrix import matrix_slopes, p_forms, sample_stars
-from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
+from walop_jax.calibration.accuracy import measures_u, p_forms, sample_stars
+from walop_jax.calibration.matrix import matrix_slopes
 from walop_jax.data.schema import Column
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import InputTable, numeric_column
@@ -159,10 +159,9 @@ def _at(
                     f"{plan.name} does not measure q and u in one exposure: the error of p depends on how stars are "
                     f"observed; plan for a parameter instead, such as --criterion {found.names[0]}"
                 )
-            blind = np.abs(np.linalg.det(m[:, :, 1:])) < SMALLEST_DETERMINANT
             form = p_forms(m.reshape(len(x), 6), stars)
             square = np.einsum("pni,pnj->pij", form, form) / form.shape[1]
-            forms.append(np.where(blind[:, None, None], 0.0, square))
+            forms.append(np.where(measures_u(m)[:, None, None], square, 0.0))
             slopes.append(slope.reshape(len(x), 6, -1) @ select)
     return np.concatenate(slopes), np.concatenate(forms)
 

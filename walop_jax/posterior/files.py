@@ -25,8 +25,8 @@ import h5py
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.product import read_calibration
+from walop_jax.calibration.calibration import Calibration, Product
+from walop_jax.calibration.product import read_calibration, read_product
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet, InputFile
 from walop_jax.fit.model_file import model_for
@@ -284,9 +284,9 @@ class Run(Result):
         return self.folder / name
 
     @functools.cached_property
-    def product(self) -> Calibration | None:
-        """The calibration as its file holds it, its model not rebuilt."""
-        return read_calibration(self.folder, self.catalogue, rebuild=False) if PRODUCT in self else None
+    def product(self) -> Product | None:
+        """Contents of the file of the calibration, its model not rebuilt."""
+        return read_product(self.folder) if PRODUCT in self else None
 
     @functools.cached_property
     def calibration(self) -> Calibration | None:
@@ -345,7 +345,7 @@ class Run(Result):
         those of the calibration were, and the verdict is its verdict.
         """
         calibration, calset = self.rebuilt, self.calset
-        text = "\n".join(calibration.model_lines) if model_text is None else model_text
+        text = "\n".join(calibration.product.model_lines) if model_text is None else model_text
         model = model_for(calset, text, calibration.design, self.catalogue)
         if model.names != calibration.model.names:
             advice = "run walop-jax refit with this model first"

@@ -48,14 +48,19 @@ class Nuts(Sampler):
     def start(self, density: Density, seed: Sequence[int]) -> State:
         """One walker from a draw of the Laplace approximation, after the warm-up."""
         first = np.random.default_rng(seed).standard_normal(density.dimension)
-        key, tuning = np.random.SeedSequence(seed).generate_state(1), _StepSize()
-        for chain, info in _chain(density, first, key, range(self.warm_up), lambda: tuning.trial):
-            tuning.learn(float(info.acceptance_rate))
+        key = np.random.SeedSequence(seed).generate_state(1)
+        adaptation = importlib.import_module("blackjax.adaptation.step_size")
+        begin, learn, settled = adaptation.dual_averaging_adaptation(TARGET_ACCEPTANCE)
+        tuning = [begin(FIRST_STEP)]
+        for chain, info in _chain(
+            density, first, key, range(self.warm_up), lambda: np.exp(tuning[0].log_step_size)
+        ):
+            tuning[0] = learn(tuning[0], info.acceptance_rate)
             first = np.asarray(chain.position)
         return {
             "position": first,
             "key": key,
-            "step_size": np.array(tuning.settled),
+            "step_size": np.array(settled(tuning[0]) if self.warm_up else FIRST_STEP),
             "steps": np.array(self.warm_up),
         }
 
@@ -108,26 +113,3 @@ def _kernels(with_gradient: Callable[..., tuple[Array, Array]]) -> tuple[Callabl
         return kernel.step(key, state)
 
     return compiled(begin), compiled(step)
-
-
-class _StepSize:
-    """Dual averaging of the step size (Hoffman & Gelman 2014, section 3.2.1, their constants)."""
-
-    def __init__(self, first: float = FIRST_STEP) -> None:
-        self._centre = np.log(10 * first)
-        self._log, self._mean, self._error, self._count = np.log(first), np.log(first), 0.0, 0
-
-    def learn(self, acceptance: float) -> None:
-        self._count += 1
-        m = self._count
-        self._error += (TARGET_ACCEPTANCE - acceptance - self._error) / (m + 10)
-        self._log = self._centre - np.sqrt(m) / 0.05 * self._error
-        self._mean += m**-0.75 * (self._log - self._mean)
-
-    @property
-    def trial(self) -> float:
-        return float(np.exp(self._log))
-
-    @property
-    def settled(self) -> float:
-        return float(np.exp(self._mean))

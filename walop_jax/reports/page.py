@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jinja2
 from matplotlib.figure import Figure
 
-from walop_jax.calibration.product import read_calibration
+from walop_jax.calibration.product import read_product
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.findings import sentences
 from walop_jax.diagnosis.limits_found import DetectionLimits
@@ -212,7 +212,7 @@ def _pulls(run: RunContents) -> list[dict[str, Any]]:
     if run.product is None:
         return []
     c, pulls = run.product, []
-    for p, value, sigma in zip(c.fitted.parameters, c.values.tolist(), c.sigma.tolist(), strict=True):
+    for p, value, sigma in zip(c.parameters, c.values.tolist(), c.sigma.tolist(), strict=True):
         if p.free and p.tie is None and p.prior is not None and sigma > 0:
             pulls.append((p, p.prior, value, sigma, (value - p.prior[0]) / p.prior[1]))
     return [
@@ -361,9 +361,7 @@ def _of_epoch(folder: Path, document: Mapping[str, Any]) -> Pictures:
     if document["fits"] is None or document.get("same"):
         return [], ()
     try:
-        old, new = (
-            read_calibration(Path(path), rebuild=False).maps for path in (document["old_file"], folder)
-        )
+        old, new = (read_product(Path(path)).maps for path in (document["old_file"], folder))
         drawn = figures.matrix_change_figure(old, new)
     except (ValueError, OSError, KeyError, TypeError) as error:
         return [], (f"The change of the instrument matrix is not drawn: {error}.",)

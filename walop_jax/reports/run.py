@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.calibration import Calibration, Product
 from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, figure_data, read_figure_data
@@ -115,7 +115,8 @@ class FigureSource(Run):
     @functools.cached_property
     def prior_width(self) -> Mapping[str, float]:
         """Widths of the priors by name, as far as they are known."""
-        return {} if self.product is None else self.product.prior_width
+        parameters = () if self.product is None else self.product.parameters
+        return {p.name: np.nan if p.prior is None else p.prior[1] for p in parameters}
 
     @property
     def examined(self) -> int:
@@ -139,8 +140,8 @@ class FigureSource(Run):
         return self.stored.maps
 
     @property
-    def stored(self) -> Calibration:
-        """The calibration as its file holds it."""
+    def stored(self) -> Calibration | Product:
+        """Contents of the file, or the calibration in memory."""
         self.wanted(PRODUCT, "give the RUN of walop-jax refit or diagnose")
         assert self.product is not None
         return self.product
@@ -162,7 +163,7 @@ class RunContents:
 
     source: FigureSource
     summary: dict[str, Any]
-    product: Calibration | None
+    product: Calibration | Product | None
     diagnosis: dict[str, Any] | None
     figure_data: DiagnosisFigureData | None
     sample: dict[str, Any] | None

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.calibration import Calibration, Product
 from walop_jax.data.records import CALIBRATION_PLATE, POLARISER
 from walop_jax.fit.parameter_table import PRIOR_ONLY
 from walop_jax.fit.verdict import Quality
@@ -132,7 +132,7 @@ _MANY = 12
 _KINDS = {"clp": "through the polariser", "moon": "of the Moon sky", "standard": "of standard stars"}
 
 
-def data_in_words(product: Calibration) -> list[tuple[str, str]]:
+def data_in_words(product: Calibration | Product) -> list[tuple[str, str]]:
     """Nights, exposures, polariser angles, plate settings, Moon patches, standards, temperatures, filters."""
     e = product.exposures
     kinds = ", ".join(
@@ -195,10 +195,10 @@ def _range(values: Float[np.ndarray, " e"], unit: str) -> str:
     return with_minus_sign(f"{low} {unit}" if low == high else f"{low} to {high} {unit}")
 
 
-def model_entries(product: Calibration) -> dict[str, dict[str, str]]:
+def model_entries(product: Calibration | Product) -> dict[str, dict[str, str]]:
     """Start, prior, and state (fixed, tied to another, known from its prior only) of every parameter, by name."""
     found = {}
-    for p, sigma in zip(product.fitted.parameters, product.sigma, strict=True):
+    for p, sigma in zip(product.parameters, product.sigma, strict=True):
         state = "" if p.free else "fixed"
         if p.tie is not None:
             state = f"tied to {p.tie}"

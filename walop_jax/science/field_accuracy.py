@@ -14,10 +14,10 @@ import functools
 import numpy as np
 from jaxtyping import Bool, Float
 
+from walop_jax.calibration.accuracy import measures_u, p_errors, p_forms, sample_stars
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import CouldHide, could_hide, off_by, unmeasured
-from walop_jax.calibration.matrix import p_errors, p_forms, sample_stars
-from walop_jax.calibration.thresholds import GOAL, SMALLEST_DETERMINANT
+from walop_jax.calibration.thresholds import GOAL
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import two_digits
 from walop_jax.likelihood.inverses import whitening
@@ -121,11 +121,6 @@ class FieldAccuracy:
         return tuple(lines)
 
 
-def measures_u(matrix: Float[np.ndarray, "p 6"]) -> Bool[np.ndarray, " p"]:
-    """Places where one exposure measures q and u, by the determinant of the 2 × 2 part of its matrix."""
-    return np.abs(np.linalg.det(matrix.reshape(-1, 2, 3)[:, :, 1:])) >= SMALLEST_DETERMINANT
-
-
 def reached(error: Float[np.ndarray, "*p"]) -> float:
     """The error that `SHARE` of some places stay below; NaN without a place."""
     return float(np.quantile(error, SHARE)) if error.size else np.nan
@@ -172,8 +167,8 @@ def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy 
     settings = calibration.usual_settings(filter_name=calibration.usual_filter)
     x, y = np.concatenate([calibration.raster(size), calibration.raster(COARSE)], axis=1)
     matrix, covariance, slopes = calibration.over_field(x, y, settings, NODES, TOLERANCE)
-    error = p_errors(matrix[: size**2], covariance[: size**2], sample_stars()).reshape(size, size)
-    with_u = measures_u(matrix[: size**2]).reshape(size, size)
+    error = p_errors(matrix[: size**2], covariance[: size**2]).reshape(size, size)
+    with_u = measures_u(matrix[: size**2].reshape(-1, 2, 3)).reshape(size, size)
     mistakes = could_hide(calibration)
     worst = mistakes[0] if mistakes else None
     nothing = np.nan if calibration.hidden is None else 0.0

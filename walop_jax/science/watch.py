@@ -152,7 +152,7 @@ def with_rivals(calibration: Calibration) -> Calibration:
     values[old] = calibration.values
     covariance[np.ix_(old, old)] = calibration.covariance
     covariance[new, new] = _CERTAIN**2
-    return dataclasses.replace(calibration, fitted=model, values=values, covariance=covariance, hidden=None)
+    return dataclasses.replace(calibration, model=model, values=values, covariance=covariance, hidden=None)
 
 
 def grouped(

@@ -1,0 +1,75 @@
+"""Errors of calibrated stars that errors of the instrument matrix make: of p on average, of q and u at worst.
+
+Stars       q, u with p ≤ 5 %, evenly, at any angle.
+Impact      m = m₀ + A s with s = (q, u), so a star that is calibrated with (m₀, A) while (m₀ + δm₀, A + δA) is true
+            comes out wrong by A⁻¹ (δm₀ + δA s), at most |A⁻¹ δm₀| + p ‖A⁻¹ δA‖.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
+
+STARS, LARGEST_P = 100, 0.05
+
+
+def sample_stars(count: int = STARS, seed: int = 0) -> Float[np.ndarray, "n 2"]:
+    """(q, u) of sources with p evenly up to `LARGEST_P` and any angle."""
+    rng = np.random.default_rng(seed)
+    p, angle = rng.uniform(0.0, LARGEST_P, count), rng.uniform(0.0, np.pi, count)
+    return np.stack([p * np.cos(2 * angle), p * np.sin(2 * angle)], axis=1)
+
+
+def p_errors(
+    matrix: Float[np.ndarray, "p 6"],
+    covariance: Float[np.ndarray, "p 6 6"],
+    stars: Float[np.ndarray, "n 2"] | None = None,
+) -> Float[np.ndarray, " p"]:
+    """Error of p for stars (q, u; None: `sample_stars`), rms over them, from the matrix and its covariance."""
+    form = p_forms(matrix, sample_stars() if stars is None else stars)
+    variance = np.einsum("pni,pij,pnj->pn", form, covariance, form, optimize=True)
+    return np.sqrt(np.mean(variance, axis=1))
+
+
+def p_forms(
+    matrix: Float[np.ndarray, "p 6"], stars: Float[np.ndarray, "*b n 2"]
+) -> Float[np.ndarray, "p n 6"]:
+    """δp = −e · M⁻¹ · (δm s) of every star as a linear form of the six elements; the same stars (q, u), or of each."""
+    stars = np.broadcast_to(stars, (len(matrix), *stars.shape[-2:]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        (a, b), (c, d) = matrix[:, 1:3].T, matrix[:, 4:].T
+        inverse = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], 1) / (a * d - b * c)[:, None, None]
+        along = stars / np.hypot(stars[..., :1], stars[..., 1:])
+        s = np.concatenate([np.ones((*stars.shape[:2], 1)), stars], axis=2)
+        left = np.einsum("pnc,pcr->pnr", along, inverse)
+        return np.einsum("pnr,pns->pnrs", left, s).reshape(*stars.shape[:2], 6)
+
+
+def measures_u(matrix: Float[np.ndarray, "p 2 3"]) -> Bool[np.ndarray, " p"]:
+    """Places where one exposure measures q and u, by the determinant of the 2 × 2 part of its matrix."""
+    return np.abs(np.linalg.det(matrix[:, :, 1:])) >= SMALLEST_DETERMINANT
+
+
+def change_of_qu(
+    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
+) -> Float[np.ndarray, " p"]:
+    """Largest error of q and u at each field point for stars polarised by up to `p`; NaN where not measured."""
+    found = np.full(len(assumed), np.nan)
+    if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
+        return found
+    good = measures_u(assumed)
+    inverse = np.linalg.inv(assumed[good, :, 1:])
+    change = (true - assumed)[good]
+    offset = np.linalg.norm(inverse @ change[:, :, :1], axis=(1, 2))
+    found[good] = offset + p * np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
+    return found
+
+
+def largest_change(
+    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
+) -> float:
+    """Largest of `change_of_qu` over the field; NaN when no point holds both q and u."""
+    found = change_of_qu(assumed, true, p)
+    return float(np.nanmax(found)) if np.isfinite(found).any() else float("nan")
