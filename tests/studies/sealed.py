@@ -354,7 +354,7 @@ def counts(
     light = np.zeros((len(row), 4))
     for number, (name, teff, _) in enumerate(data["configurations"]):
         here = data["configuration"] == number
-        band = forward.gauss(*forward.band(*data["filters"][name], teff), NODES)
+        band = forward.gauss(*forward.band(*data["filters"][name][:2], teff), NODES)
         plain, added = vectors(params, x, y, band, one)
         seen = plain[row[here]] + g[here, None, None] * added[row[here]]
         light[here] = np.einsum("rki,ri->rk", seen, state[here])
@@ -567,12 +567,12 @@ def table(found: list[Outcome]) -> str:
         return f"{count} of {of}" + (f" ({100 * count / of:.1f} %)" if of else "")
 
     products = [one for one in found if one.after is not None]
-    fits = [one for one in found if one.before is not None]
     rows = []
-    for name, some in (
-        ("fit", [(o, o.before) for o in fits]),
-        ("diagnosis", [(o, o.after) for o in products]),
-    ):
+    judged = {
+        "fit": [(o, o.before) for o in found if o.before is not None],
+        "diagnosis": [(o, o.after) for o in found if o.after is not None],
+    }
+    for name, some in judged.items():
         trusted = [(o, j) for o, j in some if j.trusted]
         rows.append((f"{name}: trusted", rate(len(trusted), len(some))))
         seen = [(o, j) for o, j in trusted if o.held >= HELD]
@@ -584,10 +584,10 @@ def table(found: list[Outcome]) -> str:
         )
         rows.append((f"{name}: trusted and wrong, all", rate(sum(j.wrong for _, j in trusted), len(trusted))))
     both = [o for o in products if o.before is not None]
-    worse = [o for o in both if o.after.error > WORSE * o.before.error]
+    worse = [o for o in both if o.after and o.before and o.after.error > WORSE * o.before.error]
     rows.append(("matrix worse by more than 1.2 × after the diagnosis", rate(len(worse), len(both))))
-    rows.append(("that, and trusted", rate(sum(o.after.trusted for o in worse), len(both))))
-    disagree = [o for o in both if o.before.trusted and o.p < 1e-4]
+    rows.append(("that, and trusted", rate(sum(bool(o.after and o.after.trusted) for o in worse), len(both))))
+    disagree = [o for o in both if o.before and o.before.trusted and o.p < 1e-4]
     rows.append(("fit trusted while the diagnosis has p < 10⁻⁴", rate(len(disagree), len(both))))
     null = [o for o in found if o.text == "nothing"]
     rows.append(
@@ -616,7 +616,7 @@ def table(found: list[Outcome]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sets", type=int, default=400)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=53)

@@ -22,13 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from walop_jax.calibration.matrix import (
-    SMALLEST_DETERMINANT,
-    first_setting,
-    matrix_slopes,
-    p_errors,
-    sample_stars,
-)
+from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
+from walop_jax.calibration.matrix import first_setting, matrix_slopes
 from walop_jax.diagnosis.class_average import distinct, moved, probabilities
 from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum
 from walop_jax.diagnosis.examination import Examination
@@ -152,8 +147,7 @@ class _Laid:
         off = float(far[weights > PLAUSIBLE].max(initial=0.0))
         within = self.slopes @ covariance_of_free(self.fit) @ np.swapaxes(self.slopes, 1, 2)
         if self.matrix.shape[1] == 6:
-            blocks = self.matrix.reshape(-1, 2, 3)[:, :, 1:]
-            good = np.abs(np.linalg.det(blocks)) > SMALLEST_DETERMINANT
+            good = measures_u(self.matrix)
             each = [p_errors(self.matrix[good], part[good], sample_stars()) for part in (between, within)]
         else:  # no single exposure gives q and u
             each = [

@@ -18,13 +18,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.thresholds import GOAL
 from walop_jax.diagnosis.class_average import known_apart_from, mixture
 from walop_jax.diagnosis.policy import POLICY
 from walop_jax.io.text import some, two_digits
 from walop_jax.model.effects import Context, Described
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.specification import Model, model_without, with_effects
-from walop_jax.science.star_errors import GOAL
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
@@ -113,7 +113,7 @@ def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Cont
         changes[:, place] = hidden.changes
         hidden = dataclasses.replace(hidden, changes=changes)
     return dataclasses.replace(
-        calibration, fitted=model, values=values, covariance=_positive(covariance), hidden=hidden
+        calibration, model=model, values=values, covariance=_positive(covariance), hidden=hidden
     )
 
 
