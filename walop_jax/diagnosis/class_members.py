@@ -147,7 +147,7 @@ class _Laid:
         off = float(far[weights > PLAUSIBLE].max(initial=0.0))
         within = self.slopes @ covariance_of_free(self.fit) @ np.swapaxes(self.slopes, 1, 2)
         if self.matrix.shape[1] == 6:
-            good = measures_u(self.matrix)
+            good = measures_u(self.matrix.reshape(-1, 2, 3))
             each = [p_errors(self.matrix[good], part[good], sample_stars()) for part in (between, within)]
         else:  # no single exposure gives q and u
             each = [
