@@ -36,6 +36,7 @@ OWNERS = {
     "optimistix": {"fit"},
     "emcee": {"posterior"},
     "arviz": {"posterior"},
+    "arviz_stats": {"posterior"},
     "matplotlib": {"reports"},
     "corner": {"reports"},
     "jinja2": {"reports"},
@@ -150,7 +151,9 @@ def test_docstrings_open_with_what_comes_back():
 def test_every_library_is_declared():
     """What the package imports beyond Python itself stands in the dependencies of pyproject.toml."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
-    declared = {re.split(r"[<>=!~\[; ]", entry)[0].lower() for entry in project["dependencies"]}
+    declared = {
+        re.split(r"[<>=!~\[; ]", entry)[0].lower().replace("-", "_") for entry in project["dependencies"]
+    }
     used = {
         name.split(".")[0]: module_name(path)
         for path in files()

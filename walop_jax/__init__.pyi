@@ -52,9 +52,9 @@ from walop_jax.model.instrument import Instrument as Instrument
 from walop_jax.model.parameters import param as param
 from walop_jax.model.specification import Model as Model
 from walop_jax.model.specification import with_effects as with_effects
-from walop_jax.posterior.files import Run as Run
 from walop_jax.posterior.result import Options as Options
 from walop_jax.posterior.result import arviz_of_fit as _to_arviz  # noqa: F401
+from walop_jax.posterior.run import Run as Run
 from walop_jax.simulation.observing_plan import ObservingPlan as ObservingPlan
 
 __version__: str

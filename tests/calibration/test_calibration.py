@@ -94,9 +94,9 @@ def test_what_was_read_is_written_again_byte_for_byte(calibration, product_file,
 
 
 def test_rows_are_computed_each_with_its_own_numbers(calibration):
-    """Colour temperature, point and plate go by row, whatever stands beside it, across chunks too."""
+    """Colour temperature, point and plate go by row, whatever stands beside it, across batches too."""
     rng = np.random.default_rng(1)
-    count = 40  # more than a small chunk
+    count = 40  # more than a small batch
     x, y = rng.uniform(-0.25, 0.25, (2, count))
     teff = np.where(rng.random(count) < 0.3, np.nan, rng.uniform(3000, 9000, count))
     plate = np.where(rng.random(count) < 0.5, np.nan, 45.0)

@@ -36,7 +36,7 @@ def maps(arms: int, positions: dict[str, float]) -> MatrixMaps:
 def residuals(arms: int, positions: dict[str, float]) -> ResidualMap:
     values = np.arange((4.0 * arms - 1) * 12).reshape(-1, 3, 4)
     values[0, 1, 1] = NAN
-    return ResidualMap(GRID, "SDSS-r", values, values + 0.5, np.ones((3, 4)), {"CHWP": 45.0} | positions)
+    return ResidualMap(GRID, "SDSS-r", values, values + 0.5, np.ones((3, 4)), {"CHWP": 45.0, **positions})
 
 
 def product_of(calset, arms: int, positions: dict[str, float]) -> Product:

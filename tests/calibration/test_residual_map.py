@@ -15,7 +15,6 @@ from walop_jax.data.records import Block
 from walop_jax.data.settings import Settings
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.model_file import base_model
-from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.parameters import values_of
 from walop_jax.model.planning import plan_for_settings
@@ -71,7 +70,7 @@ def noiseless():
 @pytest.fixture
 def cells(monkeypatch):
     """Six by six cells of sixteen points."""
-    monkeypatch.setattr(limits, "POINTS_PER_CELL", 16)
+    monkeypatch.setattr(residual_map, "POINTS_PER_CELL", 16)
 
 
 def likelihood_of(calset):

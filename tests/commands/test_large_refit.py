@@ -29,7 +29,7 @@ RUN = ObservingPlan(
 LARGE = """
 import sys
 from walop_jax.likelihood import limits
-limits.LARGE_ABOVE, limits.LARGE_CHUNK, limits.SAMPLE = 0, 256, 1024
+limits.LARGE_ABOVE, limits.LARGE_BATCH, limits.SAMPLE = 0, 256, 1024
 from walop_jax.commands import main
 main()
 """

@@ -42,7 +42,7 @@ def frames(tmp_path_factory) -> Path:
 @pytest.fixture
 def large(monkeypatch):
     """Every set is handled like whole frames, in slabs of 64 points, and every slab is told of."""
-    for name, value in (("INTERPOLATE_ABOVE", 512), ("LARGE_ABOVE", 0), ("LARGE_CHUNK", 64), ("SAMPLE", 256)):
+    for name, value in (("INTERPOLATE_ABOVE", 512), ("LARGE_ABOVE", 0), ("LARGE_BATCH", 64), ("SAMPLE", 256)):
         monkeypatch.setattr(limits, name, value)
     monkeypatch.setattr(runner, "TOLD_EVERY", -1.0)
 

@@ -11,7 +11,7 @@ import pytest
 
 from walop_jax.calibration.product import read_product
 from walop_jax.data.user_tables import read_input_table
-from walop_jax.posterior.files import read_draws
+from walop_jax.posterior.draws import read_draws
 
 OWN = f"{Path(__file__).resolve().parents[1] / 'posterior' / 'random_walk.py'}:Metropolis"
 

@@ -13,7 +13,7 @@ from walop_jax.commands.refit import refit
 from walop_jax.commands.sample import OUTPUTS, sample
 from walop_jax.fit.refit import FitResult, covariance
 from walop_jax.io.errors import DataError
-from walop_jax.posterior.files import Run
+from walop_jax.posterior.run import Run
 
 from .conftest import FittedSet, assert_same_files
 

@@ -57,6 +57,21 @@ def test_frames_equal_the_table(scene, tmp_path):
         same(frames.intensities.block(start, stop), table.intensities.block(start, stop))
 
 
+def test_frames_in_another_unit_are_converted_and_all_have_one(scene, tmp_path):
+    write_frames(tmp_path / "plain.fits", scene, GRID, dtype="f8")
+    plain = read_calibration_set(tmp_path / "plain.fits").intensities.block(0, 35)
+    with fits.open(tmp_path / "plain.fits", memmap=False) as hdus:
+        for name in [f"{letter}{k}" for letter in "NE" for k in range(4)]:
+            hdus[name].data = hdus[name].data / 1024.0
+            hdus[name].header["BUNIT"] = "1024 electron"
+        hdus.writeto(tmp_path / "kilo.fits", checksum=True)
+        hdus["E2"].header.remove("BUNIT")
+        hdus.writeto(tmp_path / "mixed.fits", checksum=True)
+    same(read_calibration_set(tmp_path / "kilo.fits").intensities.block(0, 35), plain)
+    with pytest.raises(DataError, match=r"\[BUNIT\] E2: has no unit, N0 is in 1024 electron"):
+        read_calibration_set(tmp_path / "mixed.fits")
+
+
 def test_single_precision_frames(scene, tmp_path):
     path = tmp_path / "frames.fits"
     write_frames(path, scene, GRID)

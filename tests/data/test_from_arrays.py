@@ -39,7 +39,7 @@ def made(**changes) -> CalibrationSet:
     [
         (
             {"counts": light()[..., :2], "errors": light()[..., :2]},
-            r"counts: has 2 camera\(s\), WALOP-SOUTH has 4; .* correct the name of the instrument",
+            r"N: has 2 camera\(s\), WALOP-SOUTH has 4; .* correct the name of the instrument",
         ),
         (
             {"filters": {"B": ([0.44], [1.0])}},

@@ -141,6 +141,7 @@ GAIA = 4658219876543210000 + np.array([0, 64, 128, 192, 256])
         [-1.0, np.nan, -99.0, 7.0, 8.0],
         ["", " ", "nan", "a", "b"],
         ["-1", "N/A", "None", "a", "b"],
+        ["-5", "-5", "-5", "007", "7"],
         MaskedColumn([5, 5, 5, 5, 6], mask=[1, 1, 1, 0, 0]),
         np.array([np.iinfo(np.uint64).max] * 3 + [1, 2], np.uint64),
         np.array([None, None, None, "a", "b"], object),
@@ -207,6 +208,16 @@ def test_a_copy_in_single_precision_is_a_copy():
     given = twice()
     given["N"][-1] = given["N"][-1].astype(np.float32)
     assert read(given).copy.tolist() == [False] * 5 + [True]
+
+
+@pytest.mark.parametrize("lacking", [0, 5], ids=["the first", "the copy"])
+def test_a_copy_that_lacks_a_camera_is_a_copy(lacking):
+    """What is left of it is the row with all cameras."""
+    given = twice()
+    given["N"][lacking, 2] = np.nan
+    found = read(given)
+    assert np.flatnonzero(found.copy).tolist() == [lacking]
+    assert not found.repeated.any()
 
 
 def test_the_same_counts_under_another_identifier_or_setting_are_flagged():
@@ -407,6 +418,18 @@ def test_units_that_are_no_counts_are_refused_with_advice(unit, message):
         read(given)
 
 
+@pytest.mark.parametrize("name", ["N", "N_ERR"])
+def test_counts_in_a_unit_and_errors_without_one_are_refused(name):
+    given = table()
+    given[name] = given[name] / 1e3
+    given[name].unit = "1000 electron"
+    other = "N_ERR" if name == "N" else "N"
+    with pytest.raises(DataError, match=rf"{other}: has no unit, {name} is in 1000 electron"):
+        read(given)
+    given[other].unit = "electron"
+    np.testing.assert_allclose(read(given).counts, table()["N"], rtol=1e-14)
+
+
 def test_columns_of_one_value_are_numbers_and_structures_are_refused():
     given = table()
     given["X"] = np.asarray(given["X"])[:, None]
@@ -474,6 +497,22 @@ def test_what_is_not_clear_is_refused_with_advice(tmp_path, content, message):
     with pytest.raises(DataError, match=message) as caught:
         field_points(read_input_table(tmp_path / "d.csv"), SOUTH)
     assert "d.csv" in str(caught.value)
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", "|"])
+def test_rows_that_are_too_short_are_refused_with_their_number(tmp_path, separator):
+    (tmp_path / "d.csv").write_text(commas_to(separator) + commas_to(separator, "0.1,0.1,2000,2001\n"))
+    with pytest.raises(DataError, match=r"d\.csv: has not as many cells as line 1 in row 2 "):
+        read_input_table(tmp_path / "d.csv")
+
+
+@pytest.mark.parametrize("ids", [("007", "7"), ("7.10", "7.1"), ("7", "7.0")])
+def test_identifiers_of_a_text_are_texts(tmp_path, ids):
+    one, other = PLAIN.replace(",a b,", f",{ids[0]},"), PLAIN.splitlines()[2].replace(",c,", f",{ids[1]},")
+    (tmp_path / "d.csv").write_text("\n".join([*one.splitlines()[:2], other]) + "\n")
+    found = read_input_table(tmp_path / "d.csv")
+    assert len(set(read_catalogue(found, SOUTH).star.tolist())) == 2
+    assert list(found.table["ID"]) == list(ids)
 
 
 # -------------------------------------------------------------------------------------------- packed files, extensions

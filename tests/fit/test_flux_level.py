@@ -7,8 +7,7 @@ import pytest
 
 import walop_jax as walop
 from walop_jax.data.merge import merge_calibration_sets
-from walop_jax.fit.model_file import LEVEL, base_model
-from walop_jax.likelihood import limits
+from walop_jax.fit.model_file import LEVEL, LEVEL_POINTS, base_model
 
 ANGLES = [0.0, 30.0, 60.0, 90.0]
 
@@ -19,7 +18,7 @@ def a_set(points: int, kind: str, counts: float, first: float):
     return walop.from_arrays(values, 1e-3 * np.abs(values), x, 0.0 * x, ANGLES, kind)
 
 
-@pytest.mark.parametrize("before", [2, limits.LEVEL_POINTS + 44])
+@pytest.mark.parametrize("before", [2, LEVEL_POINTS + 44])
 def test_light_of_known_flux_says_the_level_wherever_it_stands(before):
     """Of unpolarised light a camera gets half: N = 0.2 of unit flux is a throughput of 0.4."""
     merged = merge_calibration_sets(a_set(before, "clp", 1e5, -0.1), a_set(5, "flux", 0.2, 0.0))

@@ -10,14 +10,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from walop_jax.fit.minimise import (
-    LEAST_GAIN,
-    PATIENCE,
-    ROUGH,
-    WELL_PREDICTED,
-    distance_to_minimum,
-    minimise,
-)
+from walop_jax.fit.minimise import ROUGH, ROUNDING, WELL_PREDICTED, distance_to_minimum, minimise
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,18 +60,16 @@ def test_a_linear_problem_takes_one_step():
 
 
 def test_the_last_step_need_not_be_looked_at():
-    """Newton steps square what is left: what the last one leaves is known before."""
-    seen = exponential(), exponential()
-    start = np.array([1.101])
-    looked, unlooked = (
-        minimise(f, start, np.ones(1), damping=0.0, tolerance=1e-7, look_at_end=look)
-        for f, look in zip(seen, (True, False), strict=True)
-    )
-    assert seen[1].looked == seen[0].looked - 1
-    for found in (looked, unlooked):
-        assert found.converged
-        assert found.x[0] == pytest.approx(np.log(3.0), abs=1e-8)
-    assert 0.0 < unlooked.scaled_gradient < 1e-7
+    """Newton steps square what is left: what the last one leaves is known before.
+
+    Of exp(x) = 3 an error e leaves e²/2, so that 2.4·10⁻³, 2.9·10⁻⁶ and 4·10⁻¹² follow: the last of them unseen.
+    """
+    squares = exponential()
+    found = minimise(squares, np.array([1.101]), np.ones(1), damping=0.0, tolerance=1e-7)
+    assert found.converged
+    assert squares.looked == 2
+    assert found.x[0] == pytest.approx(np.log(3.0), abs=1e-8)
+    assert found.scaled_gradient < 1e-7
 
 
 def test_after_a_step_upwards_steps_are_damped():
@@ -101,21 +92,6 @@ def test_after_a_step_upwards_steps_are_damped():
 # ------------------------------------------------------------------------------------- far from the data
 
 
-def slowly():
-    """Residuals that no parameter explains, and one that falls as slowly as its parameter grows: 1 + 1/x for ever."""
-    return Squares(lambda x: np.array([1e3, 1.0 / x[0]]), lambda x: np.array([[0.0], [-1.0 / x[0] ** 2]]))
-
-
-def test_a_model_that_is_far_off_is_given_up_when_steps_buy_nothing():
-    patient = minimise(slowly(), np.ones(1), np.ones(1), tolerance=1e-12, maximum_steps=100)
-    hopeless = minimise(
-        slowly(), np.ones(1), np.ones(1), tolerance=1e-12, maximum_steps=100, far_off=lambda _: True
-    )
-    assert hopeless.steps < patient.steps / 4
-    assert f"{PATIENCE} more steps lowered χ² by less than" in hopeless.message or hopeless.converged
-    assert hopeless.expansion.objective < (1.0 + LEAST_GAIN) * patient.expansion.objective
-
-
 def test_a_model_that_is_far_off_is_found_to_a_tenth_of_its_error_where_steps_close_in_slowly():
     """Large residuals that bend make Gauss–Newton steps close in by a constant factor: r = (x, 5 + x²/12)."""
     bent = Squares(
@@ -131,6 +107,12 @@ def test_a_model_that_is_far_off_is_found_to_a_tenth_of_its_error_where_steps_cl
     assert abs(rough.x[0]) < 0.1 * 2.0
 
 
+def test_a_model_that_is_far_off_is_found_exactly_where_steps_close_in_fast():
+    found = minimise(exponential(), np.array([1.15]), np.ones(1), far_off=lambda _: True)
+    assert found.converged
+    assert found.x[0] == pytest.approx(np.log(3.0), abs=2e-3)
+
+
 def test_work_is_bounded_and_the_best_place_so_far_comes_back():
     squares = rosenbrock()
     found = minimise(squares, np.array([-1.2, 1.0]), np.ones(2), maximum_steps=5)
@@ -138,6 +120,21 @@ def test_work_is_bounded_and_the_best_place_so_far_comes_back():
     assert not found.converged
     assert "not converged after 5 steps" in found.message
     assert found.expansion.objective == min(found.history) == squares(found.x).objective
+
+
+def test_steps_to_and_fro_across_a_valley_are_damped():
+    """r = (x, 5 + k x²) is bent by 1 + 10 k = 1.91 where Gauss and Newton have 1: each step leaves −0.91 of the way.
+
+    Undamped, 0.9 takes a hundred of them to 10⁻⁴.
+    """
+    k = 0.091
+    bent = Squares(
+        lambda x: np.array([x[0], 5.0 + k * x[0] ** 2]), lambda x: np.array([[1.0], [2.0 * k * x[0]]])
+    )
+    found = minimise(bent, np.array([0.9]), np.ones(1), damping=0.0)
+    assert found.converged
+    assert found.steps < 15
+    assert abs(found.x[0]) < 1e-3
 
 
 # -------------------------------------------------------------------------------------- what holds always
@@ -211,6 +208,16 @@ def test_a_function_that_cannot_be_lowered_is_given_up():
     assert "no step lowers" in found.message
     assert not found.converged
     assert abs(found.x[0]) < 1e-5  # as far as rounding hides that it leads upwards
+
+
+def test_an_end_within_rounding_is_a_minimum():
+    """The gradient is off by 5·10⁻⁷ of the square root of the objective, as that of interpolated optics may be."""
+    off = 0.5 * ROUNDING**0.5 * 1e3
+    found = minimise(
+        lambda x: Expansion(1e6 + float(x @ x), x + off, np.eye(1)), np.zeros(1), np.ones(1), tolerance=1e-5
+    )
+    assert found.converged
+    assert 1e-5 < found.scaled_gradient <= off * (1.0 + 1e-9)
 
 
 def test_nothing_to_vary_is_a_minimum():

@@ -89,9 +89,9 @@ def make_block(seed=3, noise=True, flux_known=True):
     return Block(x, y, counts, sigma, used, source), instrument
 
 
-def likelihood_of(block, rows=ROWS, points_per_chunk=None):
+def likelihood_of(block, rows=ROWS, batch=None):
     calset = calibration_set(block, rows)
-    return Likelihood.of(calset, base_model(calset, throughput_degree=2), points_per_chunk=points_per_chunk)
+    return Likelihood.of(calset, base_model(calset, throughput_degree=2), batch=batch)
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +213,7 @@ def test_matrix_is_the_fisher_information_with_fluxes_marginalised():
 def test_posterior_adds_the_priors(likelihood, values):
     """χ² of the priors and half its derivative, by hand, on top of the data's."""
     found = likelihood.expand(values)
-    normal = engine.dense_equations(
+    normal = engine.normal_equations(
         likelihood.model.instrument(values), likelihood.plan, next(iter(likelihood.points))
     )
     gradient, matrix, chi2 = np.array(normal.gradient), np.array(normal.matrix), 0.0
@@ -234,21 +234,6 @@ def test_posterior_adds_the_priors(likelihood, values):
     assert found.objective == pytest.approx(float(normal.chi2) + chi2 + loose, rel=1e-12)
     np.testing.assert_allclose(found.gradient, gradient[free], rtol=1e-12)
     np.testing.assert_allclose(found.matrix, matrix[np.ix_(free, free)], rtol=1e-12)
-
-
-def test_equations_from_all_rows_are_the_normal_equations(likelihood, values):
-    """Two programs of the same sums; counts of 10⁶ known to 10⁻³ leave 10⁻¹³ of a residual to rounding."""
-    arguments = likelihood.model.instrument(values), likelihood.plan, next(iter(likelihood.points))
-    dense, structured = engine.dense_equations(*arguments), engine.normal_equations(*arguments)
-    size = np.sqrt(np.diag(dense.matrix))
-    size[size == 0] = 1.0
-    assert float(structured.chi2) == pytest.approx(float(dense.chi2), rel=1e-9)
-    np.testing.assert_allclose(
-        structured.gradient / size, dense.gradient / size, rtol=0, atol=1e-9 * np.sqrt(dense.chi2)
-    )
-    np.testing.assert_allclose(
-        structured.matrix / np.outer(size, size), dense.matrix / np.outer(size, size), atol=1e-10
-    )
 
 
 def test_a_factor_on_the_errors_leaves_the_priors_alone(likelihood, values):
@@ -287,12 +272,12 @@ def changed(block, **changes):
     return dataclasses.replace(block, **changes)
 
 
-def test_chunks_change_nothing(block, likelihood, values):
-    """Seven points in chunks of three: the last one is padded."""
-    chunked = likelihood_of(block, points_per_chunk=3)
-    assert len(chunked.points) == 3
-    same(chunked.expand(values), likelihood.expand(values))
-    assert (chunked.dof, chunked.census.n_data) == (likelihood.dof, likelihood.census.n_data)
+def test_batches_change_nothing(block, likelihood, values):
+    """Seven points in batches of three: the last one is padded."""
+    batched = likelihood_of(block, batch=3)
+    assert len(batched.points) == 3
+    same(batched.expand(values), likelihood.expand(values))
+    assert (batched.dof, batched.census.n_data) == (likelihood.dof, likelihood.census.n_data)
 
 
 def test_order_of_the_points_changes_nothing(block, likelihood, values):

@@ -24,9 +24,7 @@ RUN = frame_run(72)
 @pytest.fixture(scope="module")
 def made():
     calset = simulate(RUN, seed=12).calset
-    return Likelihood.of(
-        calset, base_model(calset, throughput_degree=2), points_per_chunk=512, interpolate=True
-    )
+    return Likelihood.of(calset, base_model(calset, throughput_degree=2), batch=512, interpolate=True)
 
 
 @pytest.fixture(scope="module")
@@ -39,12 +37,12 @@ def large(made, monkeypatch):
     """The same set, handled as if it were too large for many passes."""
     monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
     monkeypatch.setattr(limits, "SAMPLE", 1024)
-    return Likelihood.of(made.calset, made.model, points_per_chunk=512)
+    return Likelihood.of(made.calset, made.model, batch=512)
 
 
 def test_blocks_change_nothing(made):
-    """Chunks of 512 go in blocks of 64; chunks of 250 are one block each."""
-    other = Likelihood.of(made.calset, made.model, points_per_chunk=250, interpolate=True)
+    """Batches of 512 go in blocks of 64; batches of 250 are one block each."""
+    other = Likelihood.of(made.calset, made.model, batch=250, interpolate=True)
     one, two = made.expand(made.model.start), other.expand(made.model.start)
     size = np.sqrt(np.diag(two.matrix))
     assert one.data == pytest.approx(two.data, rel=1e-12)
@@ -83,7 +81,7 @@ def test_frames_and_table_path_agree_to_1e_8(made, monkeypatch):
     monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
     monkeypatch.setattr(search, "LARGE_TOLERANCE", 1e-6)
     monkeypatch.setattr(limits, "SAMPLE", 72)
-    frames = Likelihood.of(sample, made.model, points_per_chunk=16, interpolate=True)
+    frames = Likelihood.of(sample, made.model, batch=16, interpolate=True)
     assert frames.layout.large
     a, b = plain.expand(made.model.start), frames.expand(made.model.start)
     size = np.sqrt(np.diag(a.matrix))
@@ -109,14 +107,14 @@ def test_optimistix_on_residuals_in_memory_finds_the_same(made):
     """The reference: `optimistix.LevenbergMarquardt` on the residuals themselves, derivatives by JAX."""
     sample = thinned(made.calset, 20, neighbours=1)
     likelihood = Likelihood.of(sample, made.model)
-    model, chunks = likelihood.model, list(likelihood.points)
+    model, batches = likelihood.model, list(likelihood.points)
     scale = np.array([model.parameters[i].scale for i in model.free])
     select = model.selection() * scale
     to_instrument = with_values(model.instrument())
 
     def residuals(x, _):
         values = jnp.asarray(model.start) + select @ x
-        data = [engine._residuals(to_instrument(values), likelihood.plan, chunk)[1] for chunk in chunks]
+        data = [engine._residuals(to_instrument(values), likelihood.plan, batch)[1] for batch in batches]
         known = [(i, *p.prior) for i, p in enumerate(model.parameters) if p.free and p.prior is not None]
         free = [(i, p) for i, p in enumerate(model.parameters) if p.free and p.prior is None]
         pulled = [(i, p.start, p.loose) for i, p in free if p.loose is not None]
@@ -141,7 +139,7 @@ def test_optimistix_on_residuals_in_memory_finds_the_same(made):
 def test_misfit_of_a_large_set_is_that_of_points_spread_over_it(made, monkeypatch):
     values = made.model.start
     full = misfit.misfit_at(made, values)
-    monkeypatch.setattr(limits, "MISFIT_POINTS", 2560)
+    monkeypatch.setattr(misfit, "MISFIT_POINTS", 2560)
     some = misfit.misfit_at(made, values)
     assert some != full
     assert some.camera == pytest.approx(full.camera, rel=0.1)
@@ -151,9 +149,7 @@ def test_misfit_of_a_large_set_is_that_of_points_spread_over_it(made, monkeypatc
 def test_memory_is_bounded_by_what_is_allowed(made):
     """Small memory: small slabs, read anew; the estimate stays below what was allowed."""
     for memory in (1e9, 1e8, 5e6):
-        likelihood = Likelihood.of(
-            made.calset, made.model, points_per_chunk=64, interpolate=True, memory=memory
-        )
+        likelihood = Likelihood.of(made.calset, made.model, batch=64, interpolate=True, memory=memory)
         assert likelihood.layout.memory <= memory
     assert not likelihood.layout.kept
     again = likelihood.expand(made.model.start)

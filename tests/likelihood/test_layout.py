@@ -29,28 +29,28 @@ def model(calset):
 
 @pytest.mark.parametrize("memory", [1e9, 1e7, 2e6])
 @pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("chunk", [None, 7, 64, 10_000])
-def test_pieces_cover_the_set_within_its_memory(calset, model, memory, threads, chunk):
-    layout = Layout.of(calset, model, memory=memory, threads=threads, points_per_chunk=chunk)
+@pytest.mark.parametrize("batch", [None, 7, 64, 10_000])
+def test_pieces_cover_the_set_within_its_memory(calset, model, memory, threads, batch):
+    layout = Layout.of(calset, model, memory=memory, threads=threads, batch=batch)
     assert layout.points == 400
-    assert layout.chunk == min(chunk or limits.POINTS_PER_CHUNK, 400)
-    assert layout.slab % layout.chunk == 0
+    assert layout.batch == min(batch or limits.BATCH, 400)
+    assert layout.slab % layout.batch == 0
     assert (layout.slabs - 1) * layout.slab < 400 <= layout.slabs * layout.slab
-    assert (layout.chunks - 1) * layout.chunk < 400 <= layout.chunks * layout.chunk
+    assert (layout.batches - 1) * layout.batch < 400 <= layout.batches * layout.batch
     each = bytes_per_point(len(calset.exposures))
     assert layout.kept == (2 * each * 400 <= memory)
-    # One chunk for each thread is the least that there can be.
-    assert layout.memory <= max(memory, limits.READING * threads * each * layout.chunk)
+    # One batch for each thread is the least that there can be.
+    assert layout.memory <= max(memory, limits.READING * threads * each * layout.batch)
 
 
 def test_the_size_of_a_set_decides_how_it_is_handled(calset, model, monkeypatch):
     def handled():
         layout = Layout.of(calset, model)
-        return layout.interpolated, layout.large, layout.chunk
+        return layout.interpolated, layout.large, layout.batch
 
-    assert handled() == (False, False, limits.POINTS_PER_CHUNK)
+    assert handled() == (False, False, limits.BATCH)
     monkeypatch.setattr(limits, "INTERPOLATE_ABOVE", 399)
-    monkeypatch.setattr(limits, "LARGE_CHUNK", 100)
+    monkeypatch.setattr(limits, "LARGE_BATCH", 100)
     assert handled() == (True, False, 100)
     monkeypatch.setattr(limits, "LARGE_ABOVE", 399)
     assert handled() == (True, True, 100)

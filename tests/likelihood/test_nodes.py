@@ -117,7 +117,7 @@ def test_error_is_measured(monkeypatch):
     monkeypatch.setattr(nodes, "TOLERANCE", 0.01)
     table, again = nodes.accurate_nodes(simulated.truth, plan, FIELD, scale)
     assert again == stated
-    x, y = np.random.default_rng(3).uniform(-0.3, 0.3, (2, limits.SOLVED_TOGETHER))
+    x, y = np.random.default_rng(3).uniform(-0.3, 0.3, (2, limits.BATCH))
     rows, _ = nodes.solved_optics(simulated.truth, plan, x, y)
     between, _ = table(jnp.asarray(x), jnp.asarray(y))
     assert 0.1 * stated < np.abs(np.asarray(between - rows)).max() < 3.0 * stated

@@ -70,7 +70,7 @@ def calset(tmp_path_factory):
 
 @pytest.fixture
 def streaming(calset, monkeypatch):
-    """The same set when there is hardly any memory: three slabs of two chunks of 16 points."""
+    """The same set when there is hardly any memory: three slabs of two batches of 16 points."""
     each = bytes_per_point(len(calset.exposures))
     monkeypatch.setattr(limits, "MEMORY", 81 * each)
     monkeypatch.setattr(limits, "READING", 1)
@@ -85,7 +85,7 @@ def equal(one, other):
 
 
 def test_what_is_read_is_what_is_kept(calset, streaming):
-    layout = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16).layout
+    layout = Likelihood.of(streaming, base_model(calset, throughput_degree=2), batch=16).layout
     reader = PointReader(calset, layout.plan)
     kept, read = (MeasuredPoints(reader, dataclasses.replace(layout, kept=kept)) for kept in (True, False))
     assert (len(kept), len(read), layout.slabs) == (6, 6, 3)
@@ -97,7 +97,7 @@ def test_what_is_read_is_what_is_kept(calset, streaming):
 
 
 def test_every_pass_reads_every_slab_once(calset, streaming):
-    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), batch=16)
     asked = streaming.intensities.asked
     for _ in range(2):
         asked.clear()
@@ -109,8 +109,8 @@ def test_every_pass_reads_every_slab_once(calset, streaming):
 
 
 def test_expansion_and_counts_agree(calset, streaming):
-    one = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
-    other = Likelihood.of(calset, base_model(calset, throughput_degree=2), points_per_chunk=16, memory=1e9)
+    one = Likelihood.of(streaming, base_model(calset, throughput_degree=2), batch=16)
+    other = Likelihood.of(calset, base_model(calset, throughput_degree=2), batch=16, memory=1e9)
     assert not one.layout.kept
     assert other.layout.kept
     a, b = one.expand(one.model.start), other.expand(other.model.start)
@@ -150,14 +150,14 @@ def test_a_fault_in_the_file_stops_the_pass(calset, streaming):
             raise OSError("the disk has gone")
         return calset.intensities.block(start, stop)
 
-    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), batch=16)
     streaming.intensities.block = broken
     with pytest.raises(OSError, match="the disk has gone"):
         likelihood.expand(likelihood.model.start)
 
 
 def test_a_pass_may_be_left_half_way(calset, streaming):
-    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), points_per_chunk=16)
+    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), batch=16)
     first = next(iter(likelihood.points))
     assert first.x.shape == (16,)
     with ThreadPoolExecutor(1) as pool:

@@ -34,7 +34,7 @@ import json
 def made(**options):
     calset = simulate(RUN, seed=5).calset
     model = base_model(calset, throughput_degree=2)
-    return Likelihood.of(calset, model, points_per_chunk=64, interpolate=True, memory=1e6, **options)
+    return Likelihood.of(calset, model, batch=64, interpolate=True, memory=1e6, **options)
 
 
 @pytest.fixture
@@ -56,9 +56,7 @@ def test_the_number_of_threads_changes_nothing(likelihood):
 
 def run(code: str, *arguments: str, **options) -> subprocess.Popen:
     """Another Python that knows the tests and solves as many places together as this one: equal to the last bit."""
-    code = (
-        f"from walop_jax.likelihood import limits\nlimits.SOLVED_TOGETHER = {limits.SOLVED_TOGETHER}\n{code}"
-    )
+    code = f"from walop_jax.likelihood import limits\nlimits.BATCH = {limits.BATCH}\n{code}"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
     return subprocess.Popen(
         [sys.executable, "-c", code, *arguments],

@@ -138,7 +138,7 @@ def seconds(work) -> float:
 def test_counts_made_in_slabs_are_those_of_the_instrument():
     """What the table is made with: the truth explains it."""
     calset = made(20)
-    likelihood = Likelihood.of(calset, base_model(calset), points_per_chunk=100)
+    likelihood = Likelihood.of(calset, base_model(calset), batch=100)
     truth = np.asarray(values_of(simulate(RUN, seed=3).truth))
     chi2, dof = likelihood.expand(truth).data, 3 * 400 * EXPOSURES
     assert abs(chi2 - dof) < 5 * np.sqrt(2 * dof)
@@ -154,7 +154,7 @@ def test_cost_per_iteration():
         likelihood = Likelihood.of(calset, base_model(calset))
         values = likelihood.model.start
         near = likelihood.expand(values)  # compiles; fills the memory where the set is kept
-        data = seconds(lambda likelihood=likelihood: likelihood._total("data", None, lambda _: (), ()))
+        data = seconds(lambda likelihood=likelihood: dataclasses.replace(likelihood).census)
         full = seconds(lambda likelihood=likelihood, values=values: likelihood.expand(values))
         rows.append((side**2, data, full))
         print(
@@ -251,10 +251,10 @@ def test_errors_fall_with_the_points():
 def test_work_per_point():
     """Floating-point operations and bytes that the compiled code counts, and the rate at which it does them."""
     calset = made(32)
-    likelihood = Likelihood.of(calset, base_model(calset), points_per_chunk=256, interpolate=True)
+    likelihood = Likelihood.of(calset, base_model(calset), batch=256, interpolate=True)
     instrument = likelihood.model.instrument()
     arguments = (instrument, likelihood.plan, next(iter(likelihood.points)), likelihood.nodes(instrument)[0])
-    function, n = engine.normal_equations, 256
+    function, n = engine._table_equations, 256
     cost = jax.jit(function.__wrapped__).lower(*arguments).compile().cost_analysis()
     jax.block_until_ready(function(*arguments))
     best = min(seconds(lambda: jax.block_until_ready(function(*arguments))) for _ in range(5))

@@ -154,7 +154,10 @@ def test_a_chain_comes_back_and_refuses_what_is_not_its_own(tmp_path: Path) -> N
 
 SCRIPT = """
 import sys, numpy as np
-from walop_jax.posterior import Chain, Density, Emcee, Ensembles, Options
+from walop_jax.posterior.files import Chain
+from walop_jax.posterior.result import Options
+from walop_jax.posterior.samplers import Density
+from walop_jax.posterior.sampling import Ensembles
 f = Density(4, lambda z: -0.5 * z @ z, batch=lambda z: -0.5 * np.sum(z**2, axis=1))
 options = Options(walkers=16, moves="de", interval=50, seed=7)
 run = Ensembles(options.make_sampler(), f, options, Chain(sys.argv[1], {"data": "a"}))

@@ -10,15 +10,17 @@ import pytest
 
 WRITERS = {
     "posterior": """
-        import arviz
-        from walop_jax.posterior import write_posterior
+        from xarray import DataTree
+        from walop_jax.posterior.draws import group_of_draws
+        from walop_jax.posterior.files import write_posterior
         class Sample:
-            def to_arviz(self):
-                return arviz.from_dict(posterior={"a": np.ones((4, 20000))})
+            def groups(self):
+                return DataTree.from_dict({"posterior": group_of_draws({"a": np.ones((4, 20000))})})
         write = lambda path: write_posterior(path, Sample())
     """,
     "chain": """
-        from walop_jax.posterior import Chain, Emcee, Stretch
+        from walop_jax.posterior.files import Chain
+        from walop_jax.posterior.samplers import Stretch
         def write(path):
             there, state = Chain(path.parent, {}), {"random_keys": np.zeros(624), "random_rest": np.zeros(3)}
             there.path = path

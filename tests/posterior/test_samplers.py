@@ -12,8 +12,9 @@ import pytest
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.errors import DataError
+from walop_jax.posterior.draws import read_draws, with_moments
 from walop_jax.posterior.emcee import Emcee
-from walop_jax.posterior.files import Chain, read_draws, with_moments, write_posterior
+from walop_jax.posterior.files import Chain, write_posterior
 from walop_jax.posterior.nuts import Nuts
 from walop_jax.posterior.result import Options
 from walop_jax.posterior.samplers import SAMPLERS, Density, Sampler, Stretch, make_sampler

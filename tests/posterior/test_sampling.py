@@ -18,7 +18,8 @@ from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import astropy_table, write_table
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.posterior import sampling
-from walop_jax.posterior.files import read_draws, with_draws, with_moments, write_posterior
+from walop_jax.posterior.draws import read_draws, with_draws, with_moments
+from walop_jax.posterior.files import write_posterior
 from walop_jax.posterior.result import Options, PosteriorSample
 from walop_jax.posterior.sampling import sample
 
@@ -91,7 +92,7 @@ def test_resume_refuses_what_has_changed(scene: Scene, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="other settings"):
         sample(result, dataclasses.replace(options, seed=4), folder=tmp_path / "chain", resume=True)
     changed = model.change(model.names[model.free[0]], prior=(0.81, 0.02))
-    likelihood = Likelihood.of(result.calset, changed, points_per_chunk=result.likelihood.layout.chunk)
+    likelihood = Likelihood.of(result.calset, changed, batch=result.likelihood.layout.batch)
     other = dataclasses.replace(result, likelihood=likelihood)
     with pytest.raises(DataError, match="other priors"):
         sample(other, options, folder=tmp_path / "chain", resume=True)
@@ -202,7 +203,8 @@ def test_arviz_finds_what_it_looks_for(scene: Scene, posterior: PosteriorSample)
         -0.5 * scene.target.data(posterior.mean[scene.target.free])
         - 0.5 * scene.target.measured * np.log(2 * np.pi) - np.log(block.sigma[block.used]).sum()
     )  # fmt: skip
-    assert az.loo(data).p_loo == pytest.approx(worth, rel=0.35)
+    loo = az.loo(data)
+    assert (loo.p if hasattr(loo, "p") else loo.p_loo) == pytest.approx(worth, rel=0.35)  # ArviZ 1, 0
 
 
 def test_matrix_by_draws_agrees_with_the_covariance(

@@ -1,4 +1,4 @@
-"""The exact log density and its gradient: what the fit minimises, in however many chunks the data are."""
+"""The exact log density and its gradient: what the fit minimises, in however many batches the data are."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ def test_its_gradient_is_that_of_finite_differences(
 
 
 @pytest.mark.long
-def test_chunks_make_no_difference(scene: Scene, density: Density, place: np.ndarray) -> None:
-    """Four chunks, the last of them padded, are the same as one."""
+def test_batches_make_no_difference(scene: Scene, density: Density, place: np.ndarray) -> None:
+    """Four batches, the last of them padded, are the same as one."""
     one = scene.result.likelihood
-    cut = Likelihood.of(one.calset, one.model, points_per_chunk=6)
+    cut = Likelihood.of(one.calset, one.model, batch=6)
     several = Target(dataclasses.replace(scene.result, likelihood=cut))
     assert (len(one.points), len(cut.points)) == (1, 4)
     value, gradient = density.value_and_gradient(place)

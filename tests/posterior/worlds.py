@@ -67,8 +67,8 @@ class Worlds:
             assert prior is not None
             truth[i] = rng.normal(*prior)
         flux = 4.0 * PLAN.electrons * rng.uniform(0.7, 1.0, self.block.used.shape)
-        chunk = next(iter(self.likelihood.points))
-        unit = np.asarray(engine.prediction(self.model.instrument(truth), self.likelihood.plan, chunk))
+        batch = next(iter(self.likelihood.points))
+        unit = np.asarray(engine.prediction(self.model.instrument(truth), self.likelihood.plan, batch))
         expected = flux[:, :, None] * unit
         sigma = NOISE.sigma(expected)
         counts = expected + sigma * rng.standard_normal(expected.shape)
@@ -78,7 +78,7 @@ class Worlds:
 
     def _likelihood(self, calset: CalibrationSet) -> Likelihood:
         """Of all points at once: a sampler asks for it thousands of times."""
-        return Likelihood.of(calset, self.model, points_per_chunk=len(calset.points))
+        return Likelihood.of(calset, self.model, batch=len(calset.points))
 
 
 def ecdf_band(count: int, level: float = 0.95, grid: int = 100, draws: int = 4000, seed: int = 1) -> float:

@@ -25,6 +25,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.model import mueller
 from walop_jax.model.instrument import Instrument
 from walop_jax.paper.wavelength import plate_retardances, retardance
+from walop_jax.posterior.run import Run
 from walop_jax.reports.named import FIGURES, draw, possible
 from walop_jax.reports.paper_figures import retardance_figure, retardance_wavelength_figure
 from walop_jax.reports.posterior_figures import informed
@@ -44,7 +45,7 @@ def source(tmp_path_factory) -> FigureSource:
     write_calibration_set(folder / "set.fits", simulate(SMALL, seed=SEED).calset)
     calibration = Calibration.from_fit(refit(read_calibration_set(folder / "set.fits")).judged())
     write_calibration(folder / "calibration.fits", calibration)
-    return FigureSource(folder)
+    return FigureSource(Run(folder))
 
 
 @pytest.mark.parametrize("name", [name for name in FIGURES if name not in WITHOUT])
@@ -69,7 +70,7 @@ def test_figures_that_a_run_can_give_are_listed(source):
 def test_figures_of_a_diagnosis(tmp_path):
     """Of what was found (step 1), or of the whole (0): their titles are those of the arrays typed by hand."""
     write_figure_data(tmp_path / "diagnosis.fits", handmade_run.figure_data())
-    run = FigureSource(tmp_path)
+    run = FigureSource(Run(tmp_path))
     assert [*possible(run)] == [*OF_A_DIAGNOSIS]
     for name in OF_A_DIAGNOSIS:
         assert draw(name, run).axes[0].has_data()
@@ -151,7 +152,7 @@ def test_plates_go_by_their_names(source):
     lacking = dataclasses.replace(whole.model.template, arms=(bare, whole.model.template.arms[1]))
     model = base_model(source.calset, lacking)
     n = len(model.parameters)
-    one = dataclasses.replace(whole, fitted=model, values=model.start, covariance=np.zeros((n, n)))
+    one = dataclasses.replace(whole, model=model, values=model.start, covariance=np.zeros((n, n)))
     assert [axis.get_title() for axis in retardance_wavelength_figure(one).axes] == ["HWP2"]
     assert retardance_figure(one).axes[0].get_title().startswith("retardance of HWP2 at")
     assert possible(FigureSource.of(one))["retardance"].about == "maps of the retardance of HWP2"
@@ -161,13 +162,13 @@ def test_retardance_on_the_axis_is_that_of_the_crystals(source):
     """2π/λ Σ (n_o − n_e) d about the optic axis of the quartz, MgF2 crossed against it; no wedge bends this ray."""
     from walop_jax.model import materials
 
-    instrument = source.calibration.model.instrument(source.calibration.values)
+    instrument = source.rebuilt.model.instrument(source.rebuilt.values)
     lam = 0.62
     quartz, mgf2 = (
         float(crystal.ordinary.refractive_index(lam) - crystal.extraordinary.refractive_index(lam))
         for crystal in (materials.CRYSTALS["quartz"], materials.CRYSTALS["mgf2"])
     )
-    thick = dict(zip(source.calibration.model.names, source.calibration.values, strict=True))
+    thick = dict(zip(source.rebuilt.model.names, source.rebuilt.values, strict=True))
     straight = instrument.changed("half1.wedge", angle=0.0)
     found = plate_retardances(straight, np.array([lam]), np.zeros(1), np.zeros(1))[0, 0, 0]
     path = quartz * thick["half1.plate.quartz"] - mgf2 * thick["half1.plate.mgf2"]
@@ -181,7 +182,7 @@ def test_coefficients_that_are_only_prior_are_not_shown():
 
 @pytest.mark.parametrize("name", ["protection", "separation"])
 def test_figures_of_limits(tmp_path, name):
-    figure = draw(name, FigureSource(handmade_run.make_limits(tmp_path)))
+    figure = draw(name, FigureSource(Run(handmade_run.make_limits(tmp_path))))
     assert figure.axes[0].has_data()
 
 
@@ -195,7 +196,7 @@ def test_modulation_shows_a_point_that_was_seen_behind_the_polariser(source):
 
 def test_a_source_on_disk_stays_one(source):
     """Reading its documents made it one that is in memory, with no files."""
-    assert source.documents == {}
+    assert source.run.documents == {}
     assert "calibration.fits" in source
     assert source.maps.values.shape[0] == 6
 
@@ -215,7 +216,7 @@ def test_plates_are_found_by_their_class(tmp_path):
     calset = simulate(plan, seed=SEED).calset
     calibration = Calibration.from_fit(refit(calset, base_model(calset, design)).judged())
     write_calibration(tmp_path / "calibration.fits", calibration)
-    listed = possible(FigureSource(tmp_path))
+    listed = possible(FigureSource(Run(tmp_path)))
     assert listed["retardance"].about == "maps of the retardance of main.plate"
 
 

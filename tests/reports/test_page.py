@@ -15,7 +15,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import astropy_table, write_table
 from walop_jax.io.text import probability, value_and_error, with_error
 from walop_jax.model.effects import EFFECTS
-from walop_jax.posterior.files import Run
+from walop_jax.posterior.run import Run
 from walop_jax.reports import page as page_module
 from walop_jax.reports.page import render
 from walop_jax.reports.run import read_run
@@ -192,7 +192,7 @@ def test_a_fit_that_is_not_trusted_says_so(tmp_path):
         (lambda run: (run / "summary.json").rename(run / "summary.failed.json"), "did not converge"),
         (lambda run: (run / "summary.json").write_text("{"), "summary.json: cannot be read"),
         (lambda run: (run / "summary.json").write_text('{"chi2": 1}'), "summary.json: has no 'dof'"),
-        (lambda run: (run / "summary.json").write_text("[1]"), "summary.json: has no 'chi2'"),
+        (lambda run: (run / "summary.json").write_text("[1]"), "summary.json: is no document of a run"),
     ],
 )
 def test_what_is_no_run_is_refused(tmp_path, spoil, said):
@@ -362,7 +362,7 @@ def test_figures_are_drawn_from_the_run_that_was_given(tmp_path, monkeypatch):
     drawn = []
 
     def draw(name, source):
-        drawn.append((name, source.catalogue, source.data))
+        drawn.append((name, source.run.catalogue, source.run.data))
         return Figure()
 
     monkeypatch.setattr(page_module, "draw", draw)

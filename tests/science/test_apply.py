@@ -330,7 +330,7 @@ def _with(calibration, model, known=0.0):
     where = np.array([model.names.index(name) for name in old])
     values[where] = calibration.values
     covariance[np.ix_(where, where)] = calibration.covariance
-    return dataclasses.replace(calibration, fitted=model, values=values, covariance=covariance)
+    return dataclasses.replace(calibration, model=model, values=values, covariance=covariance)
 
 
 # ------------------------------------------------------------------------------------------------ catalogues
@@ -420,7 +420,7 @@ def test_every_instrument_can_be_tabulated(calibration, instrument, edge):
     model = make_model(instrument, nominal_instrument(instrument, throughput_degree=0))
     other = dataclasses.replace(
         calibration,
-        fitted=model,
+        model=model,
         values=model.start,
         covariance=np.zeros((len(model.start),) * 2),
         field=(-edge, edge, -edge, edge),

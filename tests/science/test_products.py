@@ -263,7 +263,7 @@ def test_the_new_set_is_fitted_with_the_old_model(first, monkeypatch):
     earlier = dataclasses.replace(SMALL, grid=4, moon_patches=0)
     model = model_for(simulate(earlier, seed=5).calset, text)
     size = len(model.names)
-    assumed = dataclasses.replace(old, fitted=model, values=model.start, covariance=1e-12 * np.eye(size))
+    assumed = dataclasses.replace(old, model=model, values=model.start, covariance=1e-12 * np.eye(size))
     asked: list[Likelihood] = []
 
     def fitted(likelihood):

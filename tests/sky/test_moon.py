@@ -20,7 +20,6 @@ from walop_jax.data.records import Site
 from walop_jax.io.errors import DataError
 from walop_jax.sky.moon import (
     body_direction,
-    earth_rotation,
     local_sidereal_time,
     moon_sky,
     offset_direction,
@@ -157,16 +156,6 @@ def test_nothing_is_downloaded(monkeypatch):
     assert np.all(np.isfinite([ra, dec]))
 
 
-def test_earth_rotation_is_that_of_the_library():
-    ours, theirs = earth_rotation(), iers.IERS_B.open()
-    times = Time(np.array([41000.3, 51544.5, 60000.25, 60600.9]), format="mjd")
-    np.testing.assert_array_equal(ours.ut1_utc(times), theirs.ut1_utc(times))
-    for one, other in zip(ours.pm_xy(times), theirs.pm_xy(times), strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert "e_UT1_UTC" in theirs.colnames, "read by the library itself"
-    assert "e_UT1_UTC" not in ours.colnames, "read by numpy"
-
-
 def test_bad_skies_are_refused():
     good = np.array([61043.85])
     with pytest.raises(DataError, match="MJD: times must be Modified"):
@@ -209,8 +198,6 @@ def test_moon_exposures_of_an_outside_simulator(either_south_set):
 def test_offsets_are_those_of_astropy_and_sidereal_time_is_within_arc_seconds():
     from astropy import units
     from astropy.coordinates import SkyCoord
-    from astropy.time import Time
-    from astropy.utils import iers
 
     random = np.random.default_rng(4)
     ra, dec, angle, far = random.uniform((0, -80, 0, 1), (360, 80, 360, 40), (50, 4)).T

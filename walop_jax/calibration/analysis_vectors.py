@@ -202,13 +202,8 @@ class AnalysisVectors:
         return sky_vectors(self.instrument, plan, x, y)[:, bands, :, :3]
 
     def _plan(self, setting: Settings, teff: Sequence[float]) -> tuple[Plan, Int[np.ndarray, " c"]]:
-        same = setting[np.zeros(len(teff), int)]
-        name = str(setting.filter[0])
-        plan = plan_for_settings(
-            self.instrument,
-            dataclasses.replace(same, teff=np.array(teff, float)),
-            {name: self.calibration.filter_curve(name)},
-        )
+        same = dataclasses.replace(setting[np.zeros(len(teff), int)], teff=np.array(teff, float))
+        plan = plan_for_settings(self.instrument, same, self.calibration.curves(setting))
         return plan, np.asarray(plan.band_of)[:, 0]
 
     def _kept(self, make: Callable[[Settings], FieldTable], setting: Settings, name: str = "") -> FieldTable:
@@ -224,7 +219,8 @@ class AnalysisVectors:
         return Rectangle(-corner, corner)
 
     def _vector_table(self, setting: Settings) -> FieldTable:
-        teff = [np.nan, *colour_nodes(COLOURS).tolist()]
+        nodes = colour_nodes(COLOURS).tolist()
+        teff = [np.nan, *nodes]
         weights = colour_weights(np.array(BETWEEN), COLOURS)
 
         def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
@@ -235,7 +231,9 @@ class AnalysisVectors:
             between = np.einsum("tc,pcks->ptks", weights, there)
             return float(np.abs(between - truth).max() / truth.max())
 
-        truth = self.exact(setting, *held_out(self._rectangle), BETWEEN)
+        # As many colours as on the nodes, for whose number the program is there.
+        colours = (*BETWEEN, *nodes[len(BETWEEN) - 1 :])
+        truth = self.exact(setting, *held_out(self._rectangle), colours)[:, : len(BETWEEN)]
         return self._accurate(exact, NODES, TOLERANCE, error, truth)
 
     def _derivative_table(self, setting: Settings) -> FieldTable:
@@ -256,8 +254,7 @@ class AnalysisVectors:
         return self._accurate(exact, DERIVATIVE_NODES, DERIVATIVE_TOLERANCE, error)
 
     def _acting_table(self, setting: Settings, acting: Mapping[int, Effect]) -> FieldTable:
-        name = str(setting.filter[0])
-        filters = {name: self.calibration.filter_curve(name)}
+        filters = self.calibration.curves(setting)
         flat = dataclasses.replace(setting, teff=np.full(1, np.nan))
 
         def vectors(

@@ -325,7 +325,7 @@ class Calibration(Contents, Fitted):
     def _elements(
         self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings
     ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
-        filters = {str(name): self.filter_curve(str(name)) for name in np.unique(settings.filter)}
+        filters = self.curves(settings)
         if self.draws is not None:
             drawn = matrix_draws(self.model, self.draws, settings, filters, x, y)
             away = drawn - drawn.mean(axis=0)
@@ -361,9 +361,8 @@ class Calibration(Contents, Fitted):
 
         In one setting, a row of `settings`; from the covariance of the parameters, draws left aside.
         """
-        name = str(settings.filter[0])
         matrix, slopes = slopes_over_field(
-            self.model.instrument(self.values), settings, {name: self.filter_curve(name)}, x, y,
+            self.model.instrument(self.values), settings, self.curves(settings), x, y,
             self.covariance, counts, tolerance,
         )  # fmt: skip
         matrix, slopes = matrix.reshape(len(x), -1), slopes.reshape(len(x), matrix[0].size, -1)
@@ -409,6 +408,10 @@ class Calibration(Contents, Fitted):
     def left_behind(self) -> tuple[str, ...]:
         """Effects of the model of which a part belongs to its exposures, so that no matrix and no star can have it."""
         return left_behind(self.model.template)
+
+    def curves(self, settings: Settings) -> dict[str, FilterCurve]:
+        """The curves of the filters of settings, by name; `DataError` as `filter_curve`."""
+        return {str(name): self.filter_curve(str(name)) for name in np.unique(settings.filter)}
 
     def filter_curve(self, name: str) -> FilterCurve:
         """The curve of a filter; `DataError` with the nearest names when there is none."""
@@ -470,8 +473,8 @@ class Calibration(Contents, Fitted):
         if self.draws is not None:
             values, covariance = self._elements(points.x, points.y, settings)
         else:
-            instrument, curves = self.model.instrument(self.values), {name: self.filter_curve(name)}
-            plan = plan_for_settings(instrument, settings[:1], curves)
+            instrument = self.model.instrument(self.values)
+            plan = plan_for_settings(instrument, settings[:1], self.curves(settings[:1]))
             values = planned_matrices(instrument, plan, points.x, points.y)
             _, covariance, _ = self.over_field(points.x, points.y, settings[:1], MAP_NODES, MAP_ERRORS)
         errors = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))

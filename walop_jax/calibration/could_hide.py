@@ -119,7 +119,7 @@ def hidden_errors(
     """Error of q and u at field positions (deg) by each mistake that could hide; NaN where u is hardly measured."""
     hidden, instrument = calibration.hidden, calibration.model.instrument(calibration.values)
     assert hidden is not None
-    filters = {str(settings.filter[0]): calibration.filter_curve(str(settings.filter[0]))}
+    filters = calibration.curves(settings)
     matrix, slopes = matrix_slopes(instrument, settings, filters, x, y)
     acting, found = acting_effects(calibration), np.empty((len(hidden), len(x)))
     for number, moved in enumerate(hidden.changes):

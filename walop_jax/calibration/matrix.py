@@ -171,8 +171,8 @@ def _slopes_at(
     return jax.vmap(one)(*columns)
 
 
-_vectors = compiled(_vectors_at, kept_as="vectors")
-_slopes = compiled(_slopes_at, kept_as="slopes")
+_vectors = compiled(_vectors_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="vectors")
+_slopes = compiled(_slopes_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="slopes")
 
 
 def analysis_vectors(
@@ -187,8 +187,8 @@ def analysis_vectors(
 
     For light behind the telescope, or `from_sky`, which passes the telescope first.
     """
-    once = len(x) <= limits.MATRICES_ONCE
-    vectors, telescope = in_chunks(lambda a, b: _vectors(instrument, plan, a, b, once=once), x, y)
+    plan = dataclasses.replace(plan, work=len(x))
+    vectors, telescope = in_chunks(lambda a, b: _vectors(instrument, plan, a, b), x, y)
     return vectors @ telescope[:, None] if from_sky else vectors
 
 
@@ -230,7 +230,7 @@ def planned_matrices(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -
 
 
 def _matrix_and_slopes(
-    instrument: Instrument, plan: Plan, *, once: bool
+    instrument: Instrument, plan: Plan
 ) -> Callable[..., tuple[Float[np.ndarray, "p a 3"], Float[np.ndarray, "p a 3 n"]]]:
     """A function of rows as those of `_slopes_at`: matrices, and their derivatives in all parameters.
 
@@ -241,9 +241,7 @@ def _matrix_and_slopes(
     size = values_of(instrument).size
 
     def at(*columns: Array) -> tuple[np.ndarray, np.ndarray]:
-        vectors, slopes = (
-            np.asarray(part)[..., 0, :, :] for part in _slopes(instrument, plan, *columns, once=once)
-        )
+        vectors, slopes = (np.asarray(part)[..., 0, :, :] for part in _slopes(instrument, plan, *columns))
         a, b = (np.moveaxis(slopes[..., arms, :], 1, -1) for arms in (first, second))
         total = (vectors[:, first, :1] + vectors[:, second, :1])[..., None]
         m = light.instrument_matrix(vectors, instrument.cameras.pairs)
@@ -273,8 +271,8 @@ def matrices(
     size = 3 * len(instrument.cameras.pairs)
     values, errors = np.empty((len(x), size)), np.empty((len(x), size, size))
     for layout, rows in settings.layouts():
-        plan = plan_for_settings(instrument, layout, filters)
-        exact = _matrix_and_slopes(instrument, plan, once=len(x) <= limits.MATRICES_ONCE)
+        plan = dataclasses.replace(plan_for_settings(instrument, layout, filters), work=len(x))
+        exact = _matrix_and_slopes(instrument, plan)
 
         def part(*columns: Array, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
             found, slopes = (one.reshape(len(one), size, *one.shape[3:]) for one in exact(*columns))
@@ -319,10 +317,9 @@ def matrix_slopes(
     """
     if not instrument.cameras.pairs:  # no row, and nothing to compile
         return np.zeros((len(x), 0, 3)), np.zeros((len(x), 0, 3, values_of(instrument).size))
-    plan = plan_for_settings(instrument, setting, filters)
+    plan = dataclasses.replace(plan_for_settings(instrument, setting, filters), work=len(x))
     numbers = (np.broadcast_to(number, len(x)) for number in _numbers(setting))
-    exact = _matrix_and_slopes(instrument, plan, once=len(x) <= limits.MATRICES_ONCE)
-    matrix, slopes = in_chunks(exact, x, y, *numbers)
+    matrix, slopes = in_chunks(_matrix_and_slopes(instrument, plan), x, y, *numbers)
     return matrix, slopes
 
 

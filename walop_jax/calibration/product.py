@@ -194,8 +194,8 @@ def _strings(values: Iterable[str]) -> np.ndarray:
 
 def _version(c: Product) -> int:
     """The oldest version of the format that can hold a calibration."""
-    newer = c.maps.arms != 2 or c.exposures.further or c.instrument not in shipped()
-    return 2 if newer or np.isin(c.exposures.kind, ("lamp", "steady")).any() else 1
+    newer = c.maps.arms != 2 or c.maps.positions or c.exposures.further or c.instrument not in shipped()
+    return 1 if not newer and np.isin(c.exposures.kind, ("clp", "moon", "standard", "flux")).all() else 2
 
 
 def _primary(c: Product, version: int) -> fits.PrimaryHDU:

@@ -37,6 +37,9 @@ from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 
+POINTS_PER_CELL = 64
+"""Field points of a cell of the residual map: its errors are an eighth of those of a point."""
+
 
 def _changes(
     vectors: Float[Any, "n k 4"], stokes: Float[Any, "n 4"], unit: Float[Any, "n k"], pairs: Sequence[Any]
@@ -76,7 +79,7 @@ def _point_sums(
     return jnp.concatenate([jnp.stack([chi2, freedom]), right, left])
 
 
-def _chunk_sums(
+def _batch_sums(
     instrument: Instrument,
     plan: Plan,
     chosen: Bool[Array, " e"],
@@ -90,13 +93,13 @@ def _chunk_sums(
     )
 
 
-_sums = compiled(_chunk_sums)
+_sums = compiled(_batch_sums)
 
 
 def cells_for(points: int, census: Census) -> Grid:
-    """A grid of square-ish cells over the used part of the field: `limits.POINTS_PER_CELL` points in each, or more."""
+    """A grid of square-ish cells over the used part of the field: `POINTS_PER_CELL` points in each, or more."""
     low_x, high_x, low_y, high_y = census.field
-    side = int(np.clip(np.sqrt(points / limits.POINTS_PER_CELL), 1, limits.MOST_CELLS))
+    side = int(np.clip(np.sqrt(points / POINTS_PER_CELL), 1, limits.CELLS))
     width, height = (high_x - low_x) / side, (high_y - low_y) / side
     return Grid(
         side, side, (0.5, 0.5), (low_x, low_y), ((width or 1.0, 0.0), (0.0, height or 1.0))
@@ -145,11 +148,11 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
     count = grid.pixels
 
     def work(number: int) -> Vector:
-        chunks = likelihood.points.slab(number)
-        cell = np.concatenate([cell_of(grid, np.asarray(chunk.x), np.asarray(chunk.y)) for chunk in chunks])
+        batches = likelihood.points.slab(number)
+        cell = np.concatenate([cell_of(grid, np.asarray(batch.x), np.asarray(batch.y)) for batch in batches])
         # Padded points carry no weight, hence zeros.
         columns = [
-            np.asarray(_sums(instrument, likelihood.plan, jnp.asarray(chosen), c, nodes)) for c in chunks
+            np.asarray(_sums(instrument, likelihood.plan, jnp.asarray(chosen), c, nodes)) for c in batches
         ]
         sums = [np.bincount(cell, column, count) for column in np.concatenate(columns).T]
         return np.concatenate(sums)
@@ -171,7 +174,7 @@ def residual_map_of_pixels(found: FrameSums) -> ResidualMap:
     exposures = likelihood.calset.exposures
     seen = found.sums.used.any(axis=(1, 2))  # not those of a table beside the frames
     setting, chosen = _main_setting(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in & seen)
-    blocks = (limits.POINTS_PER_CELL**0.5 / cells.side, max(cells.shape) / limits.MOST_CELLS)
+    blocks = (POINTS_PER_CELL**0.5 / cells.side, max(cells.shape) / limits.CELLS)
     together = int(np.ceil(max(1.0, *blocks)))
     s, t = np.meshgrid(*cells.middles())
     smooth = found.smooth(s.ravel(), t.ravel())

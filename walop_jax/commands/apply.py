@@ -70,7 +70,7 @@ def apply(
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.plain_tables import table_format
     from walop_jax.nights.stacking import calibration_of_stars, is_survey, read_survey
-    from walop_jax.posterior.files import with_moments
+    from walop_jax.posterior.draws import with_moments
     from walop_jax.science.apply import apply as apply_to_rows
     from walop_jax.science.catalogue import read_catalogue
     from walop_jax.science.polarisation import ESTIMATORS

@@ -72,9 +72,10 @@ def matrix(
     field point X +0.100°, Y −0.050°
       m21 0.0716... ± 0.000...
     """
+    from walop_jax.calibration.matrix_table import MatrixTable
     from walop_jax.fit.verdict import Quality
-    from walop_jax.io.plain_tables import MatrixTable, table_format
-    from walop_jax.posterior.files import with_draws
+    from walop_jax.io.plain_tables import table_format
+    from walop_jax.posterior.draws import with_draws
     from walop_jax.science.catalogue import POINT_COLUMNS, field_points
 
     if (points is None) == (x is None):

@@ -168,16 +168,14 @@ def _stood_at(exposures: Exposures, prefix: str) -> tuple[float | None, ...]:
 
 def _alike(after: Any, known: Calibration) -> tuple[Any, ...]:
     """The effects that a diagnosis could not tell apart: that found, as it is, then its rivals by name."""
-    from walop_jax import Run
     from walop_jax.diagnosis.findings import Diagnosis, document
     from walop_jax.io.names import DIAGNOSIS
+    from walop_jax.io.run_folder import RunFolder
 
-    if isinstance(after, str | os.PathLike):
-        after = Run(Path(after))
-    there = document(after) if isinstance(after, Diagnosis) else None
-    if isinstance(after, Run):
-        there = after.documents.get("diagnosis")
-    path = after.folder / DIAGNOSIS if isinstance(after, Run) else None
+    there, path = document(after) if isinstance(after, Diagnosis) else None, None
+    if isinstance(after, RunFolder | str | os.PathLike):
+        folder = after if isinstance(after, RunFolder) else RunFolder(Path(after))
+        there, path = folder.documents.get("diagnosis"), folder.folder / DIAGNOSIS
     if there is None:
         advice = "run diagnose first, or name the effects with --apart (apart= in Python)"
         raise fail("no diagnosis", file=path, advice=advice)

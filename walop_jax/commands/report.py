@@ -61,7 +61,7 @@ def report(
     """
     from walop_jax import FitResult, Run
     from walop_jax.io.atomic import atomic_path, check_output
-    from walop_jax.io.text import printable
+    from walop_jax.io.text import encodable
     from walop_jax.reports.page import kind_of_run, render, render_other
     from walop_jax.reports.run import read_run
 
@@ -87,7 +87,7 @@ def report(
         job.tell("drawing", "drawing")
         missing = (*found.missing, *lacking)
         text = render(dataclasses.replace(found, missing=missing), accuracy)
-    text = printable(text)
+    text = encodable(text)
     with atomic_path(target, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
     page = Page(target, len(text.encode()), missing)

@@ -111,7 +111,8 @@ def _sampled_run(
     from walop_jax.calibration.product import read_calibration
     from walop_jax.io.folder import output_folder
     from walop_jax.io.names import PRODUCT
-    from walop_jax.posterior.files import Chain, digest_of_fit
+    from walop_jax.posterior.draws import digest_of_fit
+    from walop_jax.posterior.files import Chain
     from walop_jax.posterior.sampling import sample as sample_fit
 
     folder = run.folder

@@ -153,6 +153,7 @@ def assembled(
     Raises `DataError` for whatever numbers cannot be meant.
     """
     remarks = list(remarks)
+    instrument = instrument_name(instrument, Place(path, "PRIMARY"))
     filters = make_filters(tables["FILTERS"], Place(path, "FILTERS")) if "FILTERS" in tables else {}
     place = Place(path, "EXPOSURES")
     exposures = make_exposures(tables["EXPOSURES"], filters, site, place, kinds)
@@ -294,7 +295,6 @@ NAME = "arrays"
 """Name in errors of the file that is none."""
 
 _SHOWN = 3
-_UNITS = {name: rule.unit for name, rule in schema.EXPOSURES.items()}
 
 
 def from_arrays(
@@ -332,7 +332,9 @@ def from_arrays(
     >>> made.exposures.clp_angle
     array([ 0., 30., 60., 90.])
     """
+    units = {"counts": schema.unit_of(counts), "errors": schema.unit_of(errors)}
     counts, errors = in_unit(counts, "electron", "counts"), in_unit(errors, "electron", "errors")
+    schema.check_units(units, "electron", Place(NAME, ""))
     x, y, angles = (np.atleast_1d(in_unit(v, "deg", n)) for v, n in ((x, "x"), (y, "y"), (angles, "angles")))
     if counts.ndim != 3 or counts.shape[:2] != (len(x), len(angles)) or len(x) != len(y):
         raise fail(
@@ -340,8 +342,6 @@ def from_arrays(
             column="counts",
             advice="its axes are (point, exposure, camera)",
         )
-    instrument = instrument_name(instrument, Place(NAME, "PRIMARY"))
-    check_cameras(instrument, counts.shape[2], Place(NAME, ""), "counts")
     for name, curve in (filters or {}).items():
         if not isinstance(curve, FilterCurve):
             raise fail(
@@ -356,11 +356,11 @@ def from_arrays(
     tables: dict[str, Mapping[str, Any]] = {
         "EXPOSURES": {
             "EXPOSURE": np.arange(number),
-            "KIND": _column("KIND", kinds, number),
+            "KIND": _spread("KIND", kinds, number),
             "CLP_IN": inside,
             "CLP_ANGLE": np.where(inside, angles, np.nan),
         }
-        | {name.upper(): _column(name.upper(), values, number) for name, values in exposures.items()},
+        | {name.upper(): _spread(name, values, number) for name, values in exposures.items()},
         "POINTS": {"POINT": np.arange(len(x)), "X": x, "Y": y},
         "INTENSITIES": {
             "EXPOSURE": exposure,
@@ -392,7 +392,7 @@ def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationS
     """
     found = _in_memory(
         set_tables(calset),
-        instrument=instrument_name(calset.instrument, Place(NAME, "PRIMARY")),
+        instrument=calset.instrument,
         site=calset.site,
         origin=calset.origin,
         kinds=(*KINDS, *kinds),
@@ -427,22 +427,16 @@ def _spoilt(counts: np.ndarray) -> Iterator[str]:
         yield f"{NAME}: not finite in {shown}{more}: not used in any camera"
 
 
-def _column(name: str, values: Any, number: int) -> np.ndarray:
-    unit = _UNITS.get(name, "deg" if name.endswith("_ANGLE") else "")
-    raw, masked = without_mask(getattr(values, "value", values))
-    if raw.dtype.kind in "bSU":
-        Place(NAME, "EXPOSURES").refuse(
-            np.atleast_1d(masked), "is masked", name.lower(), "fill or remove these"
-        )
-    plain = raw if raw.dtype.kind in "bSU" else in_unit(values, unit, name.lower())
-    try:
-        return np.broadcast_to(plain, number).copy()
-    except ValueError:
-        raise fail(
-            f"has shape {plain.shape} for {number} exposures",
-            column=name.lower(),
-            advice="one value for each",
-        ) from None
+def _spread(name: str, values: Any, number: int) -> Any:
+    """A column of EXPOSURES from one value for each, or one for all."""
+    spread = np.repeat(np.atleast_1d(values), number) if np.size(values) == 1 else values
+    if np.shape(spread) != (number,):
+        what = f"has shape {np.shape(values)} for {number} exposures"
+        raise fail(what, column=name.lower(), advice="one value for each")
+    plain, masked = without_mask(spread)
+    if plain.dtype.kind in "bSU":
+        Place(NAME, "EXPOSURES").refuse(masked, "is masked", name.lower(), "fill or remove these")
+    return spread
 
 
 def _none_where_masked(source: Any) -> np.ndarray:
@@ -450,15 +444,8 @@ def _none_where_masked(source: Any) -> np.ndarray:
     return np.where(masked, -1, values)
 
 
-def _sources(given: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _sources(given: Mapping[str, Any]) -> dict[str, Any]:
     """The columns of SOURCES, numbered where they have no number."""
-    columns = {}
-    for name, values in given.items():
-        rule = schema.SOURCES.get(str(name).upper())
-        if rule is not None and rule.kind == "float":
-            plain = in_unit(values, rule.unit, str(name))
-        else:
-            plain = np.asarray(values)
-        columns[str(name).upper()] = np.atleast_1d(plain)
+    columns = {str(name).upper(): np.atleast_1d(values) for name, values in given.items()}
     columns.setdefault("SOURCE", np.arange(max(map(len, columns.values()), default=0)))
     return columns

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from walop_jax.data.records import Block, DataFlag, Intensities, Points
-from walop_jax.data.schema import Place, convert_unit
+from walop_jax.data.schema import Place, check_units, convert_unit
 from walop_jax.data.table_intensities import empty_block, usable
 from walop_jax.io.errors import fail
 
@@ -221,6 +221,7 @@ def frame_stack(images: Mapping[str, Any], exposures: int, path: Path) -> tuple[
     """
     grids: dict[Grid, str] = {}
     cubes: dict[str, Cube] = {}
+    units: dict[str, str] = {}
     cameras = max([2, *(int(name[1:]) + 1 for name in images if name != "FLAG")])
     counts, errors = image_names(cameras)
     for name in (*counts, *errors, *(("FLAG",) if "FLAG" in images else ())):
@@ -231,9 +232,11 @@ def frame_stack(images: Mapping[str, Any], exposures: int, path: Path) -> tuple[
         cubes[name] = _cube(images[name], exposures, place)
         if name != "FLAG":
             grids.setdefault(read_grid(images[name].header, place), name)
-            convert_unit(
-                np.ones(1), str(images[name].header.get("BUNIT") or "electron"), "electron", "BUNIT", place
-            )
+            unit = units[name] = str(images[name].header.get("BUNIT") or "").strip()
+            size = float(convert_unit(np.ones(1), unit or "electron", "electron", "BUNIT", place)[0])
+            cube = cubes[name]
+            cubes[name] = dataclasses.replace(cube, scale=size * cube.scale, zero=size * cube.zero)
+    check_units(units, "electron", Place(path, "BUNIT"))
     if len(grids) > 1:
         one, other, *_ = grids.values()
         raise fail(f"{one} and {other} do not lie on the same grid", file=path, advice="resample them first")

@@ -11,13 +11,12 @@ import numpy as np
 
 from walop_jax.data.checks import like_radians
 from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet, DataFlag, Exposures
-from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.data.table_intensities import TableIntensities, sampled
 from walop_jax.instruments.description import shipped
 
 Severity = Literal["fault", "doubt", "note"]
 
 _LOOKED_AT = 1024  # field points whose intensities are looked at; of frames, in evenly spaced runs
-_RUN = 64
 _FEW_ANGLES = 8
 _FEWEST_SETTINGS = 3
 _NARROW = 30.0  # degrees
@@ -149,22 +148,14 @@ def inspect(calset: CalibrationSet) -> Inspection:
 
 
 def _sample(calset: CalibrationSet) -> _Sample:
-    total = len(calset.points)
-    if total <= _LOOKED_AT:
-        blocks = [calset.intensities.block(0, total)]
-    else:
-        starts = np.unique(np.linspace(0, total - _RUN, _LOOKED_AT // _RUN).astype(int))
-        blocks = [calset.intensities.block(int(start), int(start) + _RUN) for start in starts]
-    used = np.concatenate([block.used for block in blocks])
-    counted = ~calset.exposures.flux_known
-    rows = used & counted
-    counts = np.concatenate([block.counts for block in blocks])[rows]
-    sigma = np.concatenate([block.sigma for block in blocks])[rows]
+    _, block = sampled(calset.intensities, len(calset.points), _LOOKED_AT)
+    rows = block.used & ~calset.exposures.flux_known
+    counts, sigma = block.counts[rows], block.sigma[rows]
     ratio = np.where(counts > 0, sigma**2 / np.where(counts > 0, counts, 1.0), np.nan)
     seen = np.isfinite(ratio).any(axis=0)
     by_camera = np.full(ratio.shape[1], np.nan)
     by_camera[seen] = np.nanmedian(ratio[:, seen], axis=0)
-    return _Sample(len(used), used, counts.ravel(), ratio[np.isfinite(ratio)], by_camera)
+    return _Sample(len(block.used), block.used, counts.ravel(), ratio[np.isfinite(ratio)], by_camera)
 
 
 def _groups(calset: CalibrationSet, share: np.ndarray) -> tuple[Group, ...]:

@@ -62,9 +62,9 @@ class Column:
 
     kind: Kind
     unit: str = ""
-    missing: object = None
+    missing: Any = None
     width: int | None = 1
-    shape_advice: str = "see the file format"
+    shape_advice: str = "one value in a row: split it"
     remarked: bool = True
     rules: tuple[Rule, ...] = ()
 
@@ -262,12 +262,13 @@ def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[d
         if name not in columns
     ]
     table: dict[str, Any] = {}
+    units_of: dict[str, str] = {}
     absent: dict[str, list[str]] = {}
     for name, column in columns.items():
         if name in names:
             index = names.index(name)
-            unit = (hdu.columns[index].unit or "").strip()
-            table[name] = converted(_fits_values(hdu, index, name, column, place), unit, name, column, place)
+            unit = units_of[name] = (hdu.columns[index].unit or "").strip()
+            table[name] = values_of(_stored(hdu, index, name, place), name, column, place, unit=unit)
             if unit and column.kind == "float" and units.Unit(unit) != units.Unit(column.unit):
                 remarks.append(
                     place.remark(f"is in {unit}, converted to {column.unit or 'a fraction'}", name)
@@ -276,6 +277,7 @@ def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[d
             table[name] = np.full(rows, column.missing)
             if column.remarked:
                 absent.setdefault(str(column.missing), []).append(name)
+    check_units({name: units_of[name] for name in ("N", "N_ERR") if name in units_of}, "electron", place)
     for missing, left_out in absent.items():
         what = f"column{'s' if len(left_out) > 1 else ''} missing; using {missing}"
         remarks.append(place.remark(what, ", ".join(left_out)))
@@ -291,20 +293,15 @@ def table_of(given: Mapping[str, Any], columns: Mapping[str, Column], place: Pla
     rows = max(len(values) for values in given.values())
     if rows == 0:
         raise place.fail("has no rows", advice="a calibration set needs at least one")
-    table = {}
     for name, values in given.items():
         if name not in columns:
             raise place.fail("there is no such column", name, nearest(name, columns))
         if len(values) != rows:
             raise place.fail(f"has {len(values)} values, another column {rows}", name, "one for each row")
+    table = {}
     for name, column in columns.items():
         if name in given:
-            values, masked = without_mask(given[name])
-            if column.kind == "float":
-                values = np.where(masked, np.nan, values) if masked.any() else values
-            else:
-                place.refuse(masked, "is masked", name, "fill or remove these rows")
-            table[name] = converted(_shaped(values, name, column, place), "", name, column, place)
+            table[name] = values_of(given[name], name, column, place)
         elif column.missing is None:
             raise place.fail("the column is missing", name, "add it")
         else:
@@ -329,66 +326,61 @@ def undefined(hdu: Any, index: int) -> Bool[np.ndarray, ...]:
     return stored == int(column.null)
 
 
-def _fits_values(hdu: Any, index: int, name: str, column: Column, place: Place) -> np.ndarray:
+def _stored(hdu: Any, index: int, name: str, place: Place) -> np.ndarray:
     """The values of a column of a FITS table as they are stored, none of them undefined."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            values = np.asarray(hdu.data.field(index))
-            missing = undefined(hdu, index)
+            values, missing = np.asarray(hdu.data.field(index)), undefined(hdu, index)
     except (ValueError, TypeError, OSError, UnicodeError, KeyError, IndexError, Warning) as error:
         raise place.fail(f"cannot be read: {error}", name, "write the column again") from error
     place.refuse(missing, "undefined (TNULL)", name, "fill or remove these rows")
-    return _shaped(values, name, column, place)
-
-
-def _shaped(values: np.ndarray, name: str, column: Column, place: Place) -> np.ndarray:
-    """The values with the axes of their column: rows, and values in a row unless that is one."""
-    if values.dtype == object:
-        raise place.fail("is an array of variable length", name, column.shape_advice)
-    if column.width is None and values.ndim == 1:
-        values = values[:, None]
-    if column.width == 1 and values.ndim == 2 and values.shape[1] == 1:
-        values = values[:, 0]
-    if values.ndim != (1 if column.width == 1 else 2) or (
-        (column.width or 0) > 1 and values.shape[1] != column.width
-    ):
-        width = "any number of" if column.width is None else column.width
-        raise place.fail(
-            f"has shape {values.shape[1:] or '()'} in a row where {width} value(s) are needed",
-            name,
-            column.shape_advice,
-        )
     return values
 
 
-def converted(values: np.ndarray, unit: str, name: str, column: Column, place: Place) -> np.ndarray:
-    """The values of a column in the kind and unit that it has in memory; an empty `unit` is that of the column.
+def values_of(
+    given: Any, name: str, rule: Column, place: Place, *, unit: str = "", lenient: bool = False
+) -> np.ndarray:
+    """The values of a column in the kind, unit and shape of its rule; numbers that are masked are NaN.
 
-    Raises `DataError` for names where numbers are needed and the reverse, for what is no whole number or no truth
-    value, and as `convert_unit` does.
+    `given` is a column of an astropy table, an array, a quantity, times or a list; `unit` that of one without. In a
+    table of a user (`lenient`) texts may be numbers and truth values, and an empty cell holds what an absent column
+    would.
+
+    Raises `DataError`, with rows, for values of another kind or shape, for whole numbers, truth values and names that
+    are masked, and as `convert_unit` does.
     """
-    strings = values.dtype.kind in "SU"
-    if column.kind == "str":
-        if not strings:
+    values, empty, own = plain_column(given, name, rule, place)
+    values, empty = (_shaped(array, name, rule, place) for array in (values, empty))
+    strings, fill = values.dtype.kind in "OSU", rule.missing if lenient else None
+    if rule.kind == "str":
+        if not strings and not lenient:
             raise place.fail("holds numbers where names are needed", name, "write it as a string column")
-        names = np.char.strip(values.astype(str))
-        bad = [not (text.isascii() and text.isprintable()) for text in names.tolist()]
+        text = np.char.strip(values.astype(str))
+        if lenient:
+            return np.where(empty | (text == "") | (text == "None"), str(fill), text)
+        place.refuse(empty, "is masked", name, "fill or remove these rows")
+        bad = [not (entry.isascii() and entry.isprintable()) for entry in text.tolist()]
         place.refuse(np.array(bad), "holds a control character", name, "write printable ASCII")
-        return names
+        return text
+    if strings and not lenient:
+        what = f"holds strings where numbers are needed, {str(values.flat[0])!r} in row 0 (counted from 0)"
+        raise place.fail(what, name, "write it as a numeric column")
     if strings:
-        raise place.fail(
-            f"holds strings where numbers are needed, {str(values.flat[0])!r} in row 0 (counted from 0)",
-            name,
-            "write it as a numeric column",
-        )
-    if values.dtype.kind not in ("fiu" if column.kind == "float" else "fiub"):
-        advice = "write it as a numeric column" if column.kind == "float" else "write integers"
+        values = _from_text(np.where(empty, "", np.char.strip(values.astype(str))), rule, name, place)
+    if values.dtype.kind not in ("fiu" if rule.kind == "float" else "fiub"):
+        advice = "write it as a numeric column" if rule.kind == "float" else "write integers"
         raise place.fail(f"holds {values.dtype.name} values", name, advice)
-    if column.kind == "float":
-        values = values.astype(np.float64)
-        return convert_unit(values, unit, column.unit, name, place) if unit else values
-    if column.kind == "bool":
+    if rule.kind == "float":
+        numbers = values.astype(np.float64)
+        numbers[empty] = np.nan
+        numbers = convert_unit(numbers, own or unit, rule.unit, name, place) if own or unit else numbers
+        return numbers if fill is None else np.where(np.isnan(numbers), fill, numbers)
+    if fill is not None:
+        values = np.where(empty, fill, values)
+    else:
+        place.refuse(empty, "is masked", name, "fill or remove these rows")
+    if rule.kind == "bool":
         place.refuse((values != 0) & (values != 1), "is neither true nor false", name, "write T or F")
         return values.astype(bool)
     # Whole numbers are compared as floats to find 3.5 and NaN; identifiers are far below 2**53.
@@ -396,6 +388,70 @@ def converted(values: np.ndarray, unit: str, name: str, column: Column, place: P
         bad = ~(np.abs(values) < 2.0**53) | (values != np.round(values))
         place.refuse(bad, "is not a whole number", name, "write integers")
     return values.astype(np.int64)
+
+
+def plain_column(
+    given: Any, name: str, rule: Column, place: Place
+) -> tuple[np.ndarray, Bool[np.ndarray, ...], str]:
+    """The values of a column, where they are masked, and its unit; times become MJD (UTC) where days are wanted."""
+    if hasattr(given, "jd1") or np.asarray(given).dtype.kind == "M":
+        from astropy.time import Time
+
+        if rule.unit != "d":
+            raise place.fail("holds times", name, f"give numbers in {rule.unit or 'plain'}")
+        masked = np.asarray(getattr(given, "mask", False))
+        if not hasattr(given, "jd1"):
+            days = np.asarray(given)
+            masked = masked | np.isnat(days)
+            given = Time(np.where(masked, np.datetime64("2000-01-01"), days), scale="utc")
+        if not hasattr(given, "utc"):
+            raise place.fail("holds differences of times", name, "give dates")
+        values = np.asarray(getattr(given.utc.mjd, "unmasked", given.utc.mjd), dtype=float)
+        return values, np.broadcast_to(masked, values.shape), ""
+    unit = unit_of(given)
+    values, masked = without_mask(getattr(given, "value", given) if unit else given)
+    if values.dtype.names:
+        raise place.fail("is no plain column", name, "give a column of numbers or texts")
+    return values, masked, unit
+
+
+def _shaped(values: np.ndarray, name: str, rule: Column, place: Place) -> np.ndarray:
+    """The values with the axes of their column: rows, and values in a row unless that is one."""
+    if values.dtype == object and any(isinstance(entry, np.ndarray) for entry in values.flat[:1]):
+        raise place.fail("is an array of variable length", name, rule.shape_advice)
+    if rule.width is None and values.ndim == 1:
+        values = values[:, None]
+    if rule.width == 1 and values.ndim == 2 and values.shape[1] == 1:
+        values = values[:, 0]
+    several = rule.width != 1
+    if values.ndim != 1 + several or (several and rule.width not in (None, values.shape[1])):
+        width = "any number of" if rule.width is None else rule.width
+        what = f"has shape {values.shape[1:] or '()'} in a row where {width} value(s) are needed"
+        raise place.fail(what, name, rule.shape_advice)
+    return values
+
+
+MISSING = ("", "nan", "na", "n/a", "<na>", "none", "null", "--", "-", "...")
+"""Texts of a cell without a value, in small letters."""
+_TRUTH = dict.fromkeys(("true", "t", "1", "1.0", "yes"), 1.0) | dict.fromkeys(
+    ("false", "f", "0", "0.0", "no", *MISSING), 0.0
+)
+
+
+def _from_text(text: np.ndarray, rule: Column, name: str, place: Place) -> Float[np.ndarray, ...]:
+    """Numbers from the cells of a text, NaN where they are empty; of truth values 1 and 0."""
+    numbers, truth = np.empty(text.shape), rule.kind == "bool"
+    for at, cell in np.ndenumerate(text):
+        try:
+            missing = cell.lower() in MISSING
+            numbers[at] = _TRUTH[cell.lower()] if truth else float("nan" if missing else cell)
+        except (KeyError, ValueError):
+            what, advice = ("neither true nor false", "write T or F") if truth else ("not a number", "")
+            if not truth and "," in cell:
+                advice = "write numbers with a decimal point and without separators of thousands"
+            what = f"{str(cell)!r} is {what}, in {rows_text(at[:1])}"
+            raise place.fail(what, name, advice or "correct it or leave it empty") from None
+    return numbers
 
 
 def without_mask(values: Any) -> tuple[np.ndarray, Bool[np.ndarray, ...]]:
@@ -411,7 +467,7 @@ def in_unit(values: Any, unit: str, name: str) -> Float[np.ndarray, "*s"]:
     `DataError` for a unit that cannot be converted and for what is not a number.
     """
     place = Place("", "")
-    given = str(getattr(values, "unit", None) or "")
+    given = unit_of(values)
     plain = getattr(values, "value", values) if given and not hasattr(values, "colnames") else values
     try:
         raw, masked = without_mask(plain)
@@ -420,6 +476,20 @@ def in_unit(values: Any, unit: str, name: str) -> Float[np.ndarray, "*s"]:
         raise place.fail("is not made of numbers", name, f"give numbers in {unit or 'fractions'}") from None
     flat = np.atleast_1d(numbers).astype(np.float64)
     return (convert_unit(flat, given, unit, name, place) if given else flat).reshape(np.shape(numbers))
+
+
+def unit_of(column: Any) -> str:
+    """The unit that a column, an array or a quantity brings along, "" for none."""
+    return str(getattr(column, "unit", None) or "")
+
+
+def check_units(given: Mapping[str, str], wanted: str, place: Place) -> None:
+    """Raise `DataError` where some of columns that belong together have a unit to be converted and others have none."""
+    converted = [name for name, unit in given.items() if unit and units.Unit(unit) != units.Unit(wanted)]
+    without = [name for name, unit in given.items() if not unit]
+    if converted and without:
+        what = f"has no unit, {converted[0]} is in {given[converted[0]]}"
+        raise place.fail(what, without[0], f"give all in one unit, or all in {wanted}")
 
 
 def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: Place) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import re
 import warnings
@@ -11,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.data.schema import undefined
-from walop_jax.io.errors import DataError, fail
+from walop_jax.data.schema import MISSING, undefined
+from walop_jax.io.errors import DataError, fail, rows_text
 from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits, unpacked
 from walop_jax.io.plain_tables import table_format
 from walop_jax.io.text import check_input, some, unpacking
@@ -21,6 +22,7 @@ _PACKED = (".gz", ".bz2", ".xz")
 _ALSO = {".tsv": "ascii.csv", ".txt": "ascii.csv", ".dat": "ascii.csv", ".xml": "votable"}
 _SEPARATORS = (",", ";", "\t", "|")
 _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
+_CLASSES = bytes.maketrans(b'123456789,;\t|\n" ', b"ddddddddd" + b"s" * 7)  # digits and what separates cells
 _LOOKED_AT = 200  # lines, for their separators of decimals
 _NUMBER = re.compile(r"[+-]?\d[\d.,]*([eE][+-]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
@@ -187,16 +189,40 @@ def _from_csv(text: str, path: Path, needed: Collection[str]) -> tuple[Any, tupl
         rest, decimals = _with_points(rest, separator, path)
         remarks.append(f"columns are separated by {_NAMES.get(separator, separator)}{decimals}")
         text = f"{header}\n{rest}"
-    options: dict[str, Any] = {"delimiter": separator} if separator != "," else {}
+    kind = "ascii.tab" if separator == "\t" else "ascii.basic"  # which refuse rows that are too short
     try:
-        table = _astropy_table(text + "\n", "ascii.basic" if separator == " " else "ascii.csv", **options)
+        options = {"delimiter": separator} if kind == "ascii.basic" else {}
+        table = _astropy_table(text + "\n", kind, guess=False, **options)
     except UNREADABLE as error:
+        if uneven := re.search(r"inconsistent with data columns.*line (\d+)", str(error)):
+            what = f"has not as many cells as line 1 in {rows_text([int(uneven[1])])}"
+            raise fail(
+                what,
+                file=path,
+                advice="write empty cells too; decimal commas need semicolons between columns",
+            ) from error
         advice = (
             f"line 1 should name the columns, separated as the values are; it is {header[:60]!r}; decimal commas need "
             "semicolons between columns"
         )
         raise fail(f"cannot be read as a table: {one_line(error)}", file=path, advice=advice) from error
+    for index, name in enumerate(table.colnames):
+        if name.upper() == "ID" and table[name].dtype.kind in "if":
+            _keep_texts(table, index, text, separator)
     return table, tuple(remarks)
+
+
+def _keep_texts(table: Any, index: int, text: str, separator: str) -> None:
+    """Make a column of numbers one of texts if numbers are fewer: 007 and 7 are two identifiers."""
+    numbers = table.columns[index]
+    letters = text.encode().translate(_CLASSES)
+    if numbers.dtype.kind == "i" and b"s00" not in letters and b"s0d" not in letters:
+        return
+    rows = csv.reader(io.StringIO(text), delimiter=separator, skipinitialspace=True)
+    texts = [row[index].strip() for row in rows if row][1:]
+    known = np.unique(np.ma.compressed(np.ma.masked_invalid(numbers)))
+    if len({cell for cell in texts if cell.lower() not in MISSING}) > len(known):
+        table.replace_column(table.colnames[index], np.array(texts))
 
 
 def _body(text: str) -> tuple[str, list[str], str]:

@@ -29,7 +29,7 @@ ONE_CAMERA = [name for name, kind in KINDS.items() if kind.flux_known or kind.fl
 NEGATIVE = 5.0
 """Counts below minus this many sigma are no bias-subtracted counts but a fault."""
 
-_LOOKED_AT, _RUN = 4096, 64  # field points whose counts are compared; of large sets, in evenly spaced runs
+_LOOKED_AT, _RUN = 4096, 64  # field points whose counts are compared, and those of a run
 _SPOILT = 0.2
 """Above this share of unusable rows the set is refused, not masked."""
 
@@ -277,42 +277,43 @@ def mask_repeats(
         groups.setdefault(tuple(str(values[row]) for values in settings), []).append(int(row))
     times = exposures.mjd[np.isfinite(exposures.mjd)]
     fine = 2 * len(np.unique(times)) > len(times)
-    used = intensities.used.copy()
+    point, used = intensities.point, intensities.used.copy()
+
+    def rows_of(exposure: int) -> Int[np.ndarray, " r"]:
+        rows = np.flatnonzero(intensities.exposure == exposure)
+        return rows[np.argsort(point[rows])]
+
     remarks: list[str] = []
     alike: list[str] = []
     for first, *others in groups.values():
+        one = rows_of(first)
         for other in others:
-            ids = f"exposures {exposures.exposure[first]} and {exposures.exposure[other]}"
-            if not _same_data(intensities, first, other):
-                if fine and _share_points(intensities, first, other):
-                    what = f"{ids} (rows {first} and {other}, counted from 0) have the same time and settings but"
-                    advice = "no camera takes two exposures at once: correct the times, or write NaN"
-                    raise Place(file, "EXPOSURES").fail(f"{what} different counts", "MJD", advice)
+            ids, two = (
+                f"exposures {exposures.exposure[first]} and {exposures.exposure[other]}",
+                rows_of(other),
+            )
+            if len(one) and all(np.array_equal(v[one], v[two]) for v in (point, intensities.counts)):
+                remarks.append(f"{ids} are the same to the last bit, the second is not used")
+                used[two] = False
+            elif fine and np.isin(point[one[used[one]]], point[two[used[two]]]).any():
+                what = f"{ids} (rows {first} and {other}, counted from 0) have the same time and settings but"
+                advice = "no camera takes two exposures at once: correct the times, or write NaN"
+                raise Place(file, "EXPOSURES").fail(f"{what} different counts", "MJD", advice)
+            else:
                 alike.append(ids)
-                continue
-            remarks.append(f"{ids} are the same to the last bit, the second is not used")
-            used[intensities.exposure == other] = False
     if alike:
         more = f" (and {len(alike) - 1} pairs more)" if len(alike) > 1 else ""
         remarks.append(f"{alike[0]} have the same time and settings but different counts{more}")
     return intensities.using(used), remarks
 
 
-def _share_points(intensities: TableIntensities, first: int, second: int) -> bool:
-    of = intensities.exposure
-    one, other = (intensities.point[(of == entry) & intensities.used] for entry in (first, second))
-    return bool(np.intersect1d(one, other).size)
-
-
-def _same_data(intensities: TableIntensities, first: int, second: int) -> bool:
-    rows = [np.flatnonzero(intensities.exposure == entry) for entry in (first, second)]
-    rows = [entry[np.argsort(intensities.point[entry])] for entry in rows]
-    if len(rows[0]) == 0 or len(rows[0]) != len(rows[1]):
-        return False
-    return all(
-        np.array_equal(getattr(intensities, name)[rows[0]], getattr(intensities, name)[rows[1]])
-        for name in ("point", "counts")
-    )
+def sampled(intensities: Intensities, total: int, most: int) -> tuple[Int[np.ndarray, " p"], Block]:
+    """Field points of a set of so many, `most` at most and in evenly spaced runs, and their data."""
+    if total <= most:
+        return np.arange(total), intensities.block(0, total)
+    starts = np.linspace(0, total - _RUN, most // _RUN).astype(int)
+    blocks = [intensities.block(start, start + _RUN) for start in starts.tolist()]
+    return (starts[:, None] + np.arange(_RUN)).ravel(), Block.joined(blocks)
 
 
 def repeated_counts(
@@ -331,14 +332,9 @@ def repeated_counts(
     counted = ~exposures.flux_known
     if compression is not None:
         counted &= ~compression.covers(exposures)
-    total = len(points) if counted.any() else 0
-    starts = (
-        range(0, total, _RUN) if total <= _LOOKED_AT else np.linspace(0, total - _RUN, _LOOKED_AT // _RUN)
-    )
-    if not len(starts):
+    if not counted.any():
         return
-    places = np.concatenate([np.arange(start, min(start + _RUN, total)) for start in map(int, starts)])
-    block = Block.joined([intensities.block(int(start), int(start) + _RUN) for start in starts])
+    places, block = sampled(intensities, len(points), _LOOKED_AT)
     at, exposure = np.nonzero(block.used & counted)
     same = equal_rows([block.x[at], block.y[at], *block.counts[at, exposure].T])
     order = np.lexsort((at, exposure, same))  # copies behind what they repeat

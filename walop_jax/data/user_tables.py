@@ -14,19 +14,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
-from walop_jax.data.schema import Column, Place, converted, distinct, without_mask
+from walop_jax.data.schema import (
+    MISSING,
+    Column,
+    Place,
+    check_units,
+    distinct,
+    plain_column,
+    unit_of,
+    values_of,
+)
 from walop_jax.data.table_files import read_table_file, table_of_hdu
-from walop_jax.io.errors import fail, rows_text
+from walop_jax.io.errors import fail
 from walop_jax.io.fits_reading import one_line
 from walop_jax.io.text import in_ascii, some
-
-MISSING = ("", "nan", "na", "n/a", "<na>", "none", "null", "--", "-", "...")
-"""Texts of a cell without a value, in small letters."""
-_TRUTH = dict.fromkeys(("true", "t", "1", "1.0", "yes"), 1.0) | dict.fromkeys(
-    ("false", "f", "0", "0.0", "no", *MISSING), 0.0
-)
 
 _LISTED = 12  # columns, in a message
 _LIKE = 0.7  # of names, for "did you mean"
@@ -156,74 +159,55 @@ def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
     Raises `DataError` naming file, column and rows for what cannot be converted.
     """
     place, column = Place(source.path, ""), source.column(name)
-    if column is None:
-        if rule.missing is None:
-            advice = f"add it, or name it so; {_what_is_there(source)}"
-            raise place.fail("the column is missing", name, advice)
-        return np.full(source.rows, rule.missing)
-    values, empty, unit = plain_column(column, name, rule, place)
-    if values.ndim == 2 and values.shape[1] == 1:
-        values, empty = values[:, 0], empty[:, 0]
-    if values.ndim != 1:
-        raise place.fail(f"has shape {values.shape[1:]} in a row, one value is needed", name, "split it")
-    return _cells(values, empty, unit, name, rule, place)
+    if column is not None:
+        return values_of(column, name, rule, place, lenient=True)
+    if rule.missing is None:
+        raise place.fail("the column is missing", name, f"add it, or name it so; {_what_is_there(source)}")
+    return np.full(source.rows, rule.missing)
 
 
 def _what_is_there(source: InputTable) -> str:
     return f"the table has {some([str(name) for name in source.table.colnames], _LISTED)}"
 
 
-def vector_column(source: InputTable, name: str, rule: Column, cameras: Sequence[str]) -> np.ndarray:
-    """A column with `rule.width` numbers in a row, or that many columns side by side, which text formats need.
+def vector_columns(
+    source: InputTable, names: Sequence[str], rule: Column, cameras: Sequence[str]
+) -> list[np.ndarray]:
+    """Columns with `rule.width` numbers in a row, or that many columns side by side, which text formats need.
 
-    These are N0, N1, … and N0_ERR, N1_ERR, … (or N_ERR0, …), or go by the names of the `cameras`: O1, E1, … and
-    O1_ERR, E1_ERR, … Raises `DataError` as `numeric_column` does, and for a row of another width.
+    Those of N and N_ERR are N0, N1, … and N0_ERR, N1_ERR, … (or N_ERR0, …), or go by the names of the `cameras`: O1,
+    E1, … and O1_ERR, E1_ERR, … Raises `DataError` as `numeric_column` does, for a row of another width, and where only
+    some of them have a unit that is converted.
     """
-    place = Place(source.path, "")
-    width = rule.width or 1
-    if name not in source.names:
-        head, _, tail = name.partition("_")
-        end = f"_{tail}" if tail else ""
-        spelled = [f"{head}{k}{end}" for k in range(width)], [f"{camera.upper()}{end}" for camera in cameras]
-        forms = (*spelled, [f"{name}{k}" for k in range(width)])
-        parts = next((form for form in forms if any(part in source.names for part in form)), None)
-        if parts is None:
-            source.lacking.update((name, *spelled[0], *spelled[1]))
-            if rule.missing is not None:
-                return np.full((source.rows, width), rule.missing)
-            listed = ", or ".join(f"{form[0]} … {form[-1]}" for form in spelled)
-            raise place.fail("the column is missing", name, f"add it, or {listed}; {_what_is_there(source)}")
-        single = dataclasses.replace(rule, width=1)
-        return np.stack([numeric_column(source, part, single) for part in parts], axis=1)
-    values, empty, unit = plain_column(source.column(name), name, rule, place)
-    if values.ndim != 2 or values.shape[1] != width:
-        what = f"has shape {values.shape[1:] or '()'} in a row, {width} values are needed"
-        raise place.fail(what, name, rule.shape_advice)
-    return _cells(values, empty, unit, name, rule, place)
+    single = dataclasses.replace(rule, width=1)
+    parts = {name: _side_by_side(source, name, rule.width or 1, cameras) for name in names}
+    found = {part: source.column(part) for name in names for part in parts[name]}
+    units = {part: unit_of(column) for part, column in found.items() if column is not None}
+    values = [
+        numeric_column(source, name, rule)
+        if parts[name] == [name]
+        else np.stack([numeric_column(source, part, single) for part in parts[name]], axis=1)
+        for name in names
+    ]
+    check_units(units, rule.unit, Place(source.path, ""))
+    return values
 
 
-def plain_column(
-    column: Any, name: str, rule: Column, place: Place
-) -> tuple[np.ndarray, Bool[np.ndarray, ...], str]:
-    """The values of a column, where they are masked, and its unit; times become MJD (UTC) where days are wanted."""
-    if hasattr(column, "jd1") or np.asarray(column).dtype.kind == "M":
-        from astropy.time import Time
-
-        if rule.unit != "d":
-            raise place.fail("holds times", name, f"give numbers in {rule.unit or 'plain'}")
-        masked = np.asarray(getattr(column, "mask", False))
-        if not hasattr(column, "jd1"):
-            days = np.asarray(column)
-            masked = masked | np.isnat(days)
-            column = Time(np.where(masked, np.datetime64("2000-01-01"), days), scale="utc")
-        if not hasattr(column, "utc"):
-            raise place.fail("holds differences of times", name, "give dates")
-        values = np.asarray(getattr(column.utc.mjd, "unmasked", column.utc.mjd), dtype=float)
-        return values, np.broadcast_to(masked, values.shape), ""
-    if not hasattr(column, "dtype") or column.dtype.names:
-        raise place.fail("is no plain column", name, "give a column of numbers or texts")
-    values, masked = without_mask(column)
-    return values, masked, str(getattr(column, "unit", None) or "")
+def _side_by_side(source: InputTable, name: str, width: int, cameras: Sequence[str]) -> list[str]:
+    """The columns that hold `width` numbers in a row: one of that name, or one for each number."""
+    if name in source.names:
+        return [name]
+    head, _, tail = name.partition("_")
+    end = f"_{tail}" if tail else ""
+    spelled = [f"{head}{k}{end}" for k in range(width)], [f"{camera.upper()}{end}" for camera in cameras]
+    forms = (*spelled, [f"{name}{k}" for k in range(width)])
+    parts = next((form for form in forms if any(part in source.names for part in form)), None)
+    if parts is None:
+        source.lacking.update((name, *spelled[0], *spelled[1]))
+        listed = ", or ".join(f"{form[0]} … {form[-1]}" for form in spelled)
+        advice = f"add it, or {listed}; {_what_is_there(source)}"
+        raise Place(source.path, "").fail("the column is missing", name, advice)
+    return parts
 
 
 def empty_cells(source: InputTable, name: str, rule: Column) -> Bool[np.ndarray, " n"]:
@@ -232,42 +216,6 @@ def empty_cells(source: InputTable, name: str, rule: Column) -> Bool[np.ndarray,
     if values.dtype.kind in "OSU":
         empty = empty | np.isin(np.char.lower(np.char.strip(values.astype(str))), MISSING)
     return np.any(empty.reshape(source.rows, -1), axis=1)
-
-
-def _cells(
-    values: np.ndarray, empty: Bool[np.ndarray, ...], unit: str, name: str, rule: Column, place: Place
-) -> np.ndarray:
-    """The values of a column as `rule` has them; a masked, empty or NaN cell is what it says of absent columns."""
-    if rule.kind == "str":
-        text = np.char.strip(values.astype(str))
-        return np.where(empty | (text == "") | (text == "None"), str(rule.missing), text)
-    if values.dtype.kind in "OSU":
-        text = np.where(empty, "", np.char.strip(values.astype(str)))
-        values = _from_text(text, rule.kind == "bool", name, place)
-    if rule.kind == "bool":
-        return converted(np.where(empty, False, values), "", name, rule, place)
-    empty = empty | (values != values)
-    found = converted(values, unit, name, rule, place)
-    return np.where(empty, float("nan" if rule.missing is None else str(rule.missing)), found)
-
-
-def _from_text(text: np.ndarray, truth: bool, name: str, place: Place) -> Float[np.ndarray, ...]:
-    """Numbers from the cells of a text, NaN where they are empty; of truth values 1 and 0."""
-    numbers = np.empty(text.shape)
-    for at, cell in np.ndenumerate(text):
-        try:
-            missing = cell.lower() in MISSING
-            numbers[at] = _TRUTH[cell.lower()] if truth else float("nan" if missing else cell)
-        except (KeyError, ValueError):
-            what, advice = ("neither true nor false", "write T or F") if truth else ("not a number", "")
-            if not truth and "," in cell:
-                advice = "write numbers with a decimal point and without separators of thousands"
-            raise place.fail(
-                f"{str(cell)!r} is {what}, in {rows_text(at[:1])}",
-                name,
-                advice or "correct it or leave it empty",
-            ) from None
-    return numbers
 
 
 def extended(source: InputTable, added: Mapping[str, Any], header: Mapping[str, Any] | None = None) -> Any:

@@ -35,11 +35,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data import schema
-from walop_jax.data.calset import assembled
-from walop_jax.data.records import CalibrationSet, DataFlag, Site
+from walop_jax.data.calset import from_arrays
+from walop_jax.data.records import CalibrationSet, DataFlag, FilterCurve, Site
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.instruments.description import described, shipped
-from walop_jax.io.errors import DataError, fail
+from walop_jax.io.errors import DataError, errors_naming, fail
 from walop_jax.io.text import check_input
 
 HEADING = "Polarization Transmission Data"
@@ -274,27 +274,39 @@ def import_transmissions(
             f"a camera is missing: {missing}"
         )
     # Exposures and points without a row are left out too, what remains is numbered anew.
+    values[~row] = np.nan
     taken, places = row.any(axis=-1), row.reshape(-1, len(yx)).any(axis=0)
-    w, s, p = np.nonzero(row)
-    counts = _UNIT * values[row]
-    dark = np.any(counts == 0, axis=-1)
+    counts, printed = (_UNIT * part[taken][:, places].swapaxes(0, 1) for part in (values, step))
+    curves = [FilterCurve(f"MONO-{1e4 * w:.0f}", np.array([w]), np.ones(1)) for w in wavelengths]
+    colour, state = np.nonzero(taken)
+    y, x = yx[places].T
+    with errors_naming(folder):
+        calset = from_arrays(
+            counts,
+            # A number that was rounded to a step is off by step / √12.
+            np.maximum(error * counts, printed / math.sqrt(12.0)),
+            x,
+            y,
+            np.where(np.isfinite(angles), angles, np.nan)[state],
+            "flux",
+            instrument=instrument,
+            site=Site(*described(instrument).place[:4]),
+            filters={curve.name: curve for curve in curves},
+            origin="optical design program, polarization transmission",
+            filter=[curves[number].name for number in colour],
+            mjd=60000.0 + 1e-3 * np.arange(len(state)),
+            exptime=1.0,
+            temp=20.0,
+            ha=0.0,
+        )
+    table = TableIntensities.of(calset.intensities, calset.points)
+    dark = np.any(table.counts == 0, axis=-1)
     if np.any(dark):
         remarks.append(
             f"{folder}: {np.sum(dark)} of {len(dark)} rows have a transmission of 0 (vignetted): flagged, not used"
         )
-    table = {
-        "EXPOSURE": (np.cumsum(taken).reshape(taken.shape) - 1)[w, s],
-        "POINT": (np.cumsum(places) - 1)[p],
-        "SOURCE": np.full(len(p), -1),
-        "N": counts,
-        # A number that was rounded to a step is off by step / √12.
-        "N_ERR": np.maximum(error * counts, _UNIT * step[row] / math.sqrt(12.0)),
-        "FLAG": np.where(dark, DataFlag.EDGE_OR_VIGNETTED, 0),
-    }
-    filters, states = np.nonzero(taken)
-    return _calibration_set(
-        instrument, folder, wavelengths[filters], angles[states], yx[places, ::-1], table, tuple(remarks)
-    )
+    table = table.flagged(dark, DataFlag.EDGE_OR_VIGNETTED)
+    return dataclasses.replace(calset, intensities=table, remarks=(*remarks, *calset.remarks))
 
 
 def _exports(folder: Path, tell: Callable[[str], None]) -> tuple[list[TransmissionExport], list[str]]:
@@ -372,47 +384,3 @@ def _dense(
         values[at], step[at] = (part.T[:, None, :, None] for part in (e.transmission, e.step))
         owner[at] = n
     return values, step
-
-
-def _calibration_set(
-    instrument: str,
-    folder: str | os.PathLike[str],
-    wavelength: Float[np.ndarray, " e"],
-    angle: Float[np.ndarray, " e"],
-    xy: Float[np.ndarray, "p 2"],
-    rows: dict[str, np.ndarray],
-    remarks: tuple[str, ...],
-) -> CalibrationSet:
-    """Put the tables through the checks of any calibration set."""
-    names = np.array([f"MONO-{1e4 * value:.0f}" for value in wavelength])
-    n, clp_in = len(names), np.isfinite(angle)
-    curve, first = np.unique(names, return_index=True)
-    exposures = {name: np.full(n, column.missing) for name, column in schema.EXPOSURES.items()} | {
-        "EXPOSURE": np.arange(n),
-        "KIND": np.full(n, "flux"),
-        "MJD": 60000.0 + 1e-3 * np.arange(n),
-        "EXPTIME": np.ones(n),
-        "FILTER": names,
-        "CLP_IN": clp_in,
-        "CLP_ANGLE": np.where(clp_in, angle, np.nan),
-        "TEMP": np.full(n, 20.0),
-        "HA": np.zeros(n),
-    }
-    tables = {
-        "EXPOSURES": exposures,
-        "POINTS": {"POINT": np.arange(len(xy)), "X": xy[:, 0], "Y": xy[:, 1]},
-        "INTENSITIES": rows,
-        "FILTERS": {
-            "FILTER": curve,
-            "WAVELENGTH": wavelength[first][:, None],
-            "THROUGHPUT": np.ones((len(curve), 1)),
-        },
-    }
-    return assembled(
-        tables,
-        Path(folder),
-        instrument=instrument,
-        site=Site(*described(instrument).place[:4]),
-        origin="optical design program, polarization transmission",
-        remarks=remarks,
-    )

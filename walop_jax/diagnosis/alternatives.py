@@ -46,13 +46,15 @@ from walop_jax.fit.search import FAR_OFF
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import some
-from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import JOINED, alternatives, other_curves
 from walop_jax.model.effects import Context, OtherDescription
 from walop_jax.model.instrument import NoSuchPlaceError
 from walop_jax.model.specification import Model, with_effects
+
+CHOICE_ROWS = 6000
+"""(Exposure, point) pairs on which other descriptions of an instrument are compared before any of them is fitted."""
 
 _POINTS, _FEW = 16, 64  # field points that are looked at; sets of so few are looked at whole
 _STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best
@@ -510,7 +512,7 @@ def _screened(
     result: FitResult, sentences: Iterable[str], context: Context
 ) -> Iterator[tuple[Choice, float, Vector]]:
     """Each change that is one, with what it leaves, its gain in χ² and its place: the better of two places."""
-    every = max(1, limits.CHOICE_ROWS // max(len(result.calset.exposures), 1))
+    every = max(1, CHOICE_ROWS // max(len(result.calset.exposures), 1))
     calset = thinned(result.calset, every, neighbours=1)
     start = result.model.start.copy()  # but effects as they have been fitted
     for name in result.model.effect_names:

@@ -47,13 +47,17 @@ from walop_jax.diagnosis.policy import RINGS
 from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import cut, states
-from walop_jax.likelihood import engine, limits
+from walop_jax.likelihood import engine
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.inverses import unit_columns, whitening
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.effects.free_form import FINE, HARMONICS, SMOOTH, WIDTH
 from walop_jax.model.instrument import Instrument
+
+MANY_POINTS = 4
+"""Field points of an exposure, on average, above which its cameras may have gains of their own: with fewer there are
+nearly as many gains as data."""
 
 SINGLE_EXPOSURES = "single exposures"
 STATES = "states"
@@ -89,7 +93,7 @@ class Measured:
     @property
     def has_gains(self) -> bool:
         """True if exposures are seen at so many field points that gains of single ones are not all there is."""
-        return bool(self.used.sum() >= limits.MANY_POINTS * self.used.any(axis=0).sum())
+        return bool(self.used.sum() >= MANY_POINTS * self.used.any(axis=0).sum())
 
     @property
     def gained(self) -> list[int]:

@@ -58,11 +58,13 @@ from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.stand_in import on_field_points
 from walop_jax.io.progress import Stage
-from walop_jax.likelihood import limits
 from walop_jax.model.effects import Effect
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import field_declarations
 from walop_jax.model.specification import effect_context
+
+MANY_SHAPES = 8
+"""Shapes of an effect above which one of them, of the median size, stands for all in what it does to the matrix."""
 
 SECOND_ORDER = 1.1
 _ABSORBED = 1e-9  # share of the square of a column that a rival leaves below which the two are the same
@@ -195,7 +197,7 @@ def _representative(columns: Sequence[_Column]) -> set[str]:
     chosen: set[str] = set()
     for shapes in by_effect.values():
         names = sorted(shapes, key=shapes.__getitem__)
-        chosen.update(names if len(names) <= limits.MANY_SHAPES else [names[len(names) // 2]])
+        chosen.update(names if len(names) <= MANY_SHAPES else [names[len(names) // 2]])
     return chosen
 
 

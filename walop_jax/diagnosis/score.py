@@ -38,6 +38,9 @@ from walop_jax.io.code import cores
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.inverses import unit_columns, whitening
 
+NULL_DRAWS = 1_000
+"""Draws of all scores under the base model: a fifth of them give the number of trials to 7 %."""
+
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
 Reduction = Callable[[Vector, float], tuple[Vector, float]]
@@ -310,7 +313,7 @@ class ScoreSpace:
             testable=rank > 0,
         )  # fmt: skip
 
-    def smallest_p(self, rng: np.random.Generator, draws: int = limits.NULL_DRAWS) -> Vector:
+    def smallest_p(self, rng: np.random.Generator, draws: int = NULL_DRAWS) -> Vector:
         """ln of the smallest p among all candidates, drawn under the base."""
         if not self._root.rank:
             return np.zeros(0)

@@ -57,10 +57,12 @@ from walop_jax.fit.search import FAR_OFF
 from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixels
 from walop_jax.fit.verdict import NOT_MEASURED, Structure
 from walop_jax.io.text import some
-from walop_jax.likelihood import limits
 from walop_jax.likelihood.frames import PixelPosterior
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
+
+TRUST_ROWS = 20_000
+"""(Exposure, point) pairs whose residuals are searched for patterns after every fit: a second, and half a GB."""
 
 UNEVEN = 1.25
 """Factor between the squared residuals of a group and those of all below which it is a matter of the stated errors."""
@@ -77,7 +79,7 @@ def examined(
     A fit that explains nothing is held against other readings of its data first (`alternatives`), unless these were
     tried already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p,
     `policy` holds the thresholds.
-    Of a set with more than `limits.TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at.
+    Of a set with more than `TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at.
     A χ² that is a few per cent too large while nothing else is wrong is put down to the stated errors, and the
     standard errors are made from the residuals. Raises `DataError` with the remedy for data that another reading
     explains.
@@ -166,7 +168,7 @@ def pixel_structure(result: FitResult) -> Structure:
 
 def _most(result: FitResult) -> int:
     """Field points that are looked at."""
-    return max(1, limits.TRUST_ROWS // max(len(result.calset.exposures), 1))
+    return max(1, TRUST_ROWS // max(len(result.calset.exposures), 1))
 
 
 def _errors_too_small(result: FitResult, seed: int, policy: Policy) -> Iterator[str]:

@@ -5,12 +5,13 @@ the host, since a pass may read files, in parameters scaled to their prior width
 
 Step        δ = −(JᵀJ + λ)⁻¹ Jᵀr, λ following optimistix' classical trust region from `damping` on. A start that may be
             far away takes λ = 1; one near the minimum λ = 0, the Newton step, until a step leads upwards.
-Stop        The scaled gradient d = ‖(JᵀJ)^(−½) Jᵀr‖ < `tolerance`: the distance to the minimum in standard errors.
-            Without `look_at_end` a Newton step is not looked at if d²/d₋₁, which steps that close in at a constant rate
-            leave, is that small (d₋₁: the distance at the place before). A model that is far from the data
-            (`far_off`) is given up sooner: where d < `ROUGH` shrinks by less than a factor of `CLOSING_IN` a step, as
-            its errors are made from what it leaves anyway; or where `PATIENCE` places in a row have lowered the
-            objective by less than `LEAST_GAIN` of itself.
+Stop        `TOLERANCE`: the scaled gradient d = ‖(JᵀJ)^(−½) Jᵀr‖, the distance to the minimum in standard errors. A
+            Newton step is not looked at if d²/d₋₁, which steps that close in at a constant rate leave, is that small
+            (d₋₁: the distance at the place before).
+            `ROUGH`: a model that is far from the data (`far_off`) has errors made from its residuals anyway, and is
+            near enough with d below this, at the second such place in a row if it may look at another.
+            `ROUNDING`: a step that did not lower the objective is the last where the next could not be told from it.
+            `MAXIMUM_STEPS`: places looked at.
 Source      `SOURCE`: the method and its trust region.
 """
 
@@ -18,17 +19,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+import scipy.linalg
+from jaxtyping import Float
 
-from walop_jax.model.compiled import array, compiled
+from walop_jax.model.compiled import compiled
 
 SOURCE = "Moré 1978, Lecture Notes in Mathematics 630, 105; Conn, Gould & Toint 2000, Trust Region Methods"
 
@@ -39,15 +40,14 @@ RESULTS = optx.RESULTS
 MAXIMUM_STEPS = 200
 """Along a curved valley that only a prior closes (throughput and flux) there may be more than a hundred."""
 TOLERANCE = 1e-4
-ROUGH, CLOSING_IN = 0.1, 3.0
-PATIENCE, LEAST_GAIN = 6, 1e-3
+ROUGH = 0.1
+ROUNDING = 1e-12  # of an objective: near the end two of them differ by less
 # Sums of many terms are good to some 10⁻¹⁵ of the largest eigenvalue: the smallest is then known to ten per cent.
 LARGEST_CONDITION = 1e14
-ROUNDING = 1e-12  # of an objective: near the end two of them differ by less
-SMALLEST_STEP = 1e-14  # of the trust region
-# Share of the predicted reduction above which λ falls. With 0.99 a problem that is a little curved keeps its λ and with
-# it a slow end: directions that the data hardly see then take forty steps.
-WELL_PREDICTED = 0.75
+# Shares of the predicted reduction below which λ grows and above which it falls. With 0.01 steps go to and fro across a
+# valley that is bent twice as much as Gauss and Newton have it; with 0.99 a problem that is a little curved keeps its λ
+# and with it a slow end: directions that the data hardly see then take forty steps.
+BADLY_PREDICTED, WELL_PREDICTED = 0.25, 0.75
 
 
 @runtime_checkable
@@ -93,24 +93,6 @@ class Minimum:
         return bool(self.result == RESULTS.successful)
 
 
-class _Information(NamedTuple):
-    """An expansion in scaled parameters, as compiled code takes it."""
-
-    objective: Any
-    gradient: Any
-    matrix: Any
-
-    @classmethod
-    def of(cls, given: Expansion, scale: Vector) -> _Information:
-        objective = given.objective if np.isfinite(given.objective) else np.inf
-        return cls(objective, given.gradient * scale, given.matrix * np.outer(scale, scale))
-
-    def of_function(self) -> Any:
-        """The same as optimistix takes it, whose objective is half of the sum of squares."""
-        operator = lx.MatrixLinearOperator(self.matrix, lx.positive_semidefinite_tag)
-        return optx.FunctionInfo.EvalGradHessian(0.5 * self.objective, self.gradient, operator)
-
-
 def minimise(
     evaluate: Callable[[Vector], Expansion],
     start: Vector,
@@ -119,64 +101,55 @@ def minimise(
     damping: float = 1.0,
     maximum_steps: int = MAXIMUM_STEPS,
     tolerance: float = TOLERANCE,
-    look_at_end: bool = True,
     far_off: Callable[[Any], bool] = lambda _: False,
     progress: Callable[[int, Any], None] | None = None,
 ) -> Minimum:
     """Minimise a sum of squares from `start`; `scale` is the unit of each parameter.
 
-    `evaluate(x)` gives the objective and its expansion at x, `far_off` says of an expansion whether the model is
-    hopelessly far from the data there. No more than `maximum_steps` places are looked at, the start among them;
-    `progress(step, expansion)` is told the best one after each. Without `look_at_end` the last step may be taken
-    unseen: `scaled_gradient` is then the one to be expected, and the expansion that of the place before. Never raises
-    for a numerical outcome: the gates, `result` and `message` say what happened.
+    `evaluate(x)` gives the objective and its expansion at x, `far_off` whether the model of an expansion is hopelessly
+    far from the data; `progress(step, expansion)` is given the best one after each of at most `maximum_steps` places,
+    the start among them. Where the last step is not looked at, `scaled_gradient` is the one to be expected, and the
+    expansion that of the place before. Never raises for a numerical outcome: the gates, `result` and `message` say what
+    happened.
     """
     x = trial = np.asarray(start, float)
-    region = _REGION.init(array(np.zeros(len(x))), None)  # pyright: ignore[reportArgumentType]
-    region = eqx.tree_at(lambda s: s.step_size, region, array(1.0 / damping if damping > 0 else np.inf))
-    here, near, history, best = None, None, [], []
+    size = 1.0 / damping if damping > 0 else np.inf
+    here, step, history = None, np.zeros(len(x)), []
     distance, before, condition = np.inf, np.inf, np.inf
-    result, why = RESULTS.nonlinear_max_steps_reached, ""
+    result = RESULTS.nonlinear_max_steps_reached
     while len(history) < maximum_steps:
-        found = evaluate(trial)
-        history.append(found.objective)
-        there = _Information.of(found, scale)
-        if here is None or near is None:
-            here, near = found, there
-            if not np.isfinite(found.objective):
-                result = RESULTS.nonfinite
-                break
-        size, accept, region, step = _next(len(history) == 1, x / scale, trial / scale, near, there, region)
-        if bool(accept):
-            x, here, near, before = trial, found, there, distance
+        there = evaluate(trial)
+        history.append(there.objective)
+        if here is None and not np.isfinite(there.objective):
+            here, result = there, RESULTS.nonfinite
+            break
+        lowered = here is None or there.objective < here.objective
+        size, accept = _judged(step, here, there, size)
+        if here is None or accept:
+            x, here, before = trial, there, distance
             distance, condition = distance_to_minimum(there)
-        best.append(here.objective)
         if progress is not None:
             progress(len(history), here)
-        hopeless = far_off(here)
-        left = distance * distance / before if bool(accept) and not look_at_end and np.isinf(size) else 0.0
-        rough = hopeless and distance < ROUGH and distance * CLOSING_IN > before
-        if distance < tolerance or 0.0 < left < tolerance or rough:
-            if distance >= tolerance and 0.0 < left < tolerance:
-                x, distance = x + scale * np.asarray(step), left
+        step = _step(here, scale, 1.0 / size)
+        left = distance**2 / before if accept and np.isinf(size) and np.isfinite(before) else np.inf
+        rough = far_off(here) and distance < ROUGH and (before < ROUGH or len(history) == maximum_steps)
+        smallest = ROUNDING * abs(here.objective)
+        last = not lowered and -_change(step, here) < smallest
+        if min(distance, left) < tolerance or rough or (last and distance**2 < smallest):
+            if tolerance <= distance and left < tolerance:
+                x, distance = x + step, left
             result = RESULTS.conlim if condition > LARGEST_CONDITION else RESULTS.successful
             break
-        if hopeless and len(best) > PATIENCE and best[-1] > (1.0 - LEAST_GAIN) * best[-1 - PATIENCE]:
-            result, why = (
-                RESULTS.stagnation,
-                f"{PATIENCE} more steps lowered χ² by less than {LEAST_GAIN:.1%}",
-            )
+        if last:
+            result = RESULTS.stagnation
             break
-        if float(size) < SMALLEST_STEP:
-            result, why = RESULTS.stagnation, "no step lowers χ² any more"
-            break
-        trial = x + scale * np.asarray(step)
+        trial = x + step
     assert here is not None
     return Minimum(
         x=x,
         expansion=here,
         result=result,  # pyright: ignore[reportArgumentType]
-        message=_in_words(result, why, len(history), distance, condition),  # pyright: ignore[reportArgumentType]
+        message=_in_words(result, len(history), distance, condition),  # pyright: ignore[reportArgumentType]
         steps=len(history),
         scaled_gradient=distance,
         condition=condition,
@@ -184,13 +157,13 @@ def minimise(
     )
 
 
-def _in_words(result: optx.RESULTS, why: str, steps: int, distance: float, condition: float) -> str:
+def _in_words(result: optx.RESULTS, steps: int, distance: float, condition: float) -> str:
     if bool(result == RESULTS.successful):
         return f"converged: scaled gradient {distance:.1e}"
     if bool(result == RESULTS.conlim):
         return f"parameters cannot be distinguished: condition number {condition:.1e}"
     if bool(result == RESULTS.stagnation):
-        return f"{why}, scaled gradient {distance:.1e}"
+        return f"no step lowers χ² any more, scaled gradient {distance:.1e}"
     if bool(result == RESULTS.nonfinite):
         return "the model is not finite at the start values"
     return f"not converged after {steps} steps, scaled gradient {distance:.1e}"
@@ -218,22 +191,45 @@ def distance_to_minimum(expansion: Expansion) -> tuple[float, float]:
     return float(np.sqrt(np.sum(along[positive] ** 2 / value[positive]))), condition
 
 
-_REGION = optx.ClassicalTrustRegion(high_cutoff=WELL_PREDICTED)
+def _step(here: Expansion, scale: Vector, damping: float) -> Vector:
+    """−(JᵀJ + λ)⁻¹ Jᵀr; not a number where that matrix is singular."""
+    try:
+        factors = scipy.linalg.cho_factor(here.matrix + np.diag(damping / scale**2), check_finite=False)
+    except np.linalg.LinAlgError:
+        return np.full(len(scale), np.nan)
+    return -scipy.linalg.cho_solve(factors, here.gradient, check_finite=False)
 
 
-def _after(
-    first: Any, y: Any, trial: Any, here: _Information, there: _Information, region: Any
-) -> tuple[Array, Array, Any, Array]:
-    """Size of the trust region, whether the trial is accepted, the state of the region, and the next step."""
-    size, accept, _, region = _REGION.step(first, y, trial, here.of_function(), there.of_function(), region)
-    accept = accept | (there.objective - here.objective <= ROUNDING * jnp.abs(here.objective))
+def _change(step: Vector, here: Expansion) -> float:
+    """Change of the objective by a step, as predicted."""
+    return float(2.0 * here.gradient @ step + step @ here.matrix @ step)
+
+
+def _judged(step: Vector, here: Expansion | None, there: Expansion, size: float) -> tuple[float, bool]:
+    """Size of the trust region after a step from here to there, and whether it is taken."""
+    if here is None:
+        return size, True
+    objective = there.objective if np.isfinite(there.objective) else np.inf
+    slopes = here.gradient @ step, step @ here.matrix @ step
+    grown, predicted = map(np.asarray, _region(size, here.objective, objective, *slopes))
     # From no damping at all the first retreat is to λ = 1.
-    size = jnp.where(accept | jnp.isfinite(size), size, 1.0)
-    best = jax.tree.map(lambda new, old: jnp.where(accept, new, old), there, here).of_function()
-    descent = optx.DampedNewtonDescent(linear_solver=lx.Cholesky())
-    step = descent.step(size, descent.query(best.grad, best, descent.init(best.grad, best)))[0]
-    return size, accept, eqx.tree_at(lambda s: s.step_size, region, size), step
+    grown = float(grown) if predicted or np.isfinite(grown) else 1.0
+    return grown, objective - here.objective <= ROUNDING * abs(here.objective)
 
 
-# Compiled as a whole: operation by operation it would cost a tenth of a second at the first step.
-_next = compiled(_after, kept_as="step")
+def _of_step(size: Any, here: Any, there: Any, slope: Any, bend: Any) -> Any:
+    """The trust region of optimistix along one step: numbers, so that one program serves any number of parameters.
+
+    Its objective is half of the sum of squares.
+    """
+    operator = lx.MatrixLinearOperator(bend[None, None], lx.positive_semidefinite_tag)
+    along = optx.FunctionInfo.EvalGradHessian(0.5 * here, slope[None], operator)
+    state = eqx.tree_at(lambda s: s.step_size, _REGION.init(jnp.zeros(1), None), size)  # pyright: ignore[reportArgumentType]
+    grown, accept, *_ = _REGION.step(
+        jnp.array(False), jnp.zeros(1), jnp.ones(1), along, optx.FunctionInfo.Eval(0.5 * there), state
+    )
+    return grown, accept
+
+
+_REGION = optx.ClassicalTrustRegion(low_cutoff=BADLY_PREDICTED, high_cutoff=WELL_PREDICTED)
+_region = compiled(_of_step, kept_as="region")

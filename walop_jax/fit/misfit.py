@@ -17,10 +17,12 @@ from jaxtyping import Float
 from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, Position
 from walop_jax.fit.outliers import BEYOND, MOST, outlying
 from walop_jax.fit.refit import FitResult
-from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.conventions import matrix_elements
+
+MISFIT_POINTS = 65536
+"""Field points whose residuals are grouped to describe a misfit: their cube then takes 50 MB at 25 exposures."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,15 +84,15 @@ class Misfit:
 def describe(result: FitResult) -> Misfit:
     """Group the residuals of a fit.
 
-    Of a very large set, those of `limits.MISFIT_POINTS` points spread over the field, the worst point among them.
+    Of a very large set, those of `MISFIT_POINTS` points spread over the field, the worst point among them.
     """
     return misfit_at(result.likelihood, result.values)
 
 
 def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit:
     """As `describe`, at any full vector of parameter values."""
-    if likelihood.layout.points > limits.MISFIT_POINTS:
-        likelihood = Likelihood.of(thinned(likelihood.calset, limits.MISFIT_POINTS), likelihood.model)
+    if likelihood.layout.points > MISFIT_POINTS:
+        likelihood = Likelihood.of(thinned(likelihood.calset, MISFIT_POINTS), likelihood.model)
     e, used, k = likelihood.calset.exposures, likelihood.used, likelihood.cameras
     names = likelihood.model.template.cameras.names
     _, residual = likelihood.residuals(values)

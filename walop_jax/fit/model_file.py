@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import fnmatch
 import json
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -22,7 +21,7 @@ from walop_jax.data.settings import Settings
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import parse_toml
-from walop_jax.likelihood import limits
+from walop_jax.io.toml import Reader, Table
 from walop_jax.model.effects import EFFECTS, Context, Effect, effect_by_name
 from walop_jax.model.effects.catalogue import entries, is_own
 from walop_jax.model.instrument import Instrument, adapted, as_designed, nominal_instrument
@@ -31,9 +30,13 @@ from walop_jax.model.parameters import Parameter, check_names, unknown_name
 from walop_jax.model.sources import MoonSky, Standards
 from walop_jax.model.specification import THROUGHPUT, Model, effect_context, make_model, with_effects
 
+LEVEL_POINTS = 256
+"""Field points from which the start value of a throughput is taken: a start need not be exact."""
+
 TABLES = ("model", "effects", "catalogue", "parameters", "law")
-MODEL_KEYS = ("instrument", "plates", "throughput_degree", "effects")
-PARAMETER_KEYS = ("start", "prior", "free", "tie", "unit", "scale", "about")
+PARAMETER: Table = {
+    "start": float, "prior": Any, "free": bool, "tie": str, "unit": Any, "scale": float, "about": Any,
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,52 +138,30 @@ def parse(text: str, build: Callable[[ModelTable], Model]) -> Model:
 
 
 def _header(table: Mapping[str, Any], choices: Mapping[str, Any], entries: Mapping[str, Any]) -> ModelTable:
-    check_names("key of [model]", table, MODEL_KEYS)
-    effects = table.get("effects", [])
-    if not (isinstance(effects, list) and all(isinstance(name, str) for name in effects)):
-        raise ValueError('[model] effects must be a list of names, e.g. effects = ["clp_wobble"]')
-    degree = table.get("throughput_degree")
-    if degree is not None and not (isinstance(degree, int) and 0 <= degree <= 12):
+    hints = {"instrument": str, "plates": str, "throughput_degree": int, "effects": tuple[str, ...]}
+    given = Reader("").values(hints, table, "model")
+    effects = given.get("effects", ())
+    if not 0 <= (degree := given.get("throughput_degree", 0)) <= 12:
         raise ValueError(f"[model] throughput_degree = {degree!r} must be a whole number from 0 to 12")
     check_names("effect (it has choices but is not in the list of [model])", choices, effects)
     for name, values in choices.items():
         if not isinstance(values, Mapping):
             raise ValueError(f"[effects] {name} = {values!r} must be a table, [effects.{name}]")
-    return ModelTable(table.get("instrument"), table.get("plates"), degree, tuple(effects), choices, entries)
-
-
-def _number(name: str, key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f'[parameters."{name}"] {key} = {value!r} must be a finite number')
-    return float(value)
+    return ModelTable(**given, choices=choices, entries=entries)
 
 
 def _changes(parameter: Parameter, entry: Mapping[str, Any]) -> dict[str, Any]:
-    name, changes = parameter.name, {}
-    check_names(f'key of [parameters."{name}"]', entry, PARAMETER_KEYS)
-    for key, value in entry.items():
-        if key == "unit":
-            if value != parameter.unit:
-                raise ValueError(
-                    f'[parameters."{name}"] unit is {parameter.unit!r}, not {value!r}; convert the values'
-                )
-        elif key in ("start", "scale"):
-            changes[key] = _number(name, key, value)
-        elif key == "prior":
-            if value == "none":
-                changes[key] = None
-            elif isinstance(value, list) and len(value) == 2:
-                changes[key] = (_number(name, key, value[0]), _number(name, key, value[1]))
-            else:
-                raise ValueError(
-                    f'[parameters."{name}"] prior = {value!r} must be [mean, standard deviation] or "none"'
-                )
-        elif key == "free":
-            if not isinstance(value, bool):
-                raise ValueError(f'[parameters."{name}"] free = {value!r} must be true or false')
-            changes[key] = value
-        elif key == "tie":
-            changes[key] = str(value)
+    place, read = f'parameters."{parameter.name}"', Reader("")
+    changes = read.values(PARAMETER, entry, place)
+    changes.pop("about", None)
+    if (unit := changes.pop("unit", parameter.unit)) != parameter.unit:
+        raise read.fault(place, f"unit is {parameter.unit!r}, not {unit!r}; convert the values")
+    if (prior := changes.get("prior")) == "none":
+        changes["prior"] = None
+    elif isinstance(prior, list) and len(prior) == 2:
+        changes["prior"] = read.value(tuple[float, float], prior, "prior", place)
+    elif prior is not None:
+        raise read.fault(place, f'prior = {prior!r} must be [mean, standard deviation] or "none"')
     return changes
 
 
@@ -253,8 +234,8 @@ def _level(calset: CalibrationSet) -> float:
     """
     for part, points, exposures in parts_of(calset):
         known = calset.exposures.flux_known[exposures]
-        for start in range(0, len(points) if known.any() else 0, limits.LEVEL_POINTS):
-            block = part.block(start, min(start + limits.LEVEL_POINTS, len(points)))
+        for start in range(0, len(points) if known.any() else 0, LEVEL_POINTS):
+            block = part.block(start, min(start + LEVEL_POINTS, len(points)))
             counts = block.counts[block.used & known]
             if counts.size:
                 return float(2.0 * counts.mean())

@@ -23,11 +23,14 @@ from jaxtyping import Float, Int
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.search import free_scales
-from walop_jax.likelihood import engine, limits
+from walop_jax.likelihood import engine
 from walop_jax.likelihood.compressed import compressed
 from walop_jax.likelihood.frames import PixelPosterior, Vector
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood, Matrix, Posterior
+
+ROBUST_POINTS = 4096
+"""Field points whose residuals give the errors of a fit that does not explain its data."""
 
 FEWEST_BLOCKS = 8
 CELLS = 6  # of the field along a side
@@ -90,19 +93,19 @@ def larger(one: Matrix, other: Matrix) -> Matrix:
 def _gradients(likelihood: Likelihood, values: Vector) -> Iterator[tuple[str, Float[np.ndarray, "b f"]]]:
     """Gradients of the blocks, with the errors as stated, for each way of cutting the data."""
     whole = likelihood.layout.points
-    if whole > limits.ROBUST_POINTS:
-        likelihood = Likelihood.of(thinned(likelihood.calset, limits.ROBUST_POINTS), likelihood.model)
+    if whole > ROBUST_POINTS:
+        likelihood = Likelihood.of(thinned(likelihood.calset, ROBUST_POINTS), likelihood.model)
     share = whole / likelihood.layout.points
     calset, select = likelihood.calset, likelihood.model.selection()
     instrument, cell = likelihood.model.instrument(values), field_cells(calset)
     by_exposure = np.zeros((len(calset.exposures), select.shape[1]))
     by_cell, first = np.zeros((int(cell.max(initial=0)) + 1, select.shape[1])), 0
-    for chunk in likelihood.points:
-        found = engine.linearised_residuals(instrument, likelihood.plan, chunk, once=likelihood.once)
+    for batch in likelihood.points:
+        found = engine.linearised_residuals(instrument, likelihood.plan, batch)
         residual, slope = (np.asarray(part) for part in found)
-        residual = residual.reshape(chunk.counts.shape)
+        residual = residual.reshape(batch.counts.shape)
         rows = slope.reshape(*residual.shape, -1)
-        # Points that fill the last chunk have no weight, and so no gradient.
+        # Points that fill the last batch have no weight, and so no gradient.
         parts = np.einsum("pekn,pek->pen", rows, residual) @ select
         by_exposure += parts.sum(axis=0)
         inside = min(len(parts), len(cell) - first)

@@ -1,4 +1,4 @@
-"""The search for the minimum of a likelihood: from afar on a small set, from a sample's minimum on a large one.
+"""The search for the minimum of a likelihood: from afar on a small set or a sample, then near it on all of a large one.
 
 Every search ends: a model that is far from the data (χ²/dof above `FAR_OFF`) is given so many passes over them as
 `most_passes` says, all starts together. With residuals of a wrong model, errors of the data are scaled until χ²/dof is
@@ -8,7 +8,6 @@ Every search ends: a model that is far from the data (χ²/dof above `FAR_OFF`) 
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -22,6 +21,12 @@ from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood, Posterior
 from walop_jax.model import materials
 from walop_jax.model.specification import Model, Vector
+
+FIRST_STRIPS = 8
+"""Strips of image rows that are fitted before all of them: twice what a throughput of fourth order asks for."""
+
+PIXEL_SAMPLE = 1024
+"""Pixels of whole frames on which their fit begins: the optics of so few are soon solved one by one."""
 
 Expand = Callable[[Vector, float, Posterior | None], Posterior]
 
@@ -119,67 +124,30 @@ def find_minimum(
 ) -> FoundMinimum:
     """The minimum of a set from start values that may be far away; of a large one, from that of a sample of it.
 
-    Of whole frames some strips of image rows come between the sample and all pixels. `noise_scale` and `worth` are
-    those of `refit.fit`. Raises `DataError` when the exposures cannot determine the instrument.
+    The sample of a very large set is large itself. Of whole frames some strips of image rows come between the sample
+    and all pixels. `noise_scale` and `worth` are those of `refit.fit`. Raises `DataError` when the exposures cannot
+    determine the instrument.
     """
     layout = likelihood.layout
     if not layout.large:
-        return _from_afar(likelihood, first, noise_scale, worth)
+        return _best_gaps(likelihood, _from_afar(likelihood, first, noise_scale, worth))
     on_pixels = stands_for_pixels(likelihood, first)
-    points = limits.PIXEL_SAMPLE if on_pixels else max(limits.SAMPLE, layout.points // limits.FARTHEST)
-    values, scale, starts = _of_sample(likelihood, first, noise_scale, worth, points)
-    passes = [("fit of all points", None, LARGE_TOLERANCE)]
-    if on_pixels:
-        every = strips_of(likelihood) // limits.FIRST_STRIPS
-        passes = [("fit of some image rows", every, 1.0)] if every > 1 else []
-        passes.append(("fit of all pixels", 1, LARGE_TOLERANCE))
-    found: FoundMinimum | None = None
-    for label, every, tolerance in passes:
-        expand = None if every is None else functools.partial(_of_pixels, likelihood, every)
-        found = _search(
-            likelihood,
-            label,
-            values,
-            scale,
-            None,
-            expand,
-            tolerance=tolerance,
-            damping=0.0,
-            look_at_end=False,
-        )
-        values = found.values
-    assert found is not None  # there is a pass over everything
-    return dataclasses.replace(found, starts=starts)
-
-
-def _of_pixels(
-    likelihood: Likelihood, every: int, values: Vector, noise_scale: float, _: Posterior | None
-) -> Posterior:
-    return expand_pixels(likelihood, values, noise_scale, every)
-
-
-def _of_sample(
-    likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None, points: int
-) -> tuple[Vector, float, int]:
-    """The minimum of a sample of a large set, the factor on the errors, and from how many places it was sought.
-
-    The sample of a very large set is large itself.
-    """
-    sample = Likelihood.of(
-        thinned(likelihood.calset, points),
-        likelihood.model,
-        memory=likelihood.layout.allowed,
-        runner=likelihood.runner,
-    )
+    points = PIXEL_SAMPLE if on_pixels else max(limits.SAMPLE, layout.points // limits.FARTHEST)
+    some, runner = thinned(likelihood.calset, points), likelihood.runner
+    sample = Likelihood.of(some, likelihood.model, memory=layout.allowed, runner=runner)
     found = find_minimum(sample, first, noise_scale, worth)
-    return found.values, found.posterior.noise_scale, found.starts
+    scale, starts = found.posterior.noise_scale, found.starts
+    every = strips_of(likelihood) // FIRST_STRIPS if on_pixels else 0
+    passes = [("fit of some image rows", every, 1.0)] if every > 1 else []
+    passes.append((f"fit of all {'pixels' if on_pixels else 'points'}", 1, LARGE_TOLERANCE))
+    for label, step, tolerance in passes:
 
+        def of_pixels(values: Vector, scale: float, _: Posterior | None, every: int = step) -> Posterior:
+            return expand_pixels(likelihood, values, scale, every)
 
-def _from_afar(
-    likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
-) -> FoundMinimum:
-    """The minimum from start values that may be far away, of fringes that of the best order (`_best_gaps`)."""
-    return _best_gaps(likelihood, _of_one_order(likelihood, first, noise_scale, worth))
+        how = {"expand": of_pixels if on_pixels else None, "tolerance": tolerance, "damping": 0.0}
+        found = _search(likelihood, label, found.values, scale, **how)
+    return dataclasses.replace(found, starts=starts)
 
 
 def _best_gaps(likelihood: Likelihood, found: FoundMinimum) -> FoundMinimum:
@@ -208,10 +176,10 @@ def _best_gaps(likelihood: Likelihood, found: FoundMinimum) -> FoundMinimum:
     return found
 
 
-def _of_one_order(
+def _from_afar(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
 ) -> FoundMinimum:
-    """The minimum near start values that may be far away, the errors of the data scaled if need be."""
+    """The minimum from start values that may be far away, the errors of the data scaled if need be."""
     check_identifiable(likelihood)
     given = noise_scale or 1.0
     found = _search(likelihood, "fit", first, given, maximum_steps=FIRST_STEPS)
@@ -224,14 +192,13 @@ def _of_one_order(
 
 
 def _far_off(likelihood: Likelihood, found: FoundMinimum) -> FoundMinimum:
-    """The best place for a model that is far from the data: errors scaled to what it leaves, other orders tried."""
+    """The best place for a model that is far from the data: errors scaled to its residuals, other orders tried."""
     left, starts = most_passes(likelihood.model) - found.minimum.steps, 1
 
     def search(label: str, values: Vector, scale: float, most: int) -> FoundMinimum:
         nonlocal left
-        more = _search(
-            likelihood, label, values, scale, found.posterior, maximum_steps=max(1, min(most, left))
-        )
+        most = max(1, min(most, left))
+        more = _search(likelihood, label, values, scale, found.posterior, maximum_steps=most)
         left -= more.minimum.steps
         return more
 

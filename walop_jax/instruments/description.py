@@ -11,30 +11,25 @@ import dataclasses
 import functools
 import math
 import os
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeGuard
 
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.text import parse_toml, read_text
+from walop_jax.io.toml import Reader, Table
 
-Table = Mapping[str, Any]
-
-KEYS = (
-    "name", "default", "like", "about", "source", "path", "wavelength", "site", "field",
-    "cameras", "throughput", "elements", "arms",
-)  # fmt: skip
 REQUIRED = ("name", "path", "field", "cameras", "throughput", "elements", "arms")
-SITE_KEYS = ("telescope", "latitude", "longitude", "elevation", "full_moon")
-FIELD_KEYS = ("limit", "scale", "raster", "edge")
+KEYS: Table = dict.fromkeys(REQUIRED, Any) | {
+    "default": Any, "like": str, "about": str, "source": str, "wavelength": float, "site": Any,
+}  # fmt: skip
+SITE: Table = {"telescope": str} | dict.fromkeys(("latitude", "longitude", "elevation", "full_moon"), float)
+FIELD: Table = {"limit": float, "scale": float, "raster": str, "edge": float}
+CAMERAS: Table = {"names": Any, "split": bool, "floor": float}
+THROUGHPUT: Table = {"degree": int, "level": float, "scale": float, "loose": float}
 RASTERS = ("square", "line")
 NO_SOURCE = "description file"  # of numbers, where a file names none
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-LARGEST = 1e300
-CAMERA_KEYS = ("names", "split", "floor")
-THROUGHPUT_KEYS = ("degree", "level", "scale", "loose")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +68,7 @@ class Description:
     @property
     def place(self) -> tuple[str, float, float, float, float]:
         """Telescope, latitude and longitude (deg, east positive), elevation (m), MJD of a full Moon; NaN: not said."""
-        latitude, longitude, elevation, moon = (float(self.site.get(key, math.nan)) for key in SITE_KEYS[1:])
+        latitude, longitude, elevation, moon = (float(self.site.get(key, math.nan)) for key in list(SITE)[1:])
         return str(self.site.get("telescope", "")), latitude, longitude, elevation, moon
 
 
@@ -173,73 +168,8 @@ def is_named(value: Any) -> TypeGuard[list[Table]]:
     return isinstance(value, list) and all(isinstance(entry, Mapping) and "name" in entry for entry in value)
 
 
-@dataclasses.dataclass(frozen=True)
-class Reader:
-    """Values of a file, checked one by one; `where` (if any) begins every message, `place` is the table."""
-
-    where: str
-
-    def fault(self, place: str, what: str) -> DataError:
-        """The error for something that is wrong in a table."""
-        text = f"[{place}] {what}" if place else what
-        return DataError(f"{self.where}: {text}" if self.where else text)
-
-    def known(self, table: Table, keys: Iterable[str], place: str) -> None:
-        """Raise `DataError` for a key that is none of those known."""
-        for key in table:
-            if key not in keys:
-                raise self.fault(place, f"there is no key {key!r}; {nearest(key, keys)}")
-
-    def table(self, value: Any, place: str, what: str = "") -> Table:
-        """A table."""
-        if not isinstance(value, Mapping):
-            raise self.fault(place, f"{what}{value!r} must be a table")
-        return value
-
-    def name(self, value: Any, place: str) -> str:
-        """A name that parts of an instrument may have."""
-        if not NAME.fullmatch(self.text(value, "name", place)):
-            raise self.fault(place, f"{value!r} cannot be a name: letters, digits and _, a letter first")
-        return value
-
-    def words(self, value: Any, key: str, place: str) -> tuple[str, ...]:
-        """Names, each once."""
-        if not (isinstance(value, list) and value and all(isinstance(word, str) for word in value)):
-            raise self.fault(place, f"{key} = {value!r} must be a list of names")
-        if len(set(value)) != len(value):
-            raise self.fault(place, f"{key} names something twice: {', '.join(value)}")
-        return tuple(value)
-
-    def text(self, value: Any, key: str, place: str) -> str:
-        """A text on one line."""
-        if not isinstance(value, str) or not value.isprintable() or not value.strip():
-            raise self.fault(place, f"{key} = {value!r} must be a text on one line")
-        return value
-
-    def number(self, value: Any, key: str, place: str) -> float:
-        """A finite number."""
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
-            shown = repr(value) if len(repr(value)) < 80 else "that"
-            kind = "one number" if isinstance(value, list) else "a finite number"
-            raise self.fault(place, f"{key} = {shown} must be {kind}")
-        return float(value)
-
-    def numbers(self, value: Any, key: str, place: str) -> tuple[float, ...]:
-        """A list of finite numbers."""
-        if not isinstance(value, list) or not value:
-            raise self.fault(place, f"{key} = {value!r} must be a list of numbers")
-        return tuple(self.number(entry, f"{key}[{i}]", place) for i, entry in enumerate(value))
-
-    def positive(self, value: Any, key: str, place: str, advice: str = "") -> float:
-        """A number above 0."""
-        number = self.number(value, key, place)
-        if number <= 0:
-            raise self.fault(place, f"{key} = {number:g} must be above 0{advice}")
-        return number
-
-
 def _description(read: Reader, table: Table, text: str) -> Description:
-    read.known(table, KEYS, "")
+    read.values(KEYS, table, "")
     for key in REQUIRED:
         if key not in table:
             raise read.fault("", f"{key} is missing; walop-jax docs adding-an-instrument has an example")
@@ -247,21 +177,15 @@ def _description(read: Reader, table: Table, text: str) -> Description:
     site, field, series, cameras, elements, arms = (
         read.table(table.get(key, {}), "", f"{key} = ") for key in parts
     )
-    read.known(site, SITE_KEYS, "site")
-    read.known(field, FIELD_KEYS, "field")
-    read.known(series, THROUGHPUT_KEYS, "throughput")
-    read.known(cameras, CAMERA_KEYS, "cameras")
-    for key, value in site.items():
-        read.text(value, key, "site") if key == "telescope" else read.number(value, key, "site")
+    for place, hints in (("site", SITE), ("field", FIELD), ("throughput", THROUGHPUT), ("cameras", CAMERAS)):
+        read.values(hints, table.get(place, {}), place)
     if not abs(site.get("latitude", 0.0)) <= 90.0:
         raise read.fault("site", f"latitude = {site['latitude']:g} must be between -90 and 90 deg")
-    degree = series.get("degree", 4)
-    if isinstance(degree, bool) or not isinstance(degree, int) or not 0 <= degree <= 12:
+    degree, floor = series.get("degree", 4), float(cameras.get("floor", 0.0))
+    if not 0 <= degree <= 12:
         raise read.fault("throughput", f"degree = {degree!r} must be a whole number from 0 to 12")
-    split, floor = cameras.get("split", False), read.number(cameras.get("floor", 0.0), "floor", "cameras")
-    if not isinstance(split, bool) or not 0.0 <= floor < 1.0:
-        what = "split must be true or false, floor a share of the light from 0 to below 1"
-        raise read.fault("cameras", what)
+    if not 0.0 <= floor < 1.0:
+        raise read.fault("cameras", f"floor = {floor:g} must be a share of the light from 0 to below 1")
     raster = field.get("raster", RASTERS[0])
     if raster not in RASTERS:
         raise read.fault("field", f"raster = {raster!r} must be {' or '.join(RASTERS)}")
@@ -269,8 +193,8 @@ def _description(read: Reader, table: Table, text: str) -> Description:
         raise read.fault("arms", "needs one arm at least")
     return Description(
         name=read.text(table["name"], "name", ""),
-        about=read.text(table["about"], "about", "") if "about" in table else "",
-        source=read.text(table.get("source", NO_SOURCE), "source", ""),
+        about=table.get("about", ""),
+        source=table.get("source", NO_SOURCE),
         path=read.words(table["path"], "path", "") if table["path"] else (),
         elements=elements,
         arms=arms,
@@ -287,7 +211,7 @@ def _description(read: Reader, table: Table, text: str) -> Description:
         read=read,
         raster=raster,
         edge=read.number(field.get("edge", field.get("limit", 0.0)), "edge", "field"),
-        split=split,
+        split=cameras.get("split", False),
         floor=floor,
         wavelength=read.positive(table["wavelength"], "wavelength", "") if "wavelength" in table else None,
         default=table.get("default") is True,

@@ -9,7 +9,6 @@ import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from astropy.table import Column as AstropyColumn
@@ -17,7 +16,6 @@ from astropy.table import Table
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
-from walop_jax.io.text import two_digits, with_error, with_minus_sign
 
 FORMATS = {
     ".fits": "fits",
@@ -29,53 +27,6 @@ FORMATS = {
     ".votable": "votable",
 }
 """Extensions of tables that are read, and what astropy calls the format."""
-
-
-class MatrixTable(Table):
-    """Field points with the instrument matrix; a few of them are printed as elements with their errors.
-
-    `meanings` are those of the bits of FLAG.
-    """
-
-    FEW = 4
-    meanings: Mapping[int, str] = {}
-
-    def __str__(self) -> str:
-        whole = {"X", "Y"} <= set(self.colnames) and self._elements()
-        return (
-            "\n".join(map(self._block, range(len(self))))
-            if whole and len(self) <= self.FEW
-            else super().__str__()
-        )
-
-    __repr__ = __str__
-
-    def _elements(self) -> list[str]:
-        return [name for name in self.colnames if f"{name}_ERR" in self.colnames and name.startswith("M")]
-
-    def _block(self, row: int) -> str:
-        def number(name: str) -> float:
-            column: Any = self[name]
-            given = name in ("X", "Y") and column.unit is not None  # in a unit of the user's
-            return float((column.quantity.to_value("deg") if given else np.asarray(column))[row])
-
-        x, y = (with_minus_sign(f"{number(name):+.3f}°") for name in ("X", "Y"))
-        cells = [
-            f"{name.lower()} {with_error(number(name), number(f'{name}_ERR'))}" for name in self._elements()
-        ]
-        width = max(map(len, cells)) + 3
-        # `matrix` itself writes both columns; those of a user's table may be texts, or masked.
-        inside = [name[:-3] for name in self.colnames if name.endswith("_IN") and self[name][row] is np.True_]
-        stand = "".join(f", {prefix} at {number(f'{prefix}_ANGLE'):g}°" for prefix in inside)
-        lines = [f"field point X {x}, Y {y}{stand}"]
-        lines += [
-            "  " + "".join(f"{cell:<{width}}" for cell in cells[k : k + 3]) for k in range(0, len(cells), 3)
-        ]
-        if "P_ERR" in self.colnames:
-            known, flag = f"{two_digits(100 * number('P_ERR'))} %", int(number("FLAG"))
-            lines.append(f"  error of p of a star with p ≤ 5 %, calibration alone: {known}; FLAG {flag}")
-            lines += [f"  FLAG {bit}: {meaning}" for bit, meaning in self.meanings.items() if flag & bit]
-        return "\n".join(line.rstrip() for line in lines)
 
 
 def table_format(path: str | os.PathLike[str]) -> str:

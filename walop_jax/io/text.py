@@ -150,7 +150,7 @@ def some(items: Sequence[str], most: int, between: str = ", ") -> str:
 
 
 def plain(value: Any) -> Any:
-    """The value with mappings as dicts, sequences as lists, numbers that are not finite as None, texts `printable`.
+    """The value with mappings as dicts, sequences as lists, numbers that are not finite as None, texts `encodable`.
 
     Paths are texts.
     """
@@ -160,10 +160,10 @@ def plain(value: Any) -> Any:
         return [plain(entry) for entry in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return printable(os.fspath(value)) if isinstance(value, str | os.PathLike) else value
+    return encodable(os.fspath(value)) if isinstance(value, str | os.PathLike) else value
 
 
-def printable(text: str) -> str:
+def encodable(text: str) -> str:
     """The text with the bytes of a path that are not UTF-8, which no output takes, written as \\xff."""
     return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 

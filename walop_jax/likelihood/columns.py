@@ -76,10 +76,7 @@ def own_columns(
             plans[structure] = Likelihood.of(likelihood.calset, likelihood.model, (effect,))
         own = plans[structure]
         instrument = own.model.instrument(values)
-        parts = [
-            used_rows(_own(instrument, own.plan, (effect,), chunk, once=own.few), chunk)
-            for chunk in own.points
-        ]
+        parts = [used_rows(_own(instrument, own.plan, (effect,), batch), batch) for batch in own.points]
         found.append(np.concatenate(parts))
     return np.concatenate(found, axis=1)
 
@@ -107,7 +104,11 @@ def _own_at_point(
     return -projected.reshape(len(change), -1).T
 
 
-_own = compiled(jax.vmap(_own_at_point, (None, None, None, 0)), kept_as="own_columns")
+_own = compiled(
+    jax.vmap(_own_at_point, (None, None, None, 0)),
+    optimised_above=limits.OPTIMISED_ABOVE,
+    kept_as="own_columns",
+)
 
 
 # ----------------------------------------------------------------------------------------------- compiled programs
@@ -194,8 +195,10 @@ def _pushed(
     return jax.vmap(jax.vmap(at), (None, 0))(counts, change)
 
 
-_at_points = compiled(jax.vmap(_at_point, (None, None, 0)), kept_as="responses")
-_fringes_at = compiled(_fringes, kept_as="fringes")
+_at_points = compiled(
+    jax.vmap(_at_point, (None, None, 0)), optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="responses"
+)
+_fringes_at = compiled(_fringes, optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="fringes")
 _visible = compiled(_visibilities, kept_as="visibilities")
 _detectors = compiled(_pushed, kept_as="detector_slopes")
 
@@ -242,15 +245,11 @@ def generator(name: str) -> Float[np.ndarray, "4 4"]:
 
 
 class Columns:
-    """The columns of any changes at one set of values of the parameters of a likelihood.
+    """The columns of any changes at one set of values of the parameters of a likelihood."""
 
-    Those of many likelihoods, not `once`, come from a program that takes longer to compile and half the time to run.
-    """
-
-    def __init__(self, likelihood: Likelihood, values: Vector, *, once: bool = True) -> None:
+    def __init__(self, likelihood: Likelihood, values: Vector) -> None:
         self.likelihood, self.values = likelihood, values
         self.instrument = likelihood.model.instrument(values)
-        self.once = once
         self.plan = likelihood.plan
         self.patched = self.instrument.patched()
         planned = "temperature" in self.plan.conditions.planned
@@ -353,8 +352,8 @@ class ResponseBlock:
 
     def __init__(self, of: Columns, start: int, pieces: Sequence[Piece]) -> None:
         self.of, size = of, limits.RESPONSES_TOGETHER
-        (data,) = of.reader.chunks(start, start + size, size)
-        found = _at_points(of.instrument, of.plan, data, once=of.once)
+        (data,) = of.reader.batches(start, start + size, size)
+        found = _at_points(of.instrument, of.plan, data)
         self.found: _AtPoint = jax.tree.map(np.asarray, found)
         self.x, self.y, weight, self.band, self.source = (
             np.asarray(getattr(data, name)) for name in ("x", "y", "weight", "band", "source")
@@ -418,7 +417,7 @@ class ResponseBlock:
         sites = [np.stack([one, -one], 1)[:, : self.sites] for one in (x, y)]
         padded = np.pad(np.array(every), (0, -len(every) % GAPS_TOGETHER), mode="edge")
         parts = [
-            np.asarray(_fringes_at(self.of.instrument, self.of.fringe_plan, some, *sites, once=True))
+            np.asarray(_fringes_at(self.of.instrument, self.of.fringe_plan, some, *sites))
             for some in np.split(padded, len(padded) // GAPS_TOGETHER)
         ]
         whole = np.concatenate(parts, axis=3)

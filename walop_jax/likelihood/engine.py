@@ -156,7 +156,13 @@ def point_residuals(
     instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
 ) -> tuple[Float[Array, "e f"], Float[Array, "e k"]]:
     """Best flux of every exposure of one point and the normalised residuals data − model."""
-    unit = point_prediction(instrument, plan, point, nodes)
+    return residuals_of(instrument, plan, point_prediction(instrument, plan, point, nodes), point)
+
+
+def residuals_of(
+    instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], point: PointData
+) -> tuple[Float[Array, "e f"], Float[Array, "e k"]]:
+    """Best flux of every exposure and the normalised residuals, from the counts for light of unit flux."""
     flux = best_flux(instrument, plan, unit, point)
     return flux, (point.counts - real_counts(instrument, plan, unit, flux)) * point.weight
 
@@ -222,21 +228,38 @@ def _point_normal(
     return r @ r, jacobian @ r, jacobian @ jacobian.T
 
 
-def _normal_equations(
+def normal_equations(
     instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None = None
 ) -> Normal:
+    """χ² and its expansion from some points: with optics on nodes block by block, else from the rows of all points.
+
+    Rows come from a program that errors and verdict need anyway, `limits.BATCH` points at a time.
+    """
+    if nodes is not None:
+        return Normal(*map(np.asarray, _table_equations(instrument, plan, data, nodes)))
+    size, chi2, gradient, matrix = values_of(instrument).size, 0.0, 0.0, 0.0
+    for start in range(0, len(data.x), limits.BATCH):
+        part = data
+        if len(data.x) > limits.BATCH:
+            part = jax.tree.map(
+                lambda leaf, first=start: np.asarray(leaf)[first : first + limits.BATCH], data
+            )
+        residual, slope = map(np.asarray, linearised_residuals(instrument, plan, part))
+        r, jacobian = residual.reshape(-1), slope.reshape(-1, size)
+        chi2, gradient, matrix = chi2 + r @ r, gradient + jacobian.T @ r, matrix + jacobian.T @ jacobian
+    return Normal(chi2, gradient, matrix)
+
+
+def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:
     """Sums over blocks of points, so that what is needed in between stays in the processor's cache.
 
     Points that make no whole number of blocks, and few points, are one block.
     """
-
-    def function(part: PointData) -> Normal:
-        return _block_equations(instrument, plan, part, nodes)
-
     points, block = data.x.shape[0], limits.JACOBIAN_BLOCK
     if points <= block or points % block:
-        return function(data)
-    return summed(function, jax.tree.map(lambda v: v.reshape(-1, block, *v.shape[1:]), data))
+        return _block_equations(instrument, plan, data, nodes)
+    blocks = jax.tree.map(lambda v: v.reshape(-1, block, *v.shape[1:]), data)
+    return summed(lambda part: _block_equations(instrument, plan, part, nodes), blocks)
 
 
 def summed(function: Callable[[Any], Any], parts: Any) -> Any:
@@ -248,7 +271,7 @@ def summed(function: Callable[[Any], Any], parts: Any) -> Any:
     )[0]
 
 
-def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None) -> Normal:
+def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:
     size, series, plain = values_of(instrument).size, series_indices(instrument), plain_positions(instrument)
     chi2, gradient, gram = jax.vmap(_point_normal, in_axes=(None, None, 0, None))(
         instrument, plan, data, nodes
@@ -297,28 +320,16 @@ def _linearised_residuals(
     return residual, slope
 
 
-def dense_equations(instrument: Instrument, plan: Plan, data: PointData, *, once: bool = False) -> Normal:
-    """As `normal_equations`, from all rows: of small sets, for which one program is then enough.
-
-    Compiling the optics with their derivatives takes longer than the fit of a table does.
-    """
-    residual, slope = map(np.asarray, linearised_residuals(instrument, plan, data, once=once))
-    r, jacobian = residual.reshape(-1), slope.reshape(-1, slope.shape[-1])
-    return Normal(r @ r, jacobian.T @ r, jacobian.T @ jacobian)
-
-
 def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:
     """Stokes vectors that enter the collimator."""
     return jax.vmap(lambda point: light.stokes(instrument, point.sight(plan)))(data)
 
 
 incoming = compiled(_incoming, kept_as="incoming")
-
-
-normal_equations = compiled(_normal_equations, kept_as="normal_equations")
-linearised_residuals = compiled(_linearised_residuals, kept_as="linearised_residuals")
-residuals = compiled(_residuals, kept_as="residuals")
-prediction = compiled(_prediction, kept_as="prediction")
-
-
+_table_equations = compiled(_on_table, kept_as="table_equations")
+linearised_residuals = compiled(
+    _linearised_residuals, optimised_above=limits.OFTEN_OPTIMISED_ABOVE, kept_as="linearised_residuals"
+)
+residuals = compiled(_residuals, optimised_above=limits.OPTIMISED_ABOVE, kept_as="residuals")
+prediction = compiled(_prediction, optimised_above=limits.OPTIMISED_ABOVE, kept_as="prediction")
 detected = compiled(jax.vmap(light.detected, (None, None, 0)), kept_as="detected")

@@ -153,9 +153,9 @@ def solved_optics(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> O
 def in_batches(solve: Callable[[Vector, Vector], Any], x: Vector, y: Vector) -> Any:
     """Results of `solve` at field positions (deg), a tree of arrays, as many at a time as it is compiled for."""
     parts = []
-    for start in range(0, len(x), limits.SOLVED_TOGETHER):
+    for start in range(0, len(x), limits.BATCH):
         # The last batch is filled up with its last place.
-        inside = np.minimum(np.arange(start, start + limits.SOLVED_TOGETHER), len(x) - 1)
+        inside = np.minimum(np.arange(start, start + limits.BATCH), len(x) - 1)
         parts.append(jax.tree.map(np.asarray, solve(x[inside], y[inside])))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(x)], *parts)
 

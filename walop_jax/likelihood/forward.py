@@ -8,8 +8,8 @@ Symbols     θ parameters of the model, in its order and units; N ± σ used int
 Gauges      constants are left out of the densities. A free parameter without a prior may have a weak pull to its start
             value, which keeps what the data do not determine from running away; it is part of ln p, as in a fit
 Ties        a tied parameter has the value of its master, whatever stands in its place
-Derivatives in any mode and order; the optics by the rule of `likelihood.optics`. Points are worked on in chunks, in a
-            scan, and a gradient computes each chunk anew: its memory is that of one chunk
+Derivatives in any mode and order; the optics by the rule of `likelihood.optics`. Points are worked on in batches, in a
+            scan, and a gradient computes each batch anew: its memory is that of one batch
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Forward(eqx.Module):
 
     template: Instrument
     plan: Plan
-    data: PointData  # with leading axes (chunk, point)
+    data: PointData  # with leading axes (batch, point)
     used: Int[Array, " d"]
     master: Int[Array, " n"]
     free: Int[Array, " f"]
@@ -62,19 +62,19 @@ class Forward(eqx.Module):
     shape: tuple[int, int, int] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, calset: CalibrationSet, model: Model, chunk: int | None = None) -> Forward:
-        """The forward model of a set that fits into memory, `chunk` points at a time (None: by the kind of machine).
+    def of(cls, calset: CalibrationSet, model: Model, batch: int | None = None) -> Forward:
+        """The forward model of a set that fits into memory, `batch` points at a time (None: by the kind of machine).
 
         Raises RuntimeError when float64 is switched off, as the methods do: what a session compiles has its precision.
         """
         need_float64(WHAT)
-        if chunk is None:
+        if batch is None:
             on_cpu = jax.default_backend() == "cpu"
-            chunk = limits.FORWARD_CHUNK if on_cpu else limits.FORWARD_CHUNK_OF_ACCELERATORS
-        layout = Layout.of(calset, model, points_per_chunk=chunk, interpolate=False)
+            batch = limits.FORWARD_BATCH if on_cpu else limits.ACCELERATOR_BATCH
+        layout = Layout.of(calset, model, batch=batch, interpolate=False)
         reader = PointReader(calset, layout.plan, layout.mirrored, model.template.cameras.floor)
-        chunks = reader.chunks(0, layout.points, layout.chunk)
-        data = jax.tree.map(lambda *parts: array(np.stack(parts)), *chunks)
+        batches = reader.batches(0, layout.points, layout.batch)
+        data = jax.tree.map(lambda *parts: array(np.stack(parts)), *batches)
         rows: PriorRows = prior_rows(model)
         return cls(
             template=model.template,
@@ -141,7 +141,7 @@ class Forward(eqx.Module):
         """
         if flux is not None:
             flux = jnp.asarray(flux, float)
-            flux = self._chunked(flux if flux.ndim > 2 else flux[..., None])
+            flux = self._batched(flux if flux.ndim > 2 else flux[..., None])
 
         def of(point: PointData, flux: Array | None) -> Array:
             instrument, unit = self._unit(values, point)
@@ -201,16 +201,15 @@ class Forward(eqx.Module):
     def _residuals(self, values: Values | Instrument, data: PointData) -> Float[Array, "m e k"]:
         def of(point: PointData) -> Array:
             instrument, unit = self._unit(values, point)
-            flux = engine.best_flux(instrument, self.plan, unit, point)
-            return (point.counts - engine.real_counts(instrument, self.plan, unit, flux)) * point.weight
+            return engine.residuals_of(instrument, self.plan, unit, point)[1]
 
         return jax.vmap(of)(data)
 
-    def _whole(self, chunks: Float[Array, "c m e k"]) -> Float[Array, "p e k"]:
-        """All points, without those that fill up the last chunk."""
-        return chunks.reshape(-1, *chunks.shape[2:])[: self.shape[0]]
+    def _whole(self, batches: Float[Array, "c m e k"]) -> Float[Array, "p e k"]:
+        """All points, without those that fill up the last batch."""
+        return batches.reshape(-1, *batches.shape[2:])[: self.shape[0]]
 
-    def _chunked(self, points: Float[Array, "p e f"]) -> Float[Array, "c m e f"]:
-        chunks, size = self.data.x.shape
-        filled = jnp.concatenate([points, jnp.repeat(points[-1:], chunks * size - len(points), axis=0)])
-        return filled.reshape(chunks, size, *points.shape[1:])
+    def _batched(self, points: Float[Array, "p e f"]) -> Float[Array, "c m e f"]:
+        batches, size = self.data.x.shape
+        filled = jnp.concatenate([points, jnp.repeat(points[-1:], batches * size - len(points), axis=0)])
+        return filled.reshape(batches, size, *points.shape[1:])

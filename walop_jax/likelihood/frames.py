@@ -546,6 +546,6 @@ def gauss_newton(found: FrameSums) -> Matrix:
 def _slopes_on_nodes(found: FrameSums, count: int) -> Iterator[tuple[slice, Float[np.ndarray, "p e k a"]]]:
     """Derivatives of the counts on Chebyshev nodes, some at a time."""
     x, y = found.cells.field(*chebyshev.grid(FRAME, count))
-    for start in range(0, len(x), limits.SOLVED_TOGETHER):
-        here = slice(start, start + limits.SOLVED_TOGETHER)
+    for start in range(0, len(x), limits.BATCH):
+        here = slice(start, start + limits.BATCH)
         yield here, unit_slopes_at(found.likelihood, found.instrument, x[here], y[here])

@@ -1,8 +1,8 @@
 """Layout of the computation for a set under a model, and its pieces: decided once, before anything is computed.
 
-Measurements come in chunks of field points of equal size. A set that fits into half of the memory it may take is turned
-into arrays once. A larger one is read, slab by slab, on every pass: memory is that of a few slabs however many points
-there are.
+Measurements come in batches of field points of equal size. A set that fits into half of the memory it may take is
+turned into arrays once. A larger one is read, slab by slab, on every pass: memory is that of a few slabs however many
+points there are.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ THINNEST = 1e-3  # deg: shortest side of a rectangle with nodes
 class Layout:
     """The plan of the exposures, and how the field points are cut.
 
-    There are `points` field points, `chunk` in a chunk (one call of the engine) and `slab` in a slab (read together, by
+    There are `points` field points, `batch` in a batch (one call of the engine) and `slab` in a slab (read together, by
     one thread). `kept` says whether their data stay in memory, `memory` how many bytes going through them takes
     (estimated), of those `allowed`. `interpolated` says whether the optics are to be solved on nodes over `rectangle`
     (deg) and interpolated, `large` whether a fit should do with as few passes as can be, `mirrored` whether the
@@ -57,7 +57,7 @@ class Layout:
 
     plan: Plan
     points: int
-    chunk: int
+    batch: int
     slab: int
     kept: bool
     memory: int
@@ -66,6 +66,7 @@ class Layout:
     large: bool
     mirrored: bool
     rectangle: Rectangle
+    sets: int = 1
 
     @classmethod
     def of(
@@ -76,13 +77,15 @@ class Layout:
         *,
         memory: float | None = None,
         threads: int = 1,
-        points_per_chunk: int | None = None,
+        batch: int | None = None,
         interpolate: bool | None = None,
+        sets: int = 1,
     ) -> Layout:
         """Lay out a set under a model; `probes` are effects beyond the model whose columns will be asked for.
 
         `memory` (bytes) is what point data may take, None for the usual 2 GB; `threads` is the number of slabs in use
-        at a time. `points_per_chunk` and `interpolate` are decided by the size of the set where they are None.
+        at a time. `batch` and `interpolate` are decided by the size of the set where they are None; `sets` is how many
+        such sets come.
         """
         planned = planned_instrument(calset, model)
         whole = dataclasses.replace(planned, effects=(*planned.effects, *probes))
@@ -91,22 +94,22 @@ class Layout:
             plan = with_median(plan, median_counts(calset))
         mirrored = light.has_ghosts(whole)
         points, exposures = len(calset.points), len(calset.exposures)
-        many = points > limits.INTERPOLATE_ABOVE
-        interpolated = many if interpolate is None else interpolate
-        usual = limits.LARGE_CHUNK if many else limits.POINTS_PER_CHUNK
-        chunk = min(points_per_chunk or usual, points)
+        plan = dataclasses.replace(plan, work=points * exposures * sets)
+        interpolated = points > limits.INTERPOLATE_ABOVE if interpolate is None else interpolate
+        usual = limits.LARGE_BATCH if interpolated else limits.BATCH
+        batch = min(batch or usual, points)
         allowed = limits.MEMORY if memory is None else memory
         each = bytes_per_point(exposures, calset.cameras, mirrored=mirrored)
         kept = 2 * each * points <= allowed
-        # Whole chunks; and many of them, as pixels are read in whole rows of the frames.
+        # Whole batches; and many of them, as pixels are read in whole rows of the frames.
         most = min(
             limits.LARGEST_SLAB, int(allowed) // (limits.READING * threads), each * points // limits.SLABS
         )
-        slab = chunk * max(1, most // (each * chunk))
+        slab = batch * max(1, most // (each * batch))
         return cls(
             plan=plan,
             points=points,
-            chunk=chunk,
+            batch=batch,
             slab=slab,
             kept=kept,
             memory=2 * each * points if kept else limits.READING * threads * each * slab,
@@ -115,12 +118,13 @@ class Layout:
             large=interpolated and points > limits.LARGE_ABOVE,
             mirrored=mirrored,
             rectangle=_rectangle(calset, mirrored=mirrored),
+            sets=sets,
         )
 
     @property
-    def chunks(self) -> int:
-        """Number of chunks."""
-        return -(-self.points // self.chunk)
+    def batches(self) -> int:
+        """Number of batches."""
+        return -(-self.points // self.batch)
 
     @property
     def slabs(self) -> int:
@@ -259,16 +263,16 @@ class PointReader:
     mirrored: bool = False
     floor: float = 0.0
 
-    def chunks(self, start: int, stop: int, size: int) -> list[PointData]:
-        """The points `start:stop` in chunks of `size`, the last one filled up with its last point, of weight 0."""
+    def batches(self, start: int, stop: int, size: int) -> list[PointData]:
+        """The points `start:stop` in batches of `size`, the last one filled up with its last point, of weight 0."""
         block = self.calset.intensities.block(start, min(stop, len(self.calset.points)))
-        chunks, last = [], len(block.x) - 1
+        batches, last = [], len(block.x) - 1
         for first in range(0, len(block.x), size):
             rows = np.arange(first, first + size)
             part = {f.name: getattr(block, f.name)[np.minimum(rows, last)] for f in dataclasses.fields(block)}
             part["used"] &= (rows <= last)[:, None]
-            chunks.append(self.point_data(Block(**part)))
-        return chunks
+            batches.append(self.point_data(Block(**part)))
+        return batches
 
     def point_data(self, block: Block) -> PointData:
         """A block of measurements as the engine wants it."""
@@ -309,7 +313,7 @@ class PointReader:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MeasuredPoints:
-    """The measurements of a set, chunk by chunk as `layout` cuts it; the last chunk is filled up with weight 0.
+    """The measurements of a set, batch by batch as `layout` cuts it; the last batch is filled up with weight 0.
 
     They are read once if the layout keeps them in memory, else anew whenever they are gone through.
     """
@@ -318,22 +322,22 @@ class MeasuredPoints:
     layout: Layout
 
     def slab(self, number: int) -> list[PointData]:
-        """The chunks of one slab, counted from 0."""
+        """The batches of one slab, counted from 0."""
         if not self.layout.kept:
             return self._read(number)
-        each = self.layout.slab // self.layout.chunk
+        each = self.layout.slab // self.layout.batch
         return self._all[number * each : (number + 1) * each]
 
     def _read(self, number: int) -> list[PointData]:
         size = self.layout.slab
-        return self.reader.chunks(number * size, (number + 1) * size, self.layout.chunk)
+        return self.reader.batches(number * size, (number + 1) * size, self.layout.batch)
 
     @cached_property
     def _all(self) -> list[PointData]:
-        return [chunk for number in range(self.layout.slabs) for chunk in self._read(number)]
+        return [batch for number in range(self.layout.slabs) for batch in self._read(number)]
 
     def __len__(self) -> int:
-        return self.layout.chunks
+        return self.layout.batches
 
     def __iter__(self) -> Iterator[PointData]:
         for number in range(self.layout.slabs):
@@ -341,7 +345,7 @@ class MeasuredPoints:
 
     def gathered(self, field: str) -> np.ndarray:
         """A field of the point data of all points in one array, without the padding: for sets that memory can hold."""
-        parts = [np.asarray(getattr(chunk, field)) for chunk in self]
+        parts = [np.asarray(getattr(batch, field)) for batch in self]
         return np.concatenate(parts)[: self.layout.points]
 
 

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.likelihood import engine, limits
+from walop_jax.likelihood import engine
 from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
 from walop_jax.likelihood.layout import Layout, MeasuredPoints, PointReader, curves_of, planned_instrument
 from walop_jax.likelihood.optics import directions
@@ -62,6 +61,9 @@ class DataTerms(NamedTuple):
             self.matrix + other.matrix,
             self.census.joined(other.census),
         )
+
+
+Joined = TypeVar("Joined", Census, DataTerms)
 
 
 class OpticsUsed(NamedTuple):
@@ -153,7 +155,7 @@ def prior_rows(model: Model) -> PriorRows:
 class Likelihood:
     """The joint likelihood of one calibration set under one model.
 
-    Field points are handled in chunks of equal size, so that a set larger than memory goes through the same code
+    Field points are handled in batches of equal size, so that a set larger than memory goes through the same code
     (`likelihood/layout.py`), several of them at a time (`likelihood/runner.py`). Where `layout` says so, `expand`
     and `residuals` solve the optics on Chebyshev nodes only (`likelihood/field_table.py`). Immutable: what a pass
     finds out beside its sums comes back with them (`Posterior`).
@@ -167,7 +169,6 @@ class Likelihood:
     points: MeasuredPoints
     runner: Runner
     model: Model
-    once: bool = False
 
     @classmethod
     def of(
@@ -178,15 +179,14 @@ class Likelihood:
         *,
         memory: float | None = None,
         runner: Runner | None = None,
-        points_per_chunk: int | None = None,
+        batch: int | None = None,
         interpolate: bool | None = None,
-        once: bool = True,
+        sets: int = 1,
     ) -> Likelihood:
         """Bring a set and a model together; `probes` are effects beyond the model whose columns will be asked for.
 
-        `memory` (bytes) is what the data of the points may take, None for the usual 2 GB. `points_per_chunk` and
-        `interpolate` are decided by the size of the set where they are None. Derivatives of a small set are compiled
-        without optimisation, unless many such sets come (`once` False).
+        `memory` (bytes) is what the data of the points may take, None for the usual 2 GB. `batch` and
+        `interpolate` are decided by the size of the set where they are None. `sets` is how many such sets come.
         """
         runner = runner or Runner()
         layout = Layout.of(
@@ -195,12 +195,12 @@ class Likelihood:
             probes,
             memory=memory,
             threads=runner.threads,
-            points_per_chunk=points_per_chunk,
+            batch=batch,
             interpolate=interpolate,
+            sets=sets,
         )
         reader = PointReader(calset, layout.plan, layout.mirrored, model.template.cameras.floor)
-        once &= layout.points * len(calset.exposures) <= limits.DERIVATIVES_ONCE
-        return cls(layout, MeasuredPoints(reader, layout), runner, model, once)
+        return cls(layout, MeasuredPoints(reader, layout), runner, model)
 
     def following(self, values: Vector) -> Likelihood:
         """The same with wavelength nodes that follow the retarders at a full vector of values; itself if they do."""
@@ -213,7 +213,7 @@ class Likelihood:
             memory=self.layout.allowed,
             runner=self.runner,
             interpolate=self.layout.interpolated,
-            once=self.once,
+            sets=self.layout.sets,
         )
 
     @property
@@ -277,18 +277,14 @@ class Likelihood:
 
     def data_terms(self, values: Vector, near: Posterior | None = None) -> tuple[DataTerms, OpticsUsed]:
         """Terms of the data at a full vector of parameter values; `near` as for `expand`."""
-        instrument, n = self.model.instrument(values), len(values)
+        instrument = self.model.instrument(values)
         nodes, optics = self.nodes(instrument, near)
-        (data, gradient, matrix), census = self._total(
-            "χ², gradient and matrix",
-            lambda chunk: (
-                engine.dense_equations(instrument, self.plan, chunk, once=self.once)
-                if nodes is None and self.pairs <= limits.FITTED_FROM_ROWS
-                else engine.normal_equations(instrument, self.plan, chunk, nodes)
-            ),
-            ((), (n,), (n, n)),
-        )
-        return DataTerms(float(data), gradient, matrix, census), optics
+
+        def of_batch(data: engine.PointData) -> DataTerms:
+            chi2, gradient, matrix = engine.normal_equations(instrument, self.plan, data, nodes)
+            return DataTerms(float(chi2), gradient, matrix, self._counted(data))
+
+        return self._joined("χ², gradient and matrix", of_batch), optics
 
     def posterior(
         self, values: Vector, terms: DataTerms, noise_scale: float, optics: OpticsUsed
@@ -320,35 +316,26 @@ class Likelihood:
 
     # ----------------------------------------------------------------------------------- a pass over the points
 
-    def _total(
-        self,
-        label: str,
-        function: Callable[[engine.PointData], Sequence[Array]],
-        shapes: Sequence[tuple[int, ...]],
-    ) -> tuple[list[np.ndarray], Census]:
-        """Sums over all points of the arrays that `function` gives for a chunk, the points counted on the way."""
+    def _joined(self, label: str, function: Callable[[engine.PointData], Joined]) -> Joined:
+        """Results of a function for each batch of points, joined."""
 
-        def work(number: int) -> tuple[Vector, Float[np.ndarray, " 4"]]:
-            chunks = self.points.slab(number)
-            sums = np.zeros(sum(math.prod(shape) for shape in shapes))
-            for chunk in chunks:
-                sums += np.concatenate([sums[:0], *(np.ravel(array) for array in function(chunk))])
-            used = np.concatenate([np.asarray(chunk.weight)[..., 0] > 0 for chunk in chunks])
-            x, y = (np.concatenate([np.asarray(getattr(chunk, name)) for chunk in chunks]) for name in "xy")
-            extent = np.stack([-x, x, -y, y])[:, used.any(axis=1)].max(axis=1, initial=-np.inf)
-            return np.concatenate([sums, used.sum(axis=0)]), extent
+        def work(number: int) -> Joined:
+            return functools.reduce(lambda a, b: a.joined(b), map(function, self.points.slab(number)))
 
         slabs = self.runner.each(label, work, self.layout.points, self.layout.slab)
-        total, extent = functools.reduce(lambda a, b: (a[0] + b[0], np.maximum(a[1], b[1])), slabs)
-        *arrays, rows = np.split(total, np.cumsum([math.prod(shape) for shape in shapes]))
-        low_x, high_x, low_y, high_y = (extent * np.array([-1.0, 1.0, -1.0, 1.0])).tolist()
-        census = Census(rows.astype(int), (low_x, high_x, low_y, high_y), self.cameras)
-        return [array.reshape(shape) for array, shape in zip(arrays, shapes, strict=True)], census
+        return functools.reduce(lambda a, b: a.joined(b), slabs)
+
+    def _counted(self, data: engine.PointData) -> Census:
+        used = np.asarray(data.weight)[..., 0] > 0
+        x, y = (np.asarray(at)[used.any(axis=1)] for at in (data.x, data.y))
+        low, high = np.inf, -np.inf
+        field = (x.min(initial=low), x.max(initial=high), y.min(initial=low), y.max(initial=high))
+        return Census(used.sum(axis=0), tuple(map(float, field)), self.cameras)  # pyright: ignore[reportArgumentType]
 
     @cached_property
     def census(self) -> Census:
         """Count of what is used of the set: a pass of its own; an expansion brings its own census with it."""
-        return self._total("counting", lambda _: (), ())[1]
+        return self._joined("counting", self._counted)
 
     @property
     def dof(self) -> int:
@@ -358,7 +345,7 @@ class Likelihood:
     @cached_property
     def used(self) -> Bool[np.ndarray, "p e"]:
         """True where the intensities of a (point, exposure) are used."""
-        return np.concatenate([np.asarray(chunk.weight)[..., 0] > 0 for chunk in self.points])[
+        return np.concatenate([np.asarray(batch.weight)[..., 0] > 0 for batch in self.points])[
             : self.layout.points
         ]
 
@@ -373,9 +360,7 @@ class Likelihood:
         """
         instrument = self.model.instrument(values)
         nodes, _ = self.nodes(instrument)
-        parts = [
-            engine.residuals(instrument, self.plan, chunk, nodes, once=self.few) for chunk in self.points
-        ]
+        parts = [engine.residuals(instrument, self.plan, batch, nodes) for batch in self.points]
         flux, residual = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
         return flux[: self.layout.points].mean(axis=-1), residual[: self.layout.points]
 
@@ -386,30 +371,20 @@ class Likelihood:
         """
         instrument, select = self.model.instrument(values), self.model.selection()
         parts = [
-            used_rows(engine.linearised_residuals(instrument, self.plan, c, once=self.once)[1], c) @ select
+            used_rows(engine.linearised_residuals(instrument, self.plan, c)[1], c) @ select
             for c in self.points
         ]
         return np.concatenate(parts)
 
-    @property
-    def pairs(self) -> int:
-        """Number of (exposure, point) pairs, used or not."""
-        return self.layout.points * len(self.flux_known)
-
-    @property
-    def few(self) -> bool:
-        """True if there are so few pairs that programs of counts and columns are not worth optimising (`compiled`)."""
-        return self.pairs <= limits.COMPILED_ONCE
-
     def stokes(self, values: Vector) -> Float[np.ndarray, "p e 4"]:
         """Stokes vectors that enter the instrument, per unit flux."""
         instrument = self.model.instrument(values)
-        parts = [np.asarray(engine.incoming(instrument, self.plan, chunk)) for chunk in self.points]
+        parts = [np.asarray(engine.incoming(instrument, self.plan, batch)) for batch in self.points]
         return np.concatenate(parts)[: self.layout.points]
 
 
-def used_rows(columns: Array | np.ndarray, chunk: engine.PointData) -> Float[np.ndarray, "d n"]:
-    """The rows of a chunk that are used."""
-    used = np.asarray(chunk.weight)[..., 0] > 0
-    cube = np.asarray(columns).reshape(*used.shape, chunk.weight.shape[-1], -1)
+def used_rows(columns: Array | np.ndarray, batch: engine.PointData) -> Float[np.ndarray, "d n"]:
+    """The rows of a batch that are used."""
+    used = np.asarray(batch.weight)[..., 0] > 0
+    cube = np.asarray(columns).reshape(*used.shape, batch.weight.shape[-1], -1)
     return cube[used].reshape(-1, cube.shape[-1])

@@ -19,16 +19,17 @@ one by one took 9.6 s a call instead of 0.08 s), so they are switched off there 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import hashlib
 import importlib.metadata
-import io
+import json
+import operator
 import os
-import pickle
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -70,7 +71,7 @@ def program(
         if kept is None:
             kept = _traced(function, tree, leaves)
             _write(here / key, kept)
-        exported, structure = export.deserialize(kept[0]), kept[1]
+        structure, exported = kept[0], export.deserialize(bytearray(kept[1]))
     except Exception:  # whatever stands in the way: the call itself shows it, if it matters
         return None
     run, shape = jax.jit(exported.call, compiler_options=options), jax.tree.structure(structure)
@@ -88,9 +89,9 @@ def answer(name: str, tree: Any, kinds: Sequence[Any], find: Callable[[], Any]) 
     except Exception:  # as above
         return find()
     if kept is None:
-        kept = find()
+        kept = find(), b""
         _write(path, kept)
-    return kept
+    return kept[0]
 
 
 def kind(leaf: Any) -> tuple[Any, ...]:
@@ -99,8 +100,8 @@ def kind(leaf: Any) -> tuple[Any, ...]:
     return seen.shape, seen.dtype, bool(seen.weak_type)
 
 
-def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> tuple[bytearray, Any]:
-    """The program as bytes, and the structure of its results."""
+def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> tuple[Any, bytes]:
+    """The structure of the results of a program, and the program as bytes."""
     shapes: list[Any] = []
 
     def flat(*leaves: Any) -> list[Any]:
@@ -109,31 +110,75 @@ def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> t
         return found
 
     exported = export.export(jax.jit(flat))(*leaves)
-    return exported.serialize(), shapes[-1].unflatten(range(shapes[-1].num_leaves))
+    return shapes[-1].unflatten(range(shapes[-1].num_leaves)), bytes(exported.serialize())
 
 
 def _key(name: str, structure: Any, kinds: Sequence[Any]) -> str:
-    text = io.BytesIO()
-    _Exact(text).dump(structure)
     flags = os.environ.get("XLA_FLAGS", "")
     double = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-    said = repr((name, kinds, jax.default_backend(), double, flags))
-    return hashlib.sha256(_source() + said.encode() + text.getvalue()).hexdigest()
+    said = repr((name, kinds, jax.default_backend(), double, flags)) + json.dumps(_plain(structure))
+    return hashlib.sha256(_source() + said.encode()).hexdigest()
 
 
-class _Exact(pickle.Pickler):
-    """Equal bytes for equal structures, of classes and functions of this package and its libraries alone."""
+def _plain(value: Any) -> Any:
+    """A structure as JSON has it, equal for equal ones: collections and objects are lists that begin with their kind.
 
-    def __init__(self, file: io.BytesIO) -> None:
-        super().__init__(file, protocol=5)
-        self.fast = True  # without references to what came before: these go by identity
+    Raises `_NotKept` for classes and functions that are not of this package and its libraries, and for other objects.
+    """
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        array = np.asarray(value)
+        return ["array", str(array.dtype), array.shape, array.tobytes().hex()]
+    if isinstance(value, Mapping):
+        return ["dict", *([_plain(key), _plain(entry)] for key, entry in value.items())]
+    if isinstance(value, frozenset | set):
+        return ["frozenset", *sorted(map(_plain, value), key=json.dumps)]
+    if type(value) in (tuple, list):
+        return [type(value).__name__, *map(_plain, value)]
+    if isinstance(value, type) or (callable(value) and hasattr(value, "__qualname__")):
+        return ["name", _name(value)]
+    if isinstance(value, tuple):
+        return ["named", _name(type(value)), *map(_plain, value)]
+    if not dataclasses.is_dataclass(value):
+        raise _NotKept(type(value))
+    fields = {f.name: _plain(vars(value)[f.name]) for f in dataclasses.fields(value) if f.name in vars(value)}
+    return ["object", _name(type(value)), fields]
 
-    def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, type) or callable(obj):
-            module = (getattr(obj, "__module__", None) or "").partition(".")[0]
-            if module not in _KNOWN:
-                raise _NotKept(module)
-        return NotImplemented
+
+def _name(value: Any) -> str:
+    """Module and name of a class or function. Raises `_NotKept` unless it is found there."""
+    module, name = value.__module__ or "", value.__qualname__
+    if module.partition(".")[0] not in _KNOWN or _found(f"{module}:{name}") is not value:
+        raise _NotKept(name)
+    return f"{module}:{name}"
+
+
+def _found(name: str) -> Any:
+    module, _, path = name.partition(":")
+    try:
+        return operator.attrgetter(path)(sys.modules[module])
+    except (AttributeError, KeyError):
+        return None
+
+
+def _made(plain: Any) -> Any:
+    """The structure that `_plain` was given; a set as a frozen one, a mapping as a dict."""
+    if not isinstance(plain, list):
+        return plain
+    kind, *rest = plain
+    if kind == "array":
+        return np.frombuffer(bytes.fromhex(rest[2]), rest[0]).reshape(rest[1])
+    if kind == "dict":
+        return {_made(key): _made(entry) for key, entry in rest}
+    if kind == "object":
+        made = object.__new__(_found(rest[0]))
+        for name, value in rest[1].items():
+            object.__setattr__(made, name, _made(value))
+        return made
+    if kind in ("name", "named"):
+        return _found(rest[0]) if kind == "name" else _found(rest[0])._make(map(_made, rest[1:]))
+    return {"tuple": tuple, "list": list, "frozenset": frozenset}[kind](map(_made, rest))
 
 
 @functools.cache
@@ -150,19 +195,20 @@ def _source() -> bytes:
     return digest.digest()
 
 
-def _read(path: Path) -> Any:
-    """Content kept under a name; None where there is nothing, or a damaged file."""
+def _read(path: Path) -> tuple[Any, bytes] | None:
+    """Structure and bytes kept under a name; None where there is nothing, or a damaged file."""
     with contextlib.suppress(OSError):
         content = path.read_bytes()
         if hashlib.sha256(content[_DIGEST:]).digest() == content[:_DIGEST]:
             os.utime(path)
-            return pickle.loads(content[_DIGEST:])
+            text, _, rest = content[_DIGEST:].partition(b"\n")
+            return _made(json.loads(text)), rest
     return None
 
 
-def _write(path: Path, found: Any) -> None:
+def _write(path: Path, kept: tuple[Any, bytes]) -> None:
     """Keep something, in one step, and no more than there is room for; quietly not where the disk does not take it."""
-    content = pickle.dumps(found, protocol=5)
+    content = json.dumps(_plain(kept[0])).encode() + b"\n" + kept[1]
     with contextlib.suppress(OSError):
         handle, name = tempfile.mkstemp(dir=path.parent)
         try:
@@ -195,13 +241,13 @@ def knows(option: str) -> bool:
 
 
 def compiled(
-    function: Callable[..., Result], *, fuse: bool = False, kept_as: str = ""
+    function: Callable[..., Result], *, optimised_above: float = -1, fuse: bool = False, kept_as: str = ""
 ) -> Callable[..., Result]:
     """`jax.jit` with this package's options; the back end is looked up at the first call, not at import.
 
-    A call with `once=True` compiles without optimisation: sooner ready, slower to run. `fuse` leaves the fusion
-    emitters on, for a function without derivatives of the plates. `kept_as` is the name under which the traced program
-    is kept between processes (`program`), for a function that depends on nothing but its arguments.
+    Code for a `Plan` whose `work` is not above `optimised_above` is not optimised: sooner ready, slower to run. `fuse`
+    leaves the fusion emitters on, for a function without derivatives of the plates. `kept_as` is the name under which
+    the traced program is kept between processes (`program`), for a function that depends on nothing but its arguments.
     """
 
     def options(once: bool) -> dict[str, Any] | None:
@@ -229,8 +275,9 @@ def compiled(
         return programs[at]
 
     @functools.wraps(function)
-    def call(*args: Any, once: bool = False) -> Result:
+    def call(*args: Any) -> Result:
         _refuse_float32(args)
+        once = optimised_above >= 0 and any(getattr(arg, "work", np.inf) <= optimised_above for arg in args)
         with float64():
             run = (kept(args, once) if kept_as else None) or jitted(once)
             return run(*args)

@@ -23,17 +23,18 @@ import dataclasses
 import fnmatch
 import itertools
 import math
+import typing
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from walop_jax.io.errors import nearest
+from walop_jax.io.toml import Reader
 
 YEAR = 365.25  # days
 BASES = ("shared", "night", "file", "walk", "interval")
 ADDED = ("step", "bad", "linear", "annual")
-KEYS = ("per", "spread", "rate", "at", "bad")
 _NEEDS = {"rate": "walk", "at": "interval or step", "bad": "bad", "spread": "night or file"}
 
 
@@ -141,10 +142,8 @@ class Law:
 
     def document(self) -> dict[str, Any]:
         """The entry of a model file, as plain data."""
-        found = {key: getattr(self, key) for key in KEYS[1:]}
-        return {"per": list(self.per)} | {
-            key: value for key, value in found.items() if value not in (None, ())
-        }
+        given = {key: value for key, value in vars(self).items() if value not in (None, ())}
+        return given | {"per": list(self.per)}
 
 
 SHARED = Law()
@@ -153,29 +152,18 @@ Laws = Mapping[str, Law]
 
 def laws_of(tables: Mapping[str, Any]) -> dict[str, Law]:
     """The laws of the [law] tables of a model file. Raises ValueError naming the table and key that is wrong."""
-    found = {}
+    found, read, hints = {}, Reader(""), typing.get_type_hints(Law)
     for name, entry in tables.items():
-        where = f'[law."{name}"]'
+        place = f'law."{name}"'
         if not isinstance(entry, Mapping):
-            raise ValueError(f"{where} must be a table; names with dots stand in quotes")
-        for key in entry:
-            if key not in KEYS:
-                raise ValueError(f"{where}: there is no key {key!r}; {nearest(key, KEYS)}")
+            raise read.fault(place, "must be a table; names with dots stand in quotes")
+        alone = {key: (entry[key],) for key in ("per", "at") if isinstance(entry.get(key), str | int | float)}
+        values = read.values(hints, {**entry, **alone}, place)
         try:
-            found[name] = _law(entry)
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"{where} {error}") from None
+            found[name] = Law(**values)
+        except ValueError as error:
+            raise read.fault(place, str(error)) from None
     return found
-
-
-def _law(entry: Mapping[str, Any]) -> Law:
-    per = entry.get("per", "shared")
-    words = (per,) if isinstance(per, str) else tuple(map(str, per))
-    at = entry.get("at", ())
-    dates = tuple(map(float, (at,) if isinstance(at, int | float) else at))
-    bad = tuple((float(start), float(stop)) for start, stop in entry.get("bad", ()))
-    numbers = {key: None if entry.get(key) is None else float(entry[key]) for key in ("spread", "rate")}
-    return Law(words, at=dates, bad=bad, **numbers)
 
 
 def resolved(

@@ -182,7 +182,7 @@ def candidates_of(
 
 
 def with_candidates(
-    likelihood: Likelihood, values: Vector, candidates: Candidates, *, once: bool = True
+    likelihood: Likelihood, values: Vector, candidates: Candidates
 ) -> tuple[float, Vector, Float[np.ndarray, "_ _"]]:
     """χ², gradient and matrix of the data of a table in free parameters and candidates (0: cannot be computed)."""
     model = likelihood.model
@@ -193,16 +193,14 @@ def with_candidates(
         [model.selection(), np.eye(len(model.names))[:, [model.index(list(candidates)[k]) for k in held]]]
     )
     residuals, slopes = [], []
-    for chunk in likelihood.points:
-        residual, slope = engine.linearised_residuals(
-            instrument, likelihood.plan, chunk, once=likelihood.once
-        )
-        residuals.append(used_rows(residual[..., None], chunk)[:, 0])
-        slopes.append(used_rows(slope, chunk) @ select)
+    for batch in likelihood.points:
+        residual, slope = engine.linearised_residuals(instrument, likelihood.plan, batch)
+        residuals.append(used_rows(residual[..., None], batch)[:, 0])
+        slopes.append(used_rows(slope, batch) @ select)
     r, jacobian = np.concatenate(residuals), np.concatenate(slopes)
     if changes:
         cut = len(model.free)
-        columns = Columns(likelihood, values, once=once)
+        columns = Columns(likelihood, values)
         there = [k for k, change in enumerate(changes) if change and columns.has(change)]
         added = np.zeros((len(r), len(changes)))
         added[:, there] = columns.of([changes[k] for k in there])
@@ -234,14 +232,14 @@ def night_equations(
     *,
     number: int | None = None,
     own: bool = False,
-    once: bool = True,
+    sets: int = 1,
 ) -> list[Night]:
     """The nights of a set, linearised at values of the parameters: a full vector, or by name (others: start values).
 
     `changes` are the candidates (None: `candidates_of` each night), `number` the only night that is asked for. Nights
-    whose `own` minimum is farther from the values than noise explains are linearised closer to it. Programs are
-    compiled for a few nights (`once`) or for many. Of sets too large for a table of derivatives no candidates are kept.
-    Raises `DataError` as `split` does.
+    whose `own` minimum is farther from the values than noise explains are linearised closer to it. `sets` is
+    how many such sets come. Of sets too large for a table of derivatives no candidates are kept. Raises `DataError` as
+    `split` does.
     """
     if isinstance(values, Mapping):
         values = np.array([values.get(p.name, p.start) for p in model.parameters])
@@ -250,7 +248,7 @@ def night_equations(
     for evening, some in split(calset):
         if number not in (None, evening):
             continue
-        likelihood, there = Likelihood.of(some, model, once=once), values
+        likelihood, there = Likelihood.of(some, model, sets=sets), values
         if own:
             there = nearer(likelihood, values, np.sqrt(OWN * len(model.free)))
         if likelihood.layout.large:
@@ -260,7 +258,7 @@ def night_equations(
             known, census = {}, terms.census
         else:
             known = candidates_of(model, some.exposures, model.catalogue) if changes is None else changes
-            chi2, gradient, matrix = with_candidates(likelihood, there, known, once=once)
+            chi2, gradient, matrix = with_candidates(likelihood, there, known)
             census = likelihood.census
         e = some.exposures
         found.append(

@@ -40,7 +40,7 @@ from walop_jax.nights.equations import (
     with_candidates_of,
 )
 from walop_jax.nights.night_file import read_nights, write_nights
-from walop_jax.posterior.files import Run
+from walop_jax.posterior.run import Run
 
 SKETCH = 512  # measurements by which sets are compared
 COPIED = 0.02  # their share that no two sets have in common by chance
@@ -86,8 +86,8 @@ class Maker:
 
     like: Calibration | None
     folder: Path | None
-    few: bool = True
-    """True: programs are compiled for a few nights."""
+    count: int = 1
+    """Number of sets: programs for many are optimised."""
     _candidates: dict[tuple[str, ...], Candidates] = dataclasses.field(default_factory=dict)
     _sets: dict[str, tuple[CalibrationSet, Model]] = dataclasses.field(default_factory=dict)
 
@@ -113,7 +113,7 @@ class Maker:
         table = calset.intensities
         measured = sketch(calset, table) if isinstance(table, TableIntensities) else frozenset[int]()
         try:
-            nights = night_equations(calset, model, values, candidates, own=True, once=self.few)
+            nights = night_equations(calset, model, values, candidates, own=True, sets=self.count)
         except DataError as error:
             return Made([], source_of(calset), measured, error)
         if place is not None:
@@ -129,7 +129,7 @@ class Maker:
         if not task.candidates:  # a gauge stays where its column was made
             cut = len(night.names) - night.candidates
             values |= dict(zip(night.names[cut:], night.reference[cut:].tolist(), strict=True))
-        (made,) = night_equations(calset, model, values, candidates, number=night.number, once=self.few)
+        (made,) = night_equations(calset, model, values, candidates, number=night.number, sets=self.count)
         return Made([with_candidates_of(made, night)])
 
     def _set_and_model(self, data: Data) -> tuple[CalibrationSet, Model]:
@@ -173,7 +173,7 @@ class Makers:
     def _made(self, tasks: Sequence[Task]) -> Iterable[Made]:
         if self._executor is None:
             return map(self._maker.make, tasks)
-        recipe = pickle.dumps((self.like, self._maker.folder, self._maker.few))
+        recipe = pickle.dumps((self.like, self._maker.folder, self._maker.count))
         given = [(files_of_users(), recipe, pickle.dumps(task)) for task in tasks]
         return self._executor.map(make, *zip(*given, strict=True)) if given else ()
 

@@ -28,7 +28,8 @@ from walop_jax.fit.verdict import STATED, Doubt, Quality
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.fits_reading import primary_keywords
 from walop_jax.io.names import NIGHTS, PRODUCT, REFERENCE, SURVEY, TRACKS
-from walop_jax.io.text import check_input, parse_toml, read_json, read_text
+from walop_jax.io.run_folder import RunFolder
+from walop_jax.io.text import check_input, parse_toml, read_text
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.laws import Law, laws_of, resolved
 from walop_jax.model.specification import effect_context
@@ -45,7 +46,7 @@ from walop_jax.nights.equations import (
 from walop_jax.nights.making import Data, Maker, Makers, Task
 from walop_jax.nights.night_file import nights_in, read_nights, write_nights
 from walop_jax.nights.survey import Survey
-from walop_jax.posterior.files import Run
+from walop_jax.posterior.run import Run
 
 Given = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
 """Sources of nights: a fit, a set, a night, or a path: of a set, of a RUN, of a SURVEY or of its nights."""
@@ -54,7 +55,6 @@ LONG = 60.0  # days without a night that are worth a remark
 FAR = 0.02  # standard errors from the solution up to which a night need not be linearised again
 EXACT = 1e-3  # standard errors by which linearising all nights again may move the solution at most
 ROUNDS = 6
-MANY = 20  # sets from which on programs are better compiled for longer
 FILES = (NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY)
 """The files of a survey."""
 PARTIAL = "partial"
@@ -99,7 +99,7 @@ def stack(
     opened = [_opened(one, catalogue) for one in nights]
     fits = [one for one in (like, *(some.fit for some in opened)) if one is not None]
     held = [Calibration.from_fit(one) if isinstance(one, FitResult) else one for one in fits[:1]]
-    maker = Maker(held[0] if held else None, partial, len(opened) < MANY)
+    maker = Maker(held[0] if held else None, partial, len(opened))
     makers = Makers(maker, executor)
     made: list[Night] = []
     at_hand: dict[tuple[str, int], Data] = {}
@@ -216,10 +216,11 @@ def _opened(one: Given, catalogue: Sequence[type[Effect]]) -> _Opened:
         return _Opened([], Data(one.calset, data_hash(one.calset), one.model), one)
     if isinstance(one, CalibrationSet):
         return _Opened([], Data(one, data_hash(one)))
-    path = one.folder if isinstance(one, Run) else Path(one)
+    path = one.folder if isinstance(one, RunFolder) else Path(one)
     if path.is_dir() and (not (path / PRODUCT).exists() or (path / NIGHTS).exists()):
         fit = read_calibration(path / REFERENCE, catalogue) if (path / REFERENCE).exists() else None
-        said = read_json(path / SURVEY) if (path / SURVEY).exists() else {"breaks": [], "events": []}
+        folder = RunFolder(path)
+        said = folder.document(SURVEY) if SURVEY in folder else {"breaks": [], "events": []}
         return _Opened(
             nights_in(path),
             fit=fit,

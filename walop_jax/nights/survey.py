@@ -201,7 +201,7 @@ class Survey(Displayed):
             raise fail(what, advice="give one: --like RUN (like= in Python)")
         laws = {name: law.document() for name, law in self.changing.items()}
         like = dataclasses.replace(self.like, hidden=None, residuals=None, draws=None)
-        return dataclasses.replace(like, fitted=dataclasses.replace(like.model, laws=laws))
+        return dataclasses.replace(like, model=dataclasses.replace(like.model, laws=laws))
 
     def values_at(self, mjd: float) -> tuple[Vector, Matrix]:
         """All parameters and candidates (`data.names`) at a moment (MJD, UTC), and their covariance."""
@@ -282,7 +282,7 @@ class Survey(Displayed):
                 model = with_effects(model, [chosen], context)
         values, old = model.start, [model.index(name) for name in like.model.names]
         values[old] = like.values
-        return dataclasses.replace(like, fitted=model, values=values, covariance=np.zeros((len(values),) * 2))
+        return dataclasses.replace(like, model=model, values=values, covariance=np.zeros((len(values),) * 2))
 
     # --------------------------------------------------------------------------------------------------- tables
 

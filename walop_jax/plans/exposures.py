@@ -246,7 +246,7 @@ def _responses(
 ) -> tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]]:
     """Counts for light of unit flux, and their derivatives to the free parameters."""
     instrument, select = likelihood.model.instrument(values), likelihood.model.selection()
-    parts = [_unit_at(instrument, likelihood.plan, chunk) for chunk in likelihood.points]
+    parts = [_unit_at(instrument, likelihood.plan, batch) for batch in likelihood.points]
     unit, slopes = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
     count = likelihood.layout.points
     return unit[:count], slopes[:count] @ select

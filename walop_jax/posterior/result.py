@@ -17,9 +17,8 @@ import functools
 import itertools
 import json
 import math
-import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -31,9 +30,13 @@ from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import value_and_error
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.posterior.draws import INFLATION, as_arviz, group_of_draws
 from walop_jax.posterior.samplers import Sampler, make_sampler
 from walop_jax.posterior.surrogate import Accuracy
-from walop_jax.posterior.target import INFLATION, LARGEST_SAMPLED
+from walop_jax.posterior.target import LARGEST_SAMPLED
+
+if TYPE_CHECKING:
+    from xarray import Dataset, DataTree
 
 Chains = Float[np.ndarray, "e t w k"]  # ensembles, stored steps, walkers, quantities
 
@@ -102,29 +105,27 @@ def r_hat(chains: Chains) -> Float[np.ndarray, " k"]:
     """R-hat between the halves of all ensembles, per quantity; NaN for a quantity that never moved."""
     e, k = chains.shape[0], chains.shape[-1]
     parts = chains[:, :: max(1, chains[..., 0].size // RANKED)]
-    az = arviz()
+    rhat: Any = _statistics().rhat
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.array([float(az.rhat(parts[..., i].reshape(e, -1))) for i in range(k)])
+        return np.array([float(rhat(parts[..., i].reshape(e, -1))) for i in range(k)])
 
 
 def effective_samples(chains: Chains) -> Float[np.ndarray, " k"]:
     """Number of independent draws that would give means as good, per quantity."""
     e, n, w, k = chains.shape
     walkers = np.moveaxis(chains, 2, 1).reshape(e * w, n, k)
-    az = arviz()
-    return np.array([float(az.ess(walkers[..., i], method="mean")) for i in range(k)])
+    ess: Any = _statistics().ess
+    return np.array([float(ess(walkers[..., i], method="mean")) for i in range(k)])
 
 
-def arviz() -> Any:
-    """ArviZ, without the announcement that it makes when it is imported."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import arviz
+def _statistics() -> Any:
+    """ArviZ's statistics of arrays, (chain, draw); imported when a posterior is judged."""
+    from arviz_stats.base.array import array_stats
 
-    return arviz
+    return array_stats
 
 
-def _of_rows(likelihood: Likelihood) -> dict[str, Any]:
+def _of_rows(likelihood: Likelihood) -> dict[str, Dataset]:
     """ArviZ's groups of the data: the used rows (point, exposure), with the ids of both as coordinates."""
     from xarray import Dataset
 
@@ -152,21 +153,22 @@ def _of_rows(likelihood: Likelihood) -> dict[str, Any]:
 
 
 def arviz_of_fit(result: FitResult, draws: int, seed: int) -> Any:
-    """InferenceData of independent draws from the normal distribution of a fit; see `FitResult.to_arviz`."""
+    """Independent draws, for ArviZ, from the normal distribution of a fit; see `FitResult.to_arviz`."""
     size, parameters = result.sigma, result.model.parameters
     varies = np.flatnonzero(size > 0)
     correlation = result.covariance[np.ix_(varies, varies)] / np.outer(size[varies], size[varies])
     normal = functools.partial(np.random.default_rng(seed).multivariate_normal, method="eigh")
     made = result.values[varies] + size[varies] * normal(np.zeros(len(varies)), correlation, (4, draws))
     names = [parameters[i].name for i in varies]
-    data = arviz().from_dict(posterior={name: made[..., k] for k, name in enumerate(names)})
+    posterior = group_of_draws({name: made[..., k] for k, name in enumerate(names)})
     for i, name in zip(varies, names, strict=True):
-        data.posterior[name].attrs["units"] = parameters[i].unit or "1"
+        posterior[name].attrs["units"] = parameters[i].unit or "1"
     trusted = result.verdict is not None and result.trusted
-    data.posterior.attrs.update(sampler="none: covariance of the fit", trusted=int(trusted))
-    if not result.likelihood.layout.large:
-        data.add_groups(_of_rows(result.likelihood))
-    return data
+    posterior.attrs.update(sampler="none: covariance of the fit", trusted=int(trusted))
+    from xarray import DataTree
+
+    rows = {} if result.likelihood.layout.large else _of_rows(result.likelihood)
+    return as_arviz(DataTree.from_dict({"posterior": posterior, **rows}))
 
 
 def interval_in_words(row: Any) -> dict[str, str]:
@@ -447,29 +449,36 @@ class PosteriorSample(Drawn):
         return -0.5 * (chi2 / f**2 + m * np.log(2 * np.pi * f**2)) + ln_weight
 
     def to_arviz(self, log_likelihood: bool = False) -> Any:
-        """ArviZ InferenceData: one variable per coefficient that varies, under its name, with its unit.
+        """For ArviZ, `InferenceData`, or `DataTree` from ArviZ 1 on: a variable per coefficient that varies, with unit.
 
         A chain is an ensemble. Beside `posterior` and `sample_stats` (`lp`) it has `observed_data`, N of every used row
         (point, exposure), and `constant_data`, its N_ERR, X and Y; with `log_likelihood`, that group as well, which
         takes some milliseconds for each draw.
         """
+        return as_arviz(self.groups(log_likelihood))
+
+    def groups(self, log_likelihood: bool = False) -> DataTree:
+        """The groups of `to_arviz`, as `posterior.nc` holds them."""
+        from xarray import DataTree
+
         varies = self.varying
-        posterior = {self.names[i]: self.draws[:, :, i] for i in varies}
+        draws = {self.names[i]: self.draws[:, :, i] for i in varies}
         if self.ln_f is not None:
-            posterior[INFLATION] = self.ln_f
-        data = arviz().from_dict(posterior=posterior, sample_stats={"lp": self.log_posterior})
+            draws[INFLATION] = self.ln_f
+        posterior = group_of_draws(draws)
         for i in varies:
-            data.posterior[self.names[i]].attrs["units"] = self.units[i] or "1"
+            posterior[self.names[i]].attrs["units"] = self.units[i] or "1"
         v = self.convergence
         for k, name in enumerate(v.names):
-            if name not in data.posterior:  # it never moved
+            if name not in posterior:  # it never moved
                 continue
             evidence = {"autocorrelation_steps": v.tau[k], "effective_samples": v.ess[k], "r_hat": v.rhat[k]}
-            data.posterior[name].attrs.update({key: float(value) for key, value in evidence.items()})
-            data.posterior[name].attrs["sampled_by"] = self.sampler
-        data.posterior.attrs.update(
+            posterior[name].attrs.update({key: float(value) for key, value in evidence.items()})
+            posterior[name].attrs["sampled_by"] = self.sampler
+        posterior.attrs.update(
             {
                 "sampler": self.sampler,
+                "interval": "equal-tailed",
                 "converged": int(v.converged),
                 "trusted": int(self.trusted),
                 "verdict": v.message() if self.of_trusted_fit else "the fit is not trusted",
@@ -484,20 +493,19 @@ class PosteriorSample(Drawn):
         )
         if self.accuracy is not None:
             numbers = {"efficiency": self.accuracy.efficiency, "spread": self.accuracy.spread}
-            data.posterior.attrs.update({f"surrogate_{key}": value for key, value in numbers.items()})
+            posterior.attrs.update({f"surrogate_{key}": value for key, value in numbers.items()})
+        groups = {"posterior": posterior, "sample_stats": group_of_draws({"lp": self.log_posterior})}
         if self.likelihood is not None:
-            data.add_groups(_of_rows(self.likelihood))
+            groups |= _of_rows(self.likelihood)
         if log_likelihood:
             by_row = {"N": (("chain", "draw", "row"), self.log_likelihood())}
-            rows = data.observed_data.coords.drop_vars("camera")
-            data.add_groups(
-                log_likelihood=rows.to_dataset().assign(by_row).assign_coords(data.posterior.coords)
-            )
+            rows = groups["observed_data"].coords.drop_vars("camera").to_dataset()
+            groups["log_likelihood"] = rows.assign(by_row).assign_coords(posterior.coords)
         versions = versions_of(("walop-jax",))
         made_by = {"inference_library": "walop-jax", "inference_library_version": versions["walop-jax"]}
-        for group in data.groups():
-            data[group].attrs.update(made_by, sampling_time=self.seconds)
-        return data
+        for group in groups.values():
+            group.attrs.update(made_by, sampling_time=self.seconds)
+        return DataTree.from_dict(groups)
 
     def display(self) -> Display:
         """The verdict on the chains and the sampled coefficients."""

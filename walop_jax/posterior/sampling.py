@@ -19,7 +19,8 @@ from walop_jax.fit.verdict import STATED
 from walop_jax.io.code import versions_of
 from walop_jax.io.errors import fail
 from walop_jax.model.specification import Model
-from walop_jax.posterior.files import Chain, digest, digest_of_fit
+from walop_jax.posterior.draws import digest, digest_of_fit
+from walop_jax.posterior.files import Chain
 from walop_jax.posterior.result import (
     BURN_IN,
     Chains,
@@ -151,7 +152,7 @@ def numbers_of(verdict: Convergence | None) -> tuple[float, float]:
 def fingerprint(target: Target, options: Options) -> dict[str, str]:
     """Hashes of everything that decides the chain."""
     model, laid_out = target.model, target.likelihood.plan
-    data = [np.asarray(part) for chunk in target.likelihood.points for part in chunk if part is not None]
+    data = [np.asarray(part) for batch in target.likelihood.points for part in batch if part is not None]
     plan = [np.asarray(part) for part in (laid_out.wavelength, laid_out.node_weight, laid_out.teff)]
     exposures = [np.asarray(part) for part in jax.tree.leaves(laid_out.exposures)]
     parameters = [(p.name, p.start, p.free, p.tie, p.scale) for p in model.parameters]

@@ -37,8 +37,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.model.compiled import compiled
+from walop_jax.posterior.draws import INFLATION
 from walop_jax.posterior.samplers import Density
-from walop_jax.posterior.target import INFLATION, LN_F_WIDTH, Target, choose_sampled
+from walop_jax.posterior.target import LN_F_WIDTH, Target, choose_sampled
 
 Matrix = Float[np.ndarray, "..."]
 Draws = Float[np.ndarray, "n k"]
@@ -230,15 +231,15 @@ def _design(rng: np.random.Generator, odd: int, even: int, width: int) -> Draws:
 
 def _gram(target: Target, x: Float[np.ndarray, "m f"], progress: Callable[[int, int], None] | None) -> Matrix:
     """Gram matrix of (r₀, r(x_1) − r₀, r(x_2) − r₀, …) over all data."""
-    gram, chunks = np.zeros((len(x) + 1, len(x) + 1)), target.likelihood.points
-    for number, chunk in enumerate(chunks):
-        first = target.residuals(target.centre, chunk)
+    gram, batches = np.zeros((len(x) + 1, len(x) + 1)), target.likelihood.points
+    for number, batch in enumerate(batches):
+        first = target.residuals(target.centre, batch)
         rows = np.empty((len(x) + 1, first.size))
         rows[0] = first
         for m, here in enumerate(x, start=1):
-            rows[m] = target.residuals(here, chunk) - first
+            rows[m] = target.residuals(here, batch) - first
             if progress is not None:
-                progress(number * len(x) + m, len(chunks) * len(x))
+                progress(number * len(x) + m, len(batches) * len(x))
         gram += rows @ rows.T
     return gram
 

@@ -23,12 +23,12 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import check_names, with_values
+from walop_jax.posterior.draws import INFLATION
 from walop_jax.posterior.samplers import Density
 
 Vector = Float[np.ndarray, " f"]
 LARGEST_SAMPLED = 20
 LN_F_WIDTH = 1.0  # prior of ln f, the noise inflation
-INFLATION = "noise.ln_f"
 NEAR_LINEAR = ("throughput", "standard")
 
 
@@ -81,10 +81,10 @@ class Target:
         """All parameters, frozen and tied ones included."""
         return self.model.full(x, self._fitted)
 
-    def residuals(self, x: Vector, chunk: engine.PointData) -> Float[np.ndarray, " d"]:
-        """Normalised residuals of one chunk of the data, errors times `noise_scale`."""
+    def residuals(self, x: Vector, batch: engine.PointData) -> Float[np.ndarray, " d"]:
+        """Normalised residuals of one batch of the data, errors times `noise_scale`."""
         instrument = _instrument(self.model.template, jnp.asarray(self.values(x)))
-        _, r = engine.residuals(instrument, self.likelihood.plan, chunk)
+        _, r = engine.residuals(instrument, self.likelihood.plan, batch)
         return np.asarray(r).ravel() / self.noise_scale
 
     def prior_rows(self, x: Vector) -> Float[np.ndarray, " k"]:
@@ -100,10 +100,10 @@ class Target:
     def bending(self, steps: Float[np.ndarray, "f m"]) -> Float[np.ndarray, " m"]:
         """Departure of the residuals from linear at each column of `steps`: squared norm of their second order."""
         total = np.zeros(steps.shape[1])
-        for chunk in self.likelihood.points:
-            here = self.residuals(self.centre, chunk)
+        for batch in self.likelihood.points:
+            here = self.residuals(self.centre, batch)
             for m, step in enumerate(steps.T):
-                up, down = (self.residuals(self.centre + sign * step, chunk) for sign in (1, -1))
+                up, down = (self.residuals(self.centre + sign * step, batch) for sign in (1, -1))
                 total[m] += np.sum((0.5 * (up + down) - here) ** 2)
         return total
 
@@ -113,7 +113,7 @@ class Target:
 
     def data(self, x: Vector) -> float:
         """χ² of the data, errors times `noise_scale`."""
-        return sum(float(np.sum(self.residuals(x, chunk) ** 2)) for chunk in self.likelihood.points)
+        return sum(float(np.sum(self.residuals(x, batch) ** 2)) for batch in self.likelihood.points)
 
     def objective(self, x: Vector) -> float:
         """−2 ln posterior, up to a constant."""
@@ -124,18 +124,18 @@ def exact_density(target: Target, inflate: bool = False) -> Density:
     """The exact posterior of all free parameters in w, where x = x̂ + L w and L Lᵀ is the covariance of the fit.
 
     With `inflate` the errors of the data are times f; ln f has the prior N(0, 1) and ln f √(2n) is the last coordinate.
-    The data go through it chunk by chunk, however many there are: the memory of a gradient is that of one chunk.
+    The data go through it batch by batch, however many there are: the memory of a gradient is that of one batch.
     """
     likelihood = target.likelihood
     offset, slope = target.prior_rows(target.centre), target.prior_slopes(target.root)
     linear = (target.values(target.centre), target.model.selection() @ target.root, offset, slope)
-    chunks = jax.tree.map(lambda *parts: jnp.stack(parts), *likelihood.points)
-    arrays = (target.model.template, likelihood.plan, chunks, *(jnp.asarray(a) for a in linear))
+    batches = jax.tree.map(lambda *parts: jnp.stack(parts), *likelihood.points)
+    arrays = (target.model.template, likelihood.plan, batches, *(jnp.asarray(a) for a in linear))
     residuals = inspect.unwrap(engine.residuals)  # to be compiled with the density, not on its own
     measured, free = float(target.measured), len(target.free)
 
-    def chi2_of(values: Array, template: Instrument, plan: Any, chunk: engine.PointData) -> Array:
-        _, r = residuals(with_values(template)(values), plan, chunk)
+    def chi2_of(values: Array, template: Instrument, plan: Any, batch: engine.PointData) -> Array:
+        _, r = residuals(with_values(template)(values), plan, batch)
         return jnp.sum(r**2) / target.noise_scale**2
 
     def log_density(w: Array, chi2: Array, offset: Array, slope: Array) -> Array:
@@ -145,18 +145,20 @@ def exact_density(target: Target, inflate: bool = False) -> Density:
         ln_f = w[-1] * target.ln_f_unit
         return -0.5 * (chi2 * jnp.exp(-2.0 * ln_f) + total + (ln_f / LN_F_WIDTH) ** 2) - measured * ln_f
 
-    def value(w: Array, template: Instrument, plan: Any, chunks: engine.PointData, *linear: Array) -> Array:
+    def value(w: Array, template: Instrument, plan: Any, batches: engine.PointData, *linear: Array) -> Array:
         first, along, offset, slope = linear
         values = first + along @ w[:free]
-        chi2 = engine.summed(lambda chunk: chi2_of(values, template, plan, chunk), chunks)
+        chi2 = engine.summed(lambda batch: chi2_of(values, template, plan, batch), batches)
         return log_density(w, chi2, offset, slope)
 
     def with_gradient(
-        w: Array, template: Instrument, plan: Any, chunks: engine.PointData, *linear: Array
+        w: Array, template: Instrument, plan: Any, batches: engine.PointData, *linear: Array
     ) -> tuple[Array, Array]:
         first, along, offset, slope = linear
         values = first + along @ w[:free]
-        here = engine.summed(lambda chunk: jax.value_and_grad(chi2_of)(values, template, plan, chunk), chunks)
+        here = engine.summed(
+            lambda batch: jax.value_and_grad(chi2_of)(values, template, plan, batch), batches
+        )
         chi2, by_values = here
         # χ² enters as the line that has its value and slope at w.
         return jax.value_and_grad(

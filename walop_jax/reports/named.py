@@ -48,7 +48,7 @@ def _draws(source: FigureSource) -> tuple[dict[str, Any], dict[str, str], tuple[
     """Draws (chain, draw) and units by name, and the names that are shown."""
     if source.posterior is None:
         raise fail("has no posterior", file=source.folder, advice="run walop-jax sample first")
-    data = source.posterior.posterior
+    data = source.posterior["posterior"]
     held = {str(name): np.asarray(data[name].values) for name in data.data_vars}
     units = {name: str(data[name].attrs.get("units", "")) for name in held}
     units = {name: "" if unit == "1" else unit for name, unit in units.items()}

@@ -19,11 +19,11 @@ from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.findings import sentences
 from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.fit.verdict import Quality
-from walop_jax.io.errors import DataError, fail
+from walop_jax.io.errors import DataError
 from walop_jax.io.names import COMPARISON, EPOCH, LIMITS, PLANNED, SUMMARY, SURVEY, TRACKS, WATCHED
+from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import (
     probability,
-    read_json,
     rounded,
     two_digits,
     value_and_error,
@@ -319,10 +319,7 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
     Raises `DataError` for a document that cannot be read or lacks what the page shows.
     """
     file, needed, drawn = OTHERS[kind]
-    document: dict[str, Any] = read_json(folder / file)
-    for key in needed:
-        if key not in document:
-            raise fail(f"has no {key!r}", file=folder / file, advice="run the command that made it again")
+    document = RunFolder(folder).document(file, needed)
     pictures, missing = drawn(folder, document)
     words = None
     if kind in ("plan", "limits") and (folder / LIMITS).exists():

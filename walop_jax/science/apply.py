@@ -22,7 +22,6 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.settings import Settings
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError, rows_text
-from walop_jax.likelihood import limits
 from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
 from walop_jax.model.parameters import with_values
 from walop_jax.science.catalogue import Catalogue
@@ -30,6 +29,13 @@ from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, 
 from walop_jax.science.detectors import detector_slopes, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
 from walop_jax.science.star_residuals import StarResiduals
+
+STAR_SAMPLE = 16384
+"""Rows of a catalogue, spread over it, by which the whole of it is judged: they see a camera that has changed by a
+fiftieth of what single stars of 10⁶ electrons would show."""
+
+STAR_ROWS = 16384
+"""Rows of a star catalogue that are worked on together: their matrices take some MB."""
 
 MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
@@ -89,7 +95,7 @@ def apply(
     does not cover (`check_validity`).
     """
     work = _Application(AnalysisVectors(calibration), catalogue, force=force)
-    chosen = work.sample(limits.STAR_SAMPLE)
+    chosen = work.sample(STAR_SAMPLE)
     parts, watched = [], []
     for done, rows in work.blocks():
         block = work.block(rows)
@@ -103,7 +109,7 @@ def apply(
 
 
 def residuals_of(
-    vectors: AnalysisVectors, catalogue: Catalogue, rows: int = limits.STAR_SAMPLE, *, force: bool = False
+    vectors: AnalysisVectors, catalogue: Catalogue, rows: int = STAR_SAMPLE, *, force: bool = False
 ) -> list[StarResiduals]:
     """Residuals of the stars of a catalogue, of about `rows` of its rows at most; none where no camera is to spare.
 
@@ -423,12 +429,12 @@ class _Application:
 
 
 def _slices_of_stars(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]:
-    """Slices of about `limits.STAR_ROWS` rows that do not divide stars, each with the number of rows done after it."""
+    """Slices of about `STAR_ROWS` rows that do not divide stars, each with the number of rows done after it."""
     first = np.flatnonzero(np.diff(star, prepend=-1))
     start = 0
     while start < len(star):
-        at = np.searchsorted(first, start + limits.STAR_ROWS, side="right") - 1
-        end = len(star) if start + limits.STAR_ROWS >= len(star) else int(first[at])
+        at = np.searchsorted(first, start + STAR_ROWS, side="right") - 1
+        end = len(star) if start + STAR_ROWS >= len(star) else int(first[at])
         if end <= start:  # a single star with more rows than a block
             end = int(first[at + 1]) if at + 1 < len(first) else len(star)
         yield end, slice(start, end)

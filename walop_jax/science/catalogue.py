@@ -13,17 +13,15 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.schema import EXPOSURES, Column, Place, check, finite
+from walop_jax.data.schema import EXPOSURES, MISSING, Column, Place, check, finite, plain_column
 from walop_jax.data.settings import TEMPERATURE, Settings
 from walop_jax.data.table_intensities import equal_rows
 from walop_jax.data.user_tables import (
-    MISSING,
     InputTable,
     empty_cells,
     numeric_column,
-    plain_column,
     read_input_table,
-    vector_column,
+    vector_columns,
 )
 from walop_jax.io.errors import rows_text
 from walop_jax.model.instrument import Instrument
@@ -223,7 +221,7 @@ def read_catalogue(
     place = Place(source.path, "")
     points, cameras = field_points(source, instrument, always_in, never_in), len(instrument.cameras)
     rule = Column("float", "electron", width=cameras, shape_advice=f"one row holds all {cameras} cameras")
-    counts, sigma = (vector_column(source, name, rule, instrument.cameras.names) for name in ("N", "N_ERR"))
+    counts, sigma = vector_columns(source, ("N", "N_ERR"), rule, instrument.cameras.names)
     advice = "standard errors in electrons; NaN for a camera that is not to be used"
     place.refuse(np.isfinite(counts) & (sigma <= 0), "is not above 0", "N_ERR", advice)
     flagged = _flagged(source, instrument.cameras.names, place)
@@ -332,7 +330,8 @@ def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndar
     else:
         values = np.char.strip(values.astype(str))
         missing = missing | (values == "")
-        unknown = ~missing & np.isin(np.char.lower(values), _NO_ID)
+        negative = np.char.startswith(values, "-") & np.char.isdigit(np.char.lstrip(values, "-"))
+        unknown = ~missing & (negative | np.isin(np.char.lower(values), _NO_ID))
     if unknown.any():
         which = rows_text(np.flatnonzero(unknown))
         source.remarks.append(
@@ -355,17 +354,30 @@ def _copies(
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Rows that repeat one of their star, and rows with the position and counts of another star or setting.
 
-    Noise does not repeat to the digits of a float32 in all cameras: such rows are one measurement.
+    Noise does not repeat to the digits of a float32 in two cameras or more: such rows are one measurement, that with
+    most cameras is kept.
     """
-    measured = np.isfinite(counts).any(axis=1)
+    known = np.isfinite(counts)
+    measured = known.any(axis=1)
     same = equal_rows([*counts.T, *sigma.T, points.x, points.y])
+    for pattern in np.unique(known[measured & ~known.all(axis=1)], axis=0):
+        cameras = np.flatnonzero(pattern)
+        rows = np.flatnonzero(known[:, cameras].all(axis=1)) if len(cameras) > 1 else cameras[:0]
+        rows = rows[np.argsort(-known[rows].sum(axis=1), kind="stable")]
+        group = equal_rows(
+            [*counts[rows][:, cameras].T, *sigma[rows][:, cameras].T, points.x[rows], points.y[rows]]
+        )
+        _, best = np.unique(group, return_index=True)
+        same[rows] = same[rows[best[group]]]
     copy = repeated = np.zeros(len(star), bool)
     if np.bincount(same[measured], minlength=1).max() < 2:
         return copy, repeated
     settings = points.settings
     angles = [np.mod(angle, 360.0) for angle in (*settings.positions.values(), rotator)]
     _, band = np.unique(settings.filter, return_inverse=True)
-    first = np.unique(equal_rows([same, star, band.reshape(-1), *angles]), return_index=True)[1]
+    order = np.argsort(-known.sum(axis=1), kind="stable")
+    group = equal_rows([same, star, band.reshape(-1), *angles])
+    first = order[np.unique(group[order], return_index=True)[1]]
     copy = measured & ~np.isin(np.arange(len(star)), first)
     repeated = measured & (np.bincount(same[measured & ~copy], minlength=len(star))[same] > 1)
     if copy.any():

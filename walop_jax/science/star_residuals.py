@@ -26,10 +26,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import special
 
-from walop_jax.likelihood import limits
 from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.optics import through_series
+
+CHECKED_ROWS = 2048
+"""Rows whose columns for the check of a catalogue are worked on together: a hundred columns of them take 7 MB."""
 
 TRIMMED = 1e-3
 CROWDED = 1.5
@@ -128,9 +130,9 @@ class StarResiduals:
         )
 
     def blocks(self) -> Iterator[tuple[slice, slice, StarResiduals]]:
-        """Slices of stars and of rows, some `limits.CHECKED_ROWS` of these, each with what it holds."""
+        """Slices of stars and of rows, some `CHECKED_ROWS` of these, each with what it holds."""
         first = self.first
-        cuts = np.searchsorted(first, np.arange(0, len(self), limits.CHECKED_ROWS))
+        cuts = np.searchsorted(first, np.arange(0, len(self), CHECKED_ROWS))
         for start, stop in zip(cuts, [*cuts[1:], len(first)], strict=True):
             if stop > start:
                 stars = slice(int(start), int(stop))

@@ -35,7 +35,6 @@ from scipy import special
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.errors import DataError
-from walop_jax.likelihood import limits
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, with_effects
@@ -63,6 +62,7 @@ from walop_jax.science.watch_found import UNNAMED, History, Suspect, Watch, Watc
 from walop_jax.science.watch_readings import Answers, Readings
 from walop_jax.science.watch_spots import SpotFound, Spots, of_stars, profile
 
+WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen to 10⁻⁵
 SEEN = 2.33
 """Standard deviations above the alarm from which 99 % are found."""
 MOST_GROUPS = 150
@@ -90,7 +90,7 @@ def watch(
     catalogues: Sequence[Catalogue],
     *,
     names: Sequence[str] = (),
-    rows: int = limits.WATCHED_ROWS,
+    rows: int = WATCHED_ROWS,
     force: bool = False,
 ) -> Watch:
     """Look for changes of the instrument since it was calibrated in the stars of catalogues.

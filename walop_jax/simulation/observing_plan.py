@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import itertools
 import os
+import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,9 +31,10 @@ from walop_jax.data.records import (
 )
 from walop_jax.data.schema import Place
 from walop_jax.data.settings import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
-from walop_jax.instruments.description import Reader, default_name, described, shipped
+from walop_jax.instruments.description import default_name, described, shipped
 from walop_jax.io.errors import errors_naming, nearest
 from walop_jax.io.text import parse_toml, read_text
+from walop_jax.io.toml import OUT, Reader
 from walop_jax.model.effects.base import Context
 from walop_jax.model.elements import defined_elements
 from walop_jax.model.instrument import Instrument, as_designed, nominal_instrument
@@ -448,13 +450,8 @@ def _curve_document(given: str | FilterCurve) -> dict[str, Any]:
 
 # ------------------------------------------------------------------------------------------------------- plans as files
 
-OUT = "out"
 _ANGLES = len(polariser_turn())
 FULL_TURN = "full_turn"
-_STOP_HINTS, _HINTS = (
-    {field.name: str(field.type) for field in dataclasses.fields(kind)} for kind in (Stop, ObservingPlan)
-)
-_KNOWN = (*_HINTS, FULL_TURN)
 
 
 def is_plan(path: str | os.PathLike[str]) -> bool:
@@ -478,7 +475,8 @@ def plan_of(
 ) -> ObservingPlan:
     """The plan of the entries of a file in `folder`; the rest as `read_plan`."""
     content = dict(content)
-    check_names("entry of a plan", content, _KNOWN)
+    hints, of_stops, read = typing.get_type_hints(ObservingPlan), typing.get_type_hints(Stop), Reader("")
+    check_names("entry of a plan", content, (*hints, FULL_TURN))
     own = instrument_named(content, folder)
     content.pop("instrument", None)
     instrument = own if instrument is None else instrument
@@ -491,48 +489,21 @@ def plan_of(
         raise ValueError(
             f"{FULL_TURN} is of no use beside a list of angles; give their number, or leave it out"
         )
-    stops = content.pop("stops", [])
-    _check(content, _HINTS)
-    values = {name: _value(value) for name, value in content.items()}
+    stops, filters = content.pop("stops", []), content.pop("filters", None)
+    values = read.values(hints, content, "")
+    if filters is not None:
+        if not isinstance(filters, list | dict) or any(not isinstance(one, str) for one in filters):
+            raise read.fault("", f"filters = {filters!r} must be a list of names, or tables [filters.NAME]")
+        values["filters"] = tuple(filters) if isinstance(filters, list) else filters
     for stop in stops:
         for name in stop:
-            if name not in _STOP_HINTS:
+            if name not in of_stops:
                 position = "; where an element stands is moving = { HWP = 22.5 }" if name.isupper() else ""
-                raise ValueError(f"{unknown_name('entry of a stop', name, _STOP_HINTS)}{position}")
-        _check(stop, _STOP_HINTS, "stops")
-    values["stops"] = tuple(Stop(**_value(stop)) for stop in stops)
+                raise ValueError(f"{unknown_name('entry of a stop', name, of_stops)}{position}")
+    values["stops"] = tuple(Stop(**read.values(of_stops, stop, "stops")) for stop in stops)
     return ObservingPlan(
         None if instrument is None else Instrument.read(instrument, elements=defined_elements()), **values
     )
-
-
-def _check(table: Mapping[str, Any], hints: Mapping[str, str], place: str = "") -> None:
-    """Raise `DataError`, naming table and key, for values of a plan that are not of their kind."""
-    for key, value in table.items():
-        _check_value(Reader(""), key, value, hints[key], place)
-
-
-def _check_value(read: Reader, key: str, value: Any, hint: str, place: str) -> None:
-    if hint.startswith("Mapping"):
-        for name, one in read.table(value, place, f"{key} = ").items():
-            _check_value(read, name, one, hint.removeprefix("Mapping[str, "), key)
-    elif hint.startswith("Sequence"):
-        if not isinstance(value, list | dict) or any(not isinstance(one, str) for one in value):
-            raise read.fault(place, f"{key} = {value!r} must be a list of names, or tables [{key}.NAME]")
-    elif hint.startswith("tuple"):
-        pair = hint == "tuple[float, float]"
-        if not isinstance(value, list | tuple) or (pair and len(value) != 2):
-            raise read.fault(place, f"{key} = {value!r} must be a list of {'two ' if pair else ''}numbers")
-        for one in value:
-            _check_value(read, key, one, hint.removeprefix("tuple["), place)
-    elif hint.startswith("float"):
-        if not (value == OUT and hint.startswith("float | None")):
-            read.number(value, key, place)
-    elif hint.startswith("int"):
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise read.fault(place, f"{key} = {value!r} must be a whole number")
-    else:
-        read.text(value, key, place)
 
 
 def instrument_named(content: Mapping[str, Any], folder: Path) -> str | Path | None:
@@ -541,15 +512,6 @@ def instrument_named(content: Mapping[str, Any], folder: Path) -> str | Path | N
         return None
     beside = folder / str(own)
     return beside if beside.suffix == ".toml" else str(own)
-
-
-def _value(value: Any) -> Any:
-    """Lists as tuples, and None for what is out."""
-    if isinstance(value, list):
-        return tuple(_value(one) for one in value)
-    if isinstance(value, dict):
-        return {name: _value(one) for name, one in value.items()}
-    return None if value == OUT else value
 
 
 def plan_text(plan: ObservingPlan, described: str | None = None) -> str:

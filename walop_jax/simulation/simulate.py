@@ -246,10 +246,7 @@ def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, 
     """Expected counts (electron) of every (point, exposure), what the detectors do to them included."""
     likelihood = Likelihood.of(blank, make_model(blank.instrument, truth))
     unit = np.concatenate(
-        [
-            np.asarray(engine.prediction(truth, likelihood.plan, c, once=likelihood.few))
-            for c in likelihood.points
-        ]
+        [np.asarray(engine.prediction(truth, likelihood.plan, c)) for c in likelihood.points]
     )
     light_counts = flux[:, :, None] * unit[: len(flux)]
     if light.is_linear(truth):

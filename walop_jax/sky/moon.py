@@ -21,8 +21,6 @@ North and east at a field point are those of the field centre, carried there by 
 from __future__ import annotations
 
 import contextlib
-import functools
-import itertools
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -33,8 +31,6 @@ from jaxtyping import Float
 from walop_jax.data.checks import EPHEMERIS_MJD
 from walop_jax.data.records import Site
 from walop_jax.io.errors import fail
-
-EARTH_ROTATION_COLUMNS = ["#", "YR", "MM", "DD", "HH", "MJD", 'x(")', 'y(")', "UT1-UTC(s)"]
 
 
 def moon_sky(
@@ -136,35 +132,11 @@ def _offline() -> Iterator[None]:
     with (
         iers.conf.set_temp("auto_download", False),
         iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
-        iers.earth_orientation_table.set(earth_rotation()),
+        iers.earth_orientation_table.set(iers.IERS_B.open()),
         warnings.catch_warnings(),
     ):
         warnings.simplefilter("ignore")
         yield
-
-
-@functools.cache
-def earth_rotation() -> Any:
-    """Astropy's table of the rotation of the Earth (`IERS_B`), read by numpy: ten times faster than by its own reader.
-
-    A file of another layout is left to that.
-    """
-    from astropy import units
-    from astropy.utils import iers
-
-    columns = {
-        "MJD": (4, units.d),
-        "PM_x": (5, units.arcsec),
-        "PM_y": (6, units.arcsec),
-        "UT1_UTC": (7, units.s),
-    }
-    with open(iers.IERS_B_FILE, encoding="ascii") as file:
-        head = [line.split() for line in itertools.takewhile(lambda line: line.startswith("#"), file)]
-    if not head or head[-1][:9] != EARTH_ROTATION_COLUMNS:
-        return iers.IERS_B.open()
-    values = np.loadtxt(iers.IERS_B_FILE, usecols=[place for place, _ in columns.values()], unpack=True)
-    units_of = [unit for _, unit in columns.values()]
-    return iers.IERS_B([v * unit for v, unit in zip(values, units_of, strict=True)], names=list(columns))
 
 
 def rayleigh_sky(

@@ -1,0 +1,133 @@
+"""Draws of a posterior as `posterior.nc` holds them, in the groups of ArviZ, and calibrations that use them.
+
+posterior.nc   draws of every coefficient that varies. Walkers of an ensemble are not independent chains, so a chain
+               here is an ensemble: its draws are all walkers at steps spread evenly over the run. R-hat and effective
+               sample sizes are those of `result`, kept as attributes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.records import InputFile
+from walop_jax.io.errors import fail
+
+if TYPE_CHECKING:  # slow to import, and most commands read no posterior
+    from xarray import Dataset, DataTree
+
+DRAWS = 200  # of a posterior, that stand for it in matrices
+INFLATION = "noise.ln_f"
+_AGAIN = "run walop-jax sample again"
+
+
+def as_arviz(groups: DataTree) -> Any:
+    """Groups of a posterior as the installed ArviZ takes them: InferenceData (before ArviZ 1), or the tree itself."""
+    if int(importlib.metadata.version("arviz").split(".")[0]) >= 1:
+        return groups
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the announcement that it makes when it is imported
+        import arviz
+    data: dict[str, Any] = {name: node.to_dataset() for name, node in groups.children.items()}
+    return arviz.InferenceData(**data)
+
+
+def group_of_draws(draws: Mapping[str, Float[np.ndarray, "c d"]]) -> Dataset:
+    """Draws of quantities as a group: chains × draws, by number."""
+    from xarray import Dataset
+
+    chains, count = next(iter(draws.values())).shape
+    place = {"chain": np.arange(chains), "draw": np.arange(count)}
+    return Dataset({name: (("chain", "draw"), values) for name, values in draws.items()}, coords=place)
+
+
+def digest(*parts: Any) -> str:
+    """SHA-256 of arrays, texts and numbers."""
+    total = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, np.ndarray) and part.dtype.kind not in "OUS":
+            total.update(f"{part.dtype.str}{part.shape}".encode() + np.ascontiguousarray(part).tobytes())
+        else:
+            total.update(repr(part.tolist() if isinstance(part, np.ndarray) else part).encode() + b"\n")
+    return total.hexdigest()
+
+
+def digest_of_fit(inputs: Sequence[InputFile], names: Sequence[str], values: np.ndarray) -> str:
+    """Digest that tells a fit from all others: of its data, its parameters and their values, to the last bit."""
+    return digest(sorted(entry.sha256 for entry in inputs), list(names), np.asarray(values, float))
+
+
+def read_groups(path: str | os.PathLike[str]) -> DataTree:
+    """The groups of a `posterior.nc`; `DataError` if it cannot be read."""
+    import xarray
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return xarray.open_datatree(path, engine="h5netcdf").load()
+    except Exception as error:
+        raise fail(f"cannot be read: {error}", file=path, advice=_AGAIN) from error
+
+
+def read_draws(
+    path: str | os.PathLike[str], names: tuple[str, ...], fit: str | None = None
+) -> Float[np.ndarray, "d n"]:
+    """Draws of the parameters `names`, all chains one after the other; fixed ones keep their value.
+
+    `fit` is the `digest_of_fit` that was sampled around; None: whichever. Raises `DataError` for a file that cannot be
+    read, is of another model or another fit, or may not be trusted.
+    """
+    groups = read_groups(path)
+    try:
+        posterior = groups["posterior"]
+        fixed = json.loads(posterior.attrs["fixed"])
+        trusted = bool(posterior.attrs["trusted"])
+        held = {name: np.asarray(posterior[name].values).ravel() for name in map(str, posterior.data_vars)}
+    except Exception as error:
+        raise fail(f"cannot be read: {error}", file=path, advice=_AGAIN) from error
+    held.pop(INFLATION, None)
+    if set(held) | set(fixed) != set(names):
+        odd = sorted((set(held) | set(fixed)) ^ set(names))
+        raise fail(f"is of another model ({', '.join(odd[:3])})", file=path, advice=_AGAIN)
+    if fit is not None and posterior.attrs.get("fit") != fit:
+        advice = "give the posterior of this calibration, or run walop-jax sample again"
+        raise fail("is of another fit with the same parameters", file=path, advice=advice)
+    if not trusted:
+        advice = "see the warnings of the fit, or go on with walop-jax sample --resume"
+        raise fail(f"is not to be trusted: {posterior.attrs['verdict']}", file=path, advice=advice)
+    count = len(next(iter(held.values())))
+    return np.stack([held.get(name, np.full(count, fixed.get(name, np.nan))) for name in names], axis=1)
+
+
+def with_draws(calibration: Calibration, path: str | os.PathLike[str], count: int = DRAWS) -> Calibration:
+    """The calibration with `count` draws of a `posterior.nc`, over which its matrices are averaged.
+
+    `DataError` for a file of another model or another fit, or not trusted.
+    """
+    draws = _draws_of(calibration, path)
+    chosen = np.random.default_rng(0).permutation(len(draws))[:count]
+    return dataclasses.replace(calibration, draws=draws[chosen])
+
+
+def with_moments(calibration: Calibration, path: str | os.PathLike[str]) -> Calibration:
+    """The calibration with mean and covariance of all draws of a `posterior.nc` in place of the fit's.
+
+    For linear propagation, star by star. `DataError` as in `with_draws`.
+    """
+    draws = _draws_of(calibration, path)
+    return dataclasses.replace(calibration, values=draws.mean(axis=0), covariance=np.cov(draws, rowvar=False))
+
+
+def _draws_of(calibration: Calibration, path: str | os.PathLike[str]) -> Float[np.ndarray, "d n"]:
+    names = calibration.model.names
+    return read_draws(path, names, digest_of_fit(calibration.inputs, names, calibration.values))

@@ -1,0 +1,171 @@
+"""A run: its folder, with the calibration, the data, the fit and the posterior that it stands for."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from walop_jax.calibration.calibration import Calibration, Product
+from walop_jax.calibration.product import read_product
+from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.records import CalibrationSet
+from walop_jax.fit.model_file import model_for
+from walop_jax.fit.parameter_table import ParameterValue
+from walop_jax.fit.refit import FitResult, fit, with_honest_errors
+from walop_jax.fit.verdict import STATED
+from walop_jax.io.display import Display, Result
+from walop_jax.io.errors import errors_naming, fail
+from walop_jax.io.names import POSTERIOR, PRODUCT
+from walop_jax.io.run_folder import RunFolder
+from walop_jax.io.text import two_digits
+from walop_jax.likelihood import limits
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.posterior.draws import read_groups
+
+VERDICTS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "diagnosis": lambda d: str(d["verdict"]),
+    "commissioning": lambda d: "go" if d["go"] else "no-go",
+    "epoch": lambda d: (
+        f"the old calibration {'still holds' if d.get('fits') and d.get('new_trusted') else 'does not hold'}"
+    ),
+    "survey": lambda d: "trusted" if d["trusted"] else "not trusted",
+    "watch": lambda d: "the calibration holds" if d["holds"] else "the calibration is not known to hold",
+    "plan": lambda d: f"{d['what']}: {d['value']:.3g} {d['unit']}".rstrip(),
+}
+"""Documents in a few words."""
+
+SAME_FIT = 0.05  # standard errors
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Run(RunFolder, Result):
+    """The folder of a run; everything in it is read when it is asked for. None stands for what is not there.
+
+    `catalogue` are the effects that its model may have, `data` the sets of its fit (default: where they were, in the
+    folder of the run, or beside it).
+
+    >>> walop.read("RUN")["pupil.magnification"]
+    15.6675 ± 0.0051
+    """
+
+    catalogue: Sequence[type[Effect]] = EFFECTS
+    data: Sequence[str | os.PathLike[str]] = ()
+
+    @functools.cached_property
+    def product(self) -> Product | None:
+        """Contents of the file of the calibration, its model not rebuilt."""
+        return read_product(self.folder) if PRODUCT in self else None
+
+    @functools.cached_property
+    def calibration(self) -> Calibration | None:
+        """The calibration."""
+        if self.product is None:
+            return None
+        with errors_naming(self.folder / PRODUCT):
+            return self.product.rebuilt(tuple(self.catalogue))
+
+    @property
+    def rebuilt(self) -> Calibration:
+        """The calibration; `DataError` where there is none."""
+        self.wanted(PRODUCT)
+        assert self.calibration is not None
+        return self.calibration
+
+    @functools.cached_property
+    def posterior(self) -> Any:
+        """The draws as ArviZ InferenceData."""
+        return read_groups(self.folder / POSTERIOR) if POSTERIOR in self else None
+
+    @functools.cached_property
+    def calset(self) -> CalibrationSet:
+        """The data of the fit.
+
+        Raises `DataError` where the run does not say what they were, and where they are not there or have changed.
+        """
+        inputs = () if self.product is None else self.product.inputs
+        if not inputs:
+            advice = "make it with walop-jax refit"
+            raise fail("does not say what it was fitted to", file=self.folder, advice=advice)
+        calset = read_calibration_set(*(self.data or [self._located(entry.path) for entry in inputs]))
+        if sorted(entry.sha256 for entry in calset.inputs) != sorted(entry.sha256 for entry in inputs):
+            raise fail("these are not the data of the fit any more", file=inputs[0].path, advice="refit them")
+        return calset
+
+    def _located(self, path: Path) -> Path:
+        beside = self.folder.resolve()
+        for folder in (Path(), beside, *beside.parents):
+            for there in (folder / path, folder / path.name):
+                if there.exists():
+                    return there
+        raise fail(
+            f"cannot be found, neither from {Path.cwd()} nor beside {self.folder}",
+            file=path,
+            advice="say where it is (--data FILE, for each set of the fit), or copy it into the folder of the run",
+        )
+
+    def fit(self, model_text: str | None = None) -> FitResult:
+        """The fit of the run, made once more from where it ended; `model_text` is the model file of the fit.
+
+        Raises `DataError` when the data are missing, not those of the fit or too many to be sampled, and when the fit
+        does not come out as the calibration says (another model, or another version of the physics). Errors are made as
+        those of the calibration were, and the verdict is its verdict.
+        """
+        calibration, calset = self.rebuilt, self.calset
+        text = "\n".join(calibration.product.model_lines) if model_text is None else model_text
+        model = model_for(calset, text, calibration.design, self.catalogue)
+        if model.names != calibration.model.names:
+            advice = "run walop-jax refit with this model first"
+            raise fail("was fitted with another model", file=self.folder, advice=advice)
+        likelihood = Likelihood.of(calset, model)
+        if likelihood.layout.large:
+            raise fail(
+                f"has {len(calset.points)} field points: the posterior of so many is as good as normal, and "
+                "calibration.fits holds its covariance",
+                file=calibration.inputs[0].path,
+                advice=f"sample sets of up to {limits.LARGE_ABOVE} points; walop-jax compress makes one of frames",
+            )
+        result = fit(likelihood, start=calibration.values)
+        away = np.abs(result.values - calibration.values) / np.where(result.sigma > 0, result.sigma, 1.0)
+        if not result.converged or np.max(away) > SAME_FIT:
+            name = model.names[int(np.argmax(away))]
+            raise fail(
+                f"fitted again, {name} moves by {np.max(away):.2g} standard errors", file=self.folder,
+                advice="run walop-jax refit with this model and version first",
+            )  # fmt: skip
+        if calibration.verdict.errors_from != STATED:
+            result = with_honest_errors(result)
+        verdict = calibration.verdict
+        if result.errors_from != verdict.errors_from and verdict.covariance_from == "fit":
+            result = dataclasses.replace(
+                result, covariance=calibration.covariance, errors_from=verdict.errors_from
+            )
+        return dataclasses.replace(result, verdict=verdict)
+
+    def __getitem__(self, name: str) -> ParameterValue:
+        """A parameter of the calibration by name, with its error; `DataError` where there is no calibration."""
+        return self.rebuilt[name]
+
+    def display(self) -> Display:
+        """The files, and the calibration if there is one."""
+        found = self.documents
+        files = {"calibration": PRODUCT, "posterior": POSTERIOR}
+        held = [name for name, file in files.items() if file in self]
+        facts = [("holds", ", ".join([*held, *found]) or "nothing")]
+        known = found.get("summary", {}).get("accuracy_of_p")
+        if known and found["summary"].get("trusted"):
+            share = f"below 0.1 % over {100 * known['share_below_goal']:.0f} % of it"
+            facts.append(
+                ("p of a star", f"{two_digits(100 * known['median'])} % (median of the field), {share}")
+            )
+        facts += [(name, VERDICTS[name](found[name])) for name in VERDICTS if name in found]
+        inner = Display("") if self.calibration is None else self.calibration.display()
+        return dataclasses.replace(
+            inner, title=f"Run {self.folder}. {inner.title}".removesuffix(". "), facts=(*facts, *inner.facts)
+        )
