@@ -106,6 +106,8 @@ class _Laid:
         self.template = model.template
         self.columns = Columns(self.fit.likelihood, self.fit.values)
         self.usual = usual_exposure(calset, self.template)
+        self._added: dict[Sum, Float[np.ndarray, "p k 3"]] = {}
+        self._vectors: Float[np.ndarray, "p k 3"] | None = None
         instrument = model.instrument(self.fit.values)
         setting = first_setting(calset, instrument, self.usual)
         at = setting, calset.filters, calset.points.x, calset.points.y
@@ -115,6 +117,15 @@ class _Laid:
         self.errors = np.sqrt(
             np.einsum("pmf,fg,pmg->pm", self.slopes, covariance_of_free(self.fit), self.slopes)
         )
+
+    def added(self, sums: Sequence[Sum]) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
+        """Analysis vectors of a star at the field points, and what one unit of each amplitude adds to them."""
+        missing = [each for each in dict.fromkeys(sums) if each not in self._added]
+        if missing or self._vectors is None:
+            self._vectors, new = added_to_starlight(self.columns, missing, self.usual)
+            self._added |= dict(zip(missing, np.moveaxis(new, -1, 0), strict=True))
+        each = [self._added[one] for one in sums]
+        return self._vectors, np.stack(each, axis=-1) if each else np.zeros((*self._vectors.shape, 0))
 
     def class_of(self, name: str, at: Int[np.ndarray, " a"], lost: Vector, sums: tuple[Sum, ...]) -> ClassOf:
         """The class of what has the amplitudes `at`, without which the residuals change by `lost`."""
@@ -201,13 +212,17 @@ class _Step:
             found.append((evidence, probe, gram[at, at], scores[at]))
         found.sort(key=lambda one: -one[0])
         least = max(told, found[0][0] if found else told) - state.policy.improbable
+        chosen = []
         for evidence, probe, square, along_residual in found[:MOST_ASKED]:
             if evidence <= least:
-                return
+                break
             sums = tuple(tuple(each) for one in probe.group for each in one.first_order(self.laid.template))
             if len(sums) == len(probe.widths) and self._can_be_said(sums):
-                column = design.stacked([state.columns[number[probe.name]]])
-                yield self._member(probe.name, evidence, sums, column, square, along_residual, probe.widths)
+                chosen.append((probe, evidence, sums, square, along_residual))
+        self.laid.added([each for _, _, sums, *_ in chosen for each in sums])  # all of them in one go
+        for probe, evidence, sums, square, along_residual in chosen:
+            column = design.stacked([state.columns[number[probe.name]]])
+            yield self._member(probe.name, evidence, sums, column, square, along_residual, probe.widths)
 
     def in_other_kinds(self, member: Likeness) -> Likeness | None:
         """A member that is about exposures of one KIND, in all others instead; None for any other."""
@@ -252,7 +267,7 @@ class _Step:
         values[self.rest] = moved(self.jacobian, basis, self.lost + column @ amplitudes)
         slopes[self.rest] = moved(self.jacobian, basis, column)
         values[self.at] = -laid.fit.values[laid.fit.model.free[self.at]]
-        vectors, added = added_to_starlight(laid.columns, sums, laid.usual)
+        vectors, added = laid.added(sums)
         change = of_matrix(vectors, added @ amplitudes, laid.template.cameras.pairs)
         change = change.reshape(laid.matrix.shape) + laid.slopes @ values
         return Likeness(name, evidence, sums, amplitudes, covariance, values, slopes, change)
