@@ -47,16 +47,21 @@ LEAST_PROBABLE, PLAUSIBLE = 1e-3, 0.02  # of members that are kept, and of those
 
 
 def classes_of(
-    state: Examination, context: Context, names: Collection[str], said: Sequence[str]
+    state: Examination,
+    context: Context,
+    names: Collection[str],
+    said: Sequence[str],
+    alike: Collection[str] = (),
 ) -> tuple[ClassOf, ...]:
     """The classes of the effects of a model that have some names; without those of which the class is that alone.
 
-    `said` are the names of the groups of sentences that were added.
+    `said` are the names of the groups of sentences that were added, `alike` those of effects and groups that were told
+    as not to be distinguished: of far larger residuals, where one linear step says little, they count as probable.
     """
     additions = list(_additions(state.result, context, names, said))
     if not additions or not state.result.model.template.cameras.pairs:
         return ()
-    laid = _Laid(state)
+    laid = _Laid(state, alike)
     return tuple(one for one in itertools.starmap(laid.class_of, additions) if one.names)
 
 
@@ -100,7 +105,8 @@ def _groups(effect: Described, said: Sequence[str]) -> Iterator[tuple[str, ...]]
 class _Laid:
     """An examination laid out for one linear step from model to model."""
 
-    def __init__(self, state: Examination) -> None:
+    def __init__(self, state: Examination, alike: Collection[str]) -> None:
+        self.alike = alike
         self.state, self.fit, self.design = state, state.result, state.design
         calset, model = self.fit.calset, self.fit.model
         self.template = model.template
@@ -209,6 +215,8 @@ class _Step:
         for probe in (*state.probes, *state.sentences, *(probe for probe, _ in state.parts)):
             at = places[probe.name]
             evidence = log_bayes(gram[at, at], scores[at], probe.widths) / state.floor**2
+            if {probe.name, probe.effect.name} & set(self.laid.alike):
+                evidence = max(evidence, told)
             found.append((evidence, probe, gram[at, at], scores[at]))
         found.sort(key=lambda one: -one[0])
         least = max(told, found[0][0] if found else told) - state.policy.improbable

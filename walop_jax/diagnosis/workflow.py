@@ -130,7 +130,9 @@ def diagnose(
     verdict: Outcome = "unexplained" if nameless else "effect_found" if steps else "consistent"
     tell("examining what is left")
     names = {step.effect for step in steps}
-    members = classes_of(last, judge.context, names, judge.said) if last.result is judge.fit else ()
+    alike = {name for step in steps for name in (*step.equivalent, *step.nameless)} - {Described.name}
+    examined_last = last.result is judge.fit
+    members = classes_of(last, judge.context, names, judge.said, alike) if examined_last else ()
     found = Diagnosis(
         verdict=verdict,
         steps=steps,
