@@ -92,6 +92,24 @@ def test_sentences_against_the_whole_light_path(laid, text):
     _alike(columns(likelihood, values, [_said(text)]), own_columns(likelihood, values, [effect]), [text])
 
 
+@pytest.mark.parametrize(
+    "text",
+    quick(
+        [
+            "added polarisation q ahead of polariser * hours",
+            "added polarisation u ahead of polariser * per EXPTIME * x",
+            "retardance u ahead of polariser * hours",
+            "gain of O1 * per EXPTIME * x",
+            "gain of half1 * order",
+            "turn of polariser * side CLP",
+        ],
+        ["added polarisation q ahead of polariser * hours", "gain of O1 * per EXPTIME * x"],
+    ),
+)
+def test_sentences_of_single_exposures_against_the_whole_light_path(laid, text):
+    test_sentences_against_the_whole_light_path(laid, text)
+
+
 @pytest.mark.long
 def test_every_effect_against_the_whole_light_path(laid):
     likelihood, values = laid

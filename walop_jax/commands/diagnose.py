@@ -56,7 +56,6 @@ def diagnose(
 
     >>> walop.diagnose("night.fits", progress=print).verdict  # doctest: +SKIP
     """
-    from walop_jax import Calibration
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.summary import summary
     from walop_jax.diagnosis.figure_data import figure_data, write_figure_data
@@ -72,12 +71,13 @@ def diagnose(
     with job.repeated() as say:
         found = diagnosis_of(calset, chosen, seed=job.seed, minutes=minutes, progress=say)
 
-    after = answered(found.after)
+    product = found.calibration()
+    after = answered(found.after, product)
     usable = after.trusted and found.verdict != "unexplained"
 
     def files() -> Writers:
         job.tell("mapping the field", "mapping")
-        product, drawn_from = Calibration.from_fit(after), figure_data(found)
+        drawn_from = figure_data(found)
         misfit = None if after.explains_data else describe(after)
         fitted = summary(after, seconds=job.seconds, misfit=misfit) | {"seed": job.seed}
         return {

@@ -10,7 +10,9 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import Exposures
+from walop_jax.diagnosis.class_product import ClassOf, averaged
 from walop_jax.diagnosis.design import Design, positions_of
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.fit.refit import FitResult
@@ -20,6 +22,7 @@ from walop_jax.io.text import probability, some, value_and_error
 from walop_jax.model import legendre
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import Change
+from walop_jax.model.specification import effect_context
 
 HARMONICS = (0, 1, 2, 3, 4)
 FIELD_WORDS = ("uniform", "gradient", "quadratic", "cubic", "fourth order")
@@ -250,6 +253,7 @@ class Diagnosis(Drawn):
     `noise_scale` is the scatter of what no candidate explains over what N_ERR says, `noise_p` the chance that noise of
     the stated size scatters as much. `classes` are significant effects of the first examination with those that
     these data cannot tell from them, `limits` what effects that were not found stay below: rows of `diagnosis.json`.
+    `members` are the classes of what was added, with what their members do to stars.
     """
 
     first_figure = "ladder"
@@ -272,6 +276,13 @@ class Diagnosis(Drawn):
     classes: tuple[Mapping[str, Any], ...] = ()
     policy: Policy = POLICY
     ended: bool = False
+    members: tuple[ClassOf, ...] = ()
+
+    def calibration(self) -> Calibration:
+        """The calibration of the extended model: its mean over what these data cannot tell apart, with its spread."""
+        made = Calibration.from_fit(self.after)
+        context = effect_context(self.after.model.template, self.after.calset.exposures)
+        return averaged(made, self.members, context)
 
     @property
     def caution(self) -> str:
@@ -416,6 +427,16 @@ def _step(step: Step) -> dict[str, Any]:
     }
 
 
+def _members(one: ClassOf) -> dict[str, Any]:
+    return {
+        "added": one.added,
+        "members": [{"name": m.name, "probability": m.probability} for m in one.members],
+        "spread_of_p": one.spread,
+        "stated_error_of_p": one.stated,
+        "farthest_element_sigma": one.off,
+    }
+
+
 def sentences(found: Mapping[str, Any]) -> Iterator[str]:
     """Sentences beside the numbers of a diagnosis, from the content of diagnosis.json: `print`, the command and the
     page say the same."""
@@ -508,6 +529,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
             for choice in diagnosis.choices
         ],
         "classes": diagnosis.classes,
+        "members": [_members(one) for one in diagnosis.members],
         "cannot_be_tested": diagnosis.untestable,
         "chi2_per_dof_before": diagnosis.before.chi2 / max(diagnosis.before.dof, 1),
         "chi2_per_dof_after": diagnosis.after.chi2 / max(diagnosis.after.dof, 1),

@@ -24,10 +24,10 @@ import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from walop_jax.data.records import Exposures
-from walop_jax.diagnosis.hypotheses import FEWEST_POINTS, Probe, said_by
+from walop_jax.diagnosis.dependences import STEPS, Asked, between, starts_of_steps
+from walop_jax.diagnosis.hypotheses import Probe, said_by
 from walop_jax.diagnosis.policy import RINGS
 from walop_jax.likelihood import limits
 from walop_jax.model.conventions import Units
@@ -39,16 +39,12 @@ from walop_jax.model.effects.numbers import OF_SOURCES
 from walop_jax.model.effects.optics import DISPLACEMENTS
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.plan import hours_of
 from walop_jax.model.slots import acts
-from walop_jax.sky.nights import first_of_nights
 
 # -------------------------------------------------------------------------------------------------------- all sentences
 
 LINEAR = ("diattenuation", "retardance")
 ALONE = ("diattenuation v", "retardance v", "depolarisation")
-STEPS, FEW = 16, 18  # times of a step that are looked at first; times of which all spells are
-AFTER = 0.5  # hours behind the last exposure that a step ends
 ROUNDED = 1e-4  # hours, of times that are written into a description
 HARMONICS = (1, 2)
 HARMONICS_OF_ENCODER = (1, 2, 3, 4, 5, 6)
@@ -96,28 +92,6 @@ def beside_names(
     return alone, parts
 
 
-def starts_of_steps(exposures: Exposures) -> Float[np.ndarray, " s"]:
-    """Hours at which something may have changed: midway between exposures."""
-    hours = np.unique(hours_of(exposures))
-    return (hours[1:] + hours[:-1]) / 2.0
-
-
-def evenly(times: Float[np.ndarray, " s"]) -> Float[np.ndarray, " t"]:
-    """`STEPS` or fewer of them that part the others evenly; `retimed` has those between."""
-    at = np.unique(((np.arange(STEPS) + 0.5) / STEPS * len(times)).astype(int))
-    return times[at[: len(times)]]
-
-
-def between(start: float, stop: float) -> str:
-    """The factor that is 1 from one time to another (hours; to 0.4 s)."""
-    return f"hours {round(float(start), 4)} to {round(float(stop), 4)}"
-
-
-def end_of(exposures: Exposures) -> float:
-    """Hours at which a step ends: `AFTER` the last exposure."""
-    return float(hours_of(exposures).max()) + AFTER
-
-
 def retimed(sentence: Sentence, exposures: Exposures, end: int) -> list[Sentence]:
     """The same with another start (`end` 0) or stop (1), at every time as near as others that are looked at first.
 
@@ -139,105 +113,17 @@ def retimed(sentence: Sentence, exposures: Exposures, end: int) -> list[Sentence
 # -------------------------------------------------------------------------------------------------- the grammar
 
 
-@dataclasses.dataclass(frozen=True)
-class _Asked:
-    """Factors that the exposures can tell apart."""
-
-    exposures: Exposures
-    over_field: bool
-    colours: bool
-    hours: bool
-    kelvin: bool
-
-    @classmethod
-    def of(cls, exposures: Exposures, points: int) -> _Asked:
-        """Look for several filters, times and temperatures, and points enough for a pattern."""
-
-        def varies(values: np.ndarray) -> bool:
-            return bool(
-                np.isfinite(values).all() and np.ptp(values) > 1e-9 * max(1.0, float(np.abs(values).max()))
-            )
-
-        return cls(
-            exposures,
-            points >= FEWEST_POINTS,
-            len(np.unique(exposures.filter)) > 1,
-            varies(exposures.mjd),
-            varies(exposures.temp),
-        )
-
-    def harmonics(self, prefix: str, orders: Sequence[int]) -> Iterator[tuple[str, str]]:
-        """Cosine and sine of the harmonics that the angles of a moving element can show."""
-        position = self.exposures.position(prefix)
-        angles = np.unique(np.round(np.mod(position.angle[position.inside], 360.0), 3))
-        for order in orders:
-            if len(angles) >= 2 * order + 1:
-                yield f"cos {order} {prefix}", f"sin {order} {prefix}"
-
-    def hour_angle(self) -> Iterator[str]:
-        """The hour angle, where it is not the time."""
-        angle, time = self.exposures.ha, self.exposures.mjd
-        left = angle - angle.mean()
-        if self.hours:
-            time = time - time.mean()
-            left = left - time * (time @ left) / (time @ time)
-        if np.isfinite(angle).all() and np.ptp(left) > 1e-3 * np.ptp(angle):
-            yield "hour angle"
-
-    def slow(self) -> Iterator[str]:
-        """Time and temperature."""
-        if self.hours:
-            yield "hours"
-        if self.kelvin:
-            yield "kelvin"
-
-    def moments(self, inside: Bool[np.ndarray, " e"] | None) -> Float[np.ndarray, " s"]:
-        """Times at which something may have changed, of an element that it may have while it was `inside` the beam."""
-        if not self.hours:
-            return np.zeros(0)
-        starts, hours = starts_of_steps(self.exposures), np.unique(hours_of(self.exposures)[inside])
-        return starts[np.unique(np.searchsorted(starts, hours[1:]) - 1)]  # ahead of each but the first
-
-    def steps(self, inside: Bool[np.ndarray, " e"] | None = None) -> Iterator[str]:
-        """From a time until the end; not so near to an end that all but one or two exposures are alike."""
-        yield from (between(time, end_of(self.exposures)) for time in evenly(self.moments(inside)[1:-1]))
-
-    def spells(self, inside: Bool[np.ndarray, " e"]) -> Iterator[str]:
-        """From a time until another: all of them, or of many exposures an eighth, a quarter or half of them."""
-        times = self.moments(inside)
-        some, lengths = evenly(times), (STEPS // 8, STEPS // 4, STEPS // 2)
-        each = itertools.chain(*(zip(some, some[length:], strict=False) for length in lengths))
-        yield from (between(*s) for s in (itertools.combinations(times, 2) if len(times) <= FEW else each))
-
-    def kinds(self) -> Iterator[str]:
-        """Kinds of exposures, but the most frequent."""
-        names, counts = np.unique(self.exposures.kind, return_counts=True)
-        yield from (f"kind {name}" for name in names[np.argsort(-counts, kind="stable")][1:])
-
-    def nights(self) -> Iterator[str]:
-        """Every night, where there are several."""
-        if not self.hours:
-            return
-        hours = np.sort(hours_of(self.exposures))
-        first = first_of_nights(hours / 24.0)
-        if len(first) < 2:
-            return
-        for start, stop in itertools.pairwise([*first, len(hours)]):
-            yield f"hours {max(hours[start] - 0.5, 0.0):.2f} to {hours[stop - 1] + 0.5:.2f}"
-
-
 def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterator[tuple[Sentence, ...]]:
-    asked = _Asked.of(exposures, points)
+    asked = Asked.of(exposures, points)
     yield from _of_polariser(instrument, asked)
     for where, place, fixed in places(instrument, exposures):
         for base in _families(where, place):
             yield from _over_field(base, asked)
             if not fixed:
                 continue
-            if asked.colours:
-                yield _times(base, "colour")
-            for factor in asked.slow():
+            for factor in (*(("colour",) if asked.colours else ()), *asked.slow()):
                 yield _times(base, factor)
+                yield from (_times(one, factor) for one in _grown(base, asked))
     for prefix, element in _turning(instrument, exposures).items():
         if element is instrument.polariser:
             continue
@@ -247,6 +133,7 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
         inside = exposures.position(prefix).inside
         for span in (*asked.steps(inside), *asked.spells(inside)):
             yield (Sentence("turn", "of", element.name, (span,)),)
+    yield from _ahead(instrument, asked)
     yield from _of_plates(instrument, exposures, asked)
     yield from _of_cameras(instrument, asked)
     yield from _of_field_and_band(instrument, asked)
@@ -271,7 +158,7 @@ def _families(where: str, place: str) -> Iterator[tuple[Sentence, ...]]:
         yield (Sentence(kind, where, place),)
 
 
-def _over_field(base: tuple[Sentence, ...], asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+def _over_field(base: tuple[Sentence, ...], asked: Asked) -> Iterator[tuple[Sentence, ...]]:
     yield base
     if not asked.over_field:
         return
@@ -285,7 +172,28 @@ def _over_field(base: tuple[Sentence, ...], asked: _Asked) -> Iterator[tuple[Sen
         yield (dataclasses.replace(base[0], kind=f"{kind} {axis}"),)
 
 
-def _of_polariser(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+def _grown(base: tuple[Sentence, ...], asked: Asked) -> Iterator[tuple[Sentence, ...]]:
+    """The patterns of the field that stress and temperature make: with the radius, radial, diagonal."""
+    if asked.over_field:
+        yield from itertools.islice(_over_field(base, asked), 2, None)
+
+
+def _ahead(instrument: Instrument, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
+    """Changes of light from the sky that differ between exposures: telescopes turn, warm up and gather dust."""
+    polariser, exposures = instrument.polariser, asked.exposures
+    if polariser is None or exposures.clp_in.all():
+        return
+    added = tuple(Sentence(f"added polarisation {axis}", "ahead of", polariser.name) for axis in "qu")
+    if asked.over_field:
+        yield _times(added, "x", "y")
+        yield _times(added, "r2")
+    for factor in (*asked.slow(), *asked.hour_angle(), *asked.single()):
+        yield _times(added, factor)
+        for base in _families("ahead of", polariser.name):
+            yield _times(base, factor)
+
+
+def _of_polariser(instrument: Instrument, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
     polariser = instrument.polariser
     if polariser is None or polariser.moves is None or not asked.exposures.clp_in.any():
         return
@@ -295,7 +203,7 @@ def _of_polariser(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sente
         orders = HARMONICS_OF_ENCODER if base is turn else HARMONICS
         for pair in asked.harmonics(polariser.moves, orders):
             yield _times(base, *pair)
-        for factor in asked.slow():
+        for factor in (*asked.slow(), *asked.single(), *asked.sides(polariser.moves)):
             yield _times(base, factor)
     for pair in asked.harmonics(polariser.moves, (1,)) if asked.over_field else ():
         yield _times(_times(turn, *pair), "x", "y")  # a beam that wanders over a film that is not uniform
@@ -330,7 +238,7 @@ def places(instrument: Instrument, exposures: Exposures) -> Iterator[tuple[str, 
                 yield "behind", f"{arm.name}.{element.name}", True
 
 
-def _of_plates(instrument: Instrument, exposures: Exposures, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+def _of_plates(instrument: Instrument, exposures: Exposures, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
     warm = []
     for place in instrument.places(WavePlate):
         arm, _, name = place.rpartition(".")
@@ -363,7 +271,7 @@ def _fringes_ahead(plates: Sequence[str], units: Units) -> Iterator[tuple[Senten
             yield tuple(itertools.chain(*pairs))
 
 
-def _of_field_and_band(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+def _of_field_and_band(instrument: Instrument, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
     yield (Sentence("shift", "of", BAND),)
     for element in instrument.train() if asked.over_field else ():
         if isinstance(element, PupilMapping):
@@ -373,7 +281,7 @@ def _of_field_and_band(instrument: Instrument, asked: _Asked) -> Iterator[tuple[
                 yield _times(moved, factor)
 
 
-def _of_sources(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+def _of_sources(instrument: Instrument, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
     own = tuple(Sentence(kind, "of", SKY) for kind in OF_SOURCES)
     moon = np.flatnonzero(asked.exposures.direct("moon"))
     if moon.size:
@@ -387,7 +295,7 @@ def _of_sources(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
         yield tuple(Sentence(kind, "of", name.replace(" ", "_")) for kind in OF_SOURCES[:2])
 
 
-def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+def _together(instrument: Instrument, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
     """The same kind at the same place of every arm, or in every camera, each with its own amplitude."""
     arms, names = instrument.arms, instrument.cameras.names
     if len(arms) > 1 and len({arm.path for arm in arms}) == 1:
@@ -413,7 +321,7 @@ def _together(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence,
     yield tuple(Sentence("light", "in", name, origin=names[j]) for name, j in pairs if names[j] != name)
 
 
-def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentence, ...]]:
+def _of_cameras(instrument: Instrument, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
     cameras, e = instrument.cameras.names, asked.exposures
     for camera in cameras:
         gain = (Sentence("gain", "of", camera),)
@@ -423,7 +331,7 @@ def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
                 yield _times(gain, *pair)
             for pair in asked.harmonics(prefix, (1,)) if asked.over_field else ():
                 yield _times(_times(gain, *pair), "x", "y")  # an image that goes in a circle
-        for factor in (*asked.slow(), *asked.nights(), *asked.steps()):
+        for factor in (*asked.slow(), *asked.single(), *asked.nights(), *asked.steps()):
             yield _times(gain, factor)
         if asked.over_field and len(e) <= limits.FREE_EXPOSURES:
             for number in range(len(e)):
@@ -431,7 +339,7 @@ def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
         for kind in asked.kinds():
             yield _times(gain, kind)
         if asked.over_field:
-            for factor in (*asked.slow(), *asked.kinds()):
+            for factor in (*asked.slow(), *asked.single(), *asked.kinds()):
                 yield _times(_times(gain, factor), "x", "y")
             for factor in asked.slow():
                 yield (*_times(gain, factor), *_times(_times(gain, factor), "r2"))  # a focus that drifts
@@ -448,10 +356,11 @@ def _of_cameras(instrument: Instrument, asked: _Asked) -> Iterator[tuple[Sentenc
                 yield (Sentence("light", "in", camera, origin=other),)
     for arm in instrument.arms if len(instrument.arms) > 1 else ():
         gain = (Sentence("gain", "of", arm.name),)
-        for factor in (*asked.slow(), *asked.nights()):
+        for factor in (*asked.slow(), *asked.single(), *asked.nights()):
             yield _times(gain, factor)
         if asked.over_field:
             yield _times(gain, *(f"ring {n}" for n in RINGS))
             both = tuple(Sentence("gain", "of", name) for name in arm.analyser.cameras)
-            for kind in asked.kinds():
-                yield _times(_times(both, kind), "x", "y")
+            for factor in (*asked.kinds(), *asked.single()):
+                yield _times(_times(both, factor), "x", "y")
+                yield _times(_times((Sentence("gain", "of", arm.name),), factor), "x", "y")

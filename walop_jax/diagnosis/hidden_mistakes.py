@@ -69,7 +69,7 @@ def hidden_mistakes(design: Design, singles: Singles, policy: Policy = POLICY) -
     size does little to stars, which see what the polariser sees: it stays if it does half of what the worst does.
     """
     fit = design.fit
-    usual = _usual(fit.calset, fit.model.template)
+    usual = usual_exposure(fit.calset, fit.model.template)
     instrument = fit.model.instrument(fit.values)
     found = list(_mistakes(design, singles, usual, policy))
     along = np.array([one.along for one in found]).reshape(len(found), -1).T
@@ -168,7 +168,7 @@ class _Starlight:
         for number, (parameter, effect) in enumerate(_at_sizes(probe, sizes)):
             if probe.name in self.added:
                 added = self.added[probe.name][..., number] * sizes[number]
-                change = _of_matrix(self.vectors, added, pairs)
+                change = of_matrix(self.vectors, added, pairs)
             else:  # of a user's own: it has no slots
                 at = self.setting, fit.calset.filters, points.x, points.y
                 added = change = change_by_effect(self.instrument, effect, *at)
@@ -178,7 +178,7 @@ class _Starlight:
             yield _Mistake(*number_of, along[:, number], bool(alive[number]), effect, change, acts)
 
 
-def _of_matrix(
+def of_matrix(
     vectors: Float[np.ndarray, "p k 3"],
     added: Float[np.ndarray, "p k 3"],
     pairs: Sequence[tuple[int, int]],
@@ -202,7 +202,7 @@ def _at_sizes(probe: Probe, sizes: Float[np.ndarray, " a"]) -> Iterator[tuple[st
                 yield name, member.replaced(**{name: jnp.asarray(value)})
 
 
-def _usual(calset: CalibrationSet, instrument: Instrument) -> int:
+def usual_exposure(calset: CalibrationSet, instrument: Instrument) -> int:
     """The exposure in the most usual setting: the first of those with fewest moving elements in the beam."""
     inside = [calset.exposures.position(prefix).inside for prefix in instrument.patched().moving()]
     return int(np.argmin(np.sum(inside, axis=0))) if inside else 0

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.diagnosis.dependences import FEWEST_POINTS
 from walop_jax.diagnosis.score import Candidate, Score
 from walop_jax.likelihood.columns import Change, Columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
@@ -25,7 +26,6 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import CONDITIONS
 
 DEFAULT_WIDTH = 1.0
-FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median
 
 Vector = Float[np.ndarray, " _"]
 

@@ -66,6 +66,10 @@ class Policy:
     """Standard errors by which a sentence must predict unseen settings better, by its linear step, to be fitted."""
     useful: float = 2.0
     """Standard errors by which a term without a name must predict unseen settings better to stay in the model."""
+    contradicted: float = 3.0
+    """Loss in ln p of the exposures of one KIND, as those of others predict them, above which nothing is adopted."""
+    held_out_worse: float = 0.01
+    """Share by which exposures that were left out may be predicted worse after a diagnosis than before."""
     most_patterns: int = 8
     most_classes: int = 8
     negligible: float = 1e-4

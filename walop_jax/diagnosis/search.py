@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from walop_jax.calibration.accuracy import largest_change
 from walop_jax.calibration.matrix import instrument_matrices
@@ -33,6 +33,8 @@ from walop_jax.diagnosis.policy import Policy
 from walop_jax.diagnosis.score import Candidate
 from walop_jax.fit.robust import field_cells, states
 from walop_jax.model.effects import Described
+
+LaidOut = tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, " _"], int, float]
 
 # ------------------------------------------------------------------------------- what an effect does, by two fits
 
@@ -111,10 +113,37 @@ def predicts_unseen(
     return True
 
 
+def gains_by_kind(before: Design, after: Design) -> dict[str, float]:
+    """Gain in ln p of the exposures of each KIND, as all others predict them, by what one design has beyond another.
+
+    Polariser, Moon and standards see one instrument: what is true makes none of them less probable given the others.
+    The gains of a KIND and of all others by themselves add up to the evidence.
+    """
+    kinds = before.fit.calset.exposures.kind[before.exposure]
+    names = np.unique(kinds)
+    if len(names) < 2:
+        return {}
+    one, other = ((d.jacobian, d.residual, d.projector.free, d.fit.noise_scale) for d in (before, after))
+    return dict(zip(map(str, names), gains_of_units(kinds, one, other).tolist(), strict=True))
+
+
+def gains_of_units(unit: np.ndarray, before: LaidOut, after: LaidOut) -> Float[np.ndarray, " u"]:
+    """Gain in ln p of each unit of the data rows, as all others predict it, of one model over another.
+
+    Of each model the Jacobian, the residuals at its minimum, priors last, its degrees of freedom, and the factor on the
+    errors in whose units the data rows are.
+    """
+    count, found = np.unique(unit, return_counts=True)[1], []
+    for rows, residual, free, noise in (before, after):
+        density = _predictions(rows, residual, unit, free)[:, 0]
+        found.append(density - count * free / len(unit) * np.log(noise))
+    return found[1] - found[0]
+
+
 def _predictions(
     rows: Float[np.ndarray, "r n"],
     residual: Float[np.ndarray, " r"],
-    unit: Int[np.ndarray, " d"],
+    unit: np.ndarray,
     free: int,
 ) -> Float[np.ndarray, "u 2"]:
     """ln p of the data rows of each unit as all the others predict them, and the square of how far they are off.

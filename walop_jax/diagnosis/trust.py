@@ -14,6 +14,7 @@ Components  the variance of what field points, exposures, states, standards, nig
             model, finer than any pattern (`variance_components`).
 Conditions  the efficient score of every number that the set states of itself: field, filters, colours, sky; of every
             prior, term of a camera and effect of the catalogue (`stated_conditions`).
+Descriptions  the efficient score of all that a diagnosis could say is missing (`sentence_scores`).
 Repeats     the correlation of what is left of two exposures (`repeated_noise`).
 Errors      χ²/dof far below 1: N_ERR is overestimated. A few per cent are attributed to the stated errors,
             not to the model.
@@ -41,6 +42,7 @@ from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.readings import refuse_dead_cameras, refuse_mixups
 from walop_jax.diagnosis.repeated_noise import repeated_noise
 from walop_jax.diagnosis.score import Projector, ScoreTable, local_p
+from walop_jax.diagnosis.sentence_scores import described_doubts
 from walop_jax.diagnosis.stated_conditions import Singles, stated_conditions
 from walop_jax.diagnosis.variance_components import (
     VarianceComponent,
@@ -106,6 +108,7 @@ def examined(
         doubts = (
             *stated_conditions(design, singles, policy),
             *_patterns(table, policy),
+            *described_doubts(design, policy),
             *in_words(components),
             *_groups(design, policy),
             *repeated_noise(design, policy),

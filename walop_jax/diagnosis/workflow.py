@@ -25,8 +25,10 @@ from walop_jax.calibration.accuracy import largest_change
 from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis.class_members import classes_of
+from walop_jax.diagnosis.class_product import only_a_class
 from walop_jax.diagnosis.descriptions import other_descriptions
-from walop_jax.diagnosis.design import Design, strata
+from walop_jax.diagnosis.design import Design, held_out, strata
 from walop_jax.diagnosis.exact import (
     Trial,
     beyond_prior,
@@ -47,6 +49,7 @@ from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.readings import mixups_of, refusal
 from walop_jax.diagnosis.search import (
     before_and_after,
+    gains_by_kind,
     names_first,
     predicts_unseen,
     refitted_in_order,
@@ -57,6 +60,7 @@ from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.stand_in import in_field_points
+from walop_jax.fit.verdict import Quality
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.columns import columns
@@ -122,6 +126,10 @@ def diagnose(
     steps = tuple(judge.finished(step, last) for step in judge.steps)
     verdict: Outcome = "unexplained" if nameless else "effect_found" if steps else "consistent"
     tell("examining what is left")
+    names = {step.effect for step in steps}
+    alike = {name for step in steps for name in (*step.equivalent, *step.nameless)} - {Described.name}
+    examined_last = last.result is judge.fit
+    members = classes_of(last, judge.context, names, judge.said, alike) if examined_last else ()
     found = Diagnosis(
         verdict=verdict,
         steps=steps,
@@ -141,6 +149,7 @@ def diagnose(
         classes=tuple(first.classes()),
         policy=policy,
         ended=judge.ended,
+        members=members,
     )
     del first, last  # the columns of all candidates, gigabytes of a large set
     return _examined(found, seed)
@@ -157,6 +166,8 @@ def _left(first: Examination, judge: Refit, policy: Policy) -> Examination:
 def _examined(found: Diagnosis, seed: int) -> Diagnosis:
     """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked."""
     after = examined(with_honest_errors(found.after), seed, as_written=True, policy=found.policy)
+    for sentence in only_a_class(found.members):
+        after = after.doubted(Quality.CLASS_ONLY, sentence)
     if found.before is found.after:
         return dataclasses.replace(found, before=after, after=after)
     for sentence in rival_conditions(Design.of(found.before), found.after.chi2, found.policy):
@@ -179,8 +190,8 @@ class Refit:
     """The judge that fits: the current fit of a diagnosis, and the steps so far.
 
     `wanted` are the probes of `catalogue`, `sentences` and `parts` what else can be said (`grammar`). `choices` are
-    other descriptions that were tried, `said` the groups of sentences that were added. `ended` says that there was no
-    time for something.
+    other descriptions that were tried, `said` the groups of sentences that were added, `contradicted` what exposures of
+    another KIND speak against, in words. `ended` says that there was no time for something.
     """
 
     calset: CalibrationSet
@@ -197,6 +208,7 @@ class Refit:
     steps: list[Step] = dataclasses.field(default_factory=list)
     choices: dict[str, Choice] = dataclasses.field(default_factory=dict)
     said: list[str] = dataclasses.field(default_factory=list)
+    contradicted: dict[str, str] = dataclasses.field(default_factory=dict)
     ended: bool = False
     _compared: dict[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -306,10 +318,23 @@ class Refit:
         return [*sorted(clearly, key=lambda trial: names_first(trial, self.policy)), *others]
 
     def confirmed(self, state: Examination, trial: Trial) -> bool:
-        """True if data that took no part in the fit agree better with the effect than without."""
+        """True if data that took no part in the fit agree better with the effect than without, and no KIND worse."""
         assert trial.fit is not None
-        self._compared = before_and_after(trial.effect.name, state.design, Design.of(trial.fit))
-        return self._compared["heldout_after"] < self._compared["heldout_before"]
+        after = Design.of(trial.fit)
+        self._compared = before_and_after(trial.effect.name, state.design, after)
+        if self._compared["heldout_after"] >= self._compared["heldout_before"]:
+            return False
+        worse = self._contradicted(state.design, after)
+        if worse:
+            name = trial.effect.name if trial.effect is not Described else "; ".join(trial.sentences)
+            self.contradicted[name] = f"{name} (exposures of {worse} speak against it)"
+            self.tell(f"{name}: exposures of {worse} speak against it")
+        return not worse
+
+    def _contradicted(self, before: Design, after: Design) -> str:
+        """KINDS of exposures that all others predict worse with what a fit has more; empty: none."""
+        gains = gains_by_kind(before, after)
+        return ", ".join(f"KIND {kind}" for kind, gain in gains.items() if gain < -self.policy.contradicted)
 
     def adopted(self, state: Examination, trial: Trial) -> Examination:
         """Go on with the model of a trial, everything fitted again where priors or errors were in its way."""
@@ -363,6 +388,11 @@ class Refit:
     def conclusion(self, first: Examination, last: Examination) -> tuple[Examination, Unexplained | None]:
         """Drop what is not needed, then ask what has no name: the examination of the final model, and that."""
         state, nameless = self._concluded(first, last)
+        if self.steps and (worse := self._worse(first, state)):
+            return self._not_adopted(first, worse)
+        if nameless is not None and self.contradicted:
+            told = tuple(text for name, text in self.contradicted.items() if name not in self.said)
+            nameless = dataclasses.replace(nameless, parts=(*nameless.parts, *told))
         if nameless is not None or len(self.said) <= self.policy.most_sentences:
             return state, nameless
         # Something that no sentence holds looks like several that are there.
@@ -375,6 +405,24 @@ class Refit:
         state = self.examined(first)
         self.steps = refitted_in_order(self.steps, first.design, state.design)
         return state, _and(dataclasses.replace(nameless, p_value=state.table.p_global), _LEFT_OUT)
+
+    def _worse(self, first: Examination, last: Examination) -> str:
+        """Exposures that the final model predicts worse than the first, in words; empty: none."""
+        if kinds := self._contradicted(first.design, last.design):
+            return f"exposures of {kinds}, as all others predict them"
+        before, after = (held_out(one.design, "exposures") for one in (first, last))
+        if after > (1.0 + self.policy.held_out_worse) * before:
+            return f"exposures that are left out (mean squared residual {before:.3g} → {after:.3g})"
+        return ""
+
+    def _not_adopted(self, first: Examination, worse: str) -> tuple[Examination, Unexplained]:
+        """Go back to the first model: what was found is told as parts."""
+        steps, self.steps, self.fit = self.steps, [], first.result
+        parts = tuple(f"{step.effect} (χ² {step.chi2_before:.4g} → {step.chi2_after:.4g})" for step in steps)
+        text = f"with what was found the model predicts worse {worse}, so nothing was adopted: {'; '.join(parts)}"
+        self.said.clear()
+        found = _and(unexplained(first, tuple(first.patterns_needed())), text)
+        return first, dataclasses.replace(found, parts=(*parts, *self.contradicted.values()))
 
     def _concluded(self, first: Examination, state: Examination) -> tuple[Examination, Unexplained | None]:
         dropped, parts = self._drop_what_is_not_needed(), ()

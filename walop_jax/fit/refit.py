@@ -170,8 +170,12 @@ class FitResult(Fitted):
 
     def remarked(self, sentence: str) -> FitResult:
         """The fit with a remark in its verdict, which forbids nothing."""
+        return self.doubted(Quality(0), sentence)
+
+    def doubted(self, bit: Quality, sentence: str) -> FitResult:
+        """The fit with one more thing against it, which forbids trust unless it has no bit."""
         verdict = self.checked_verdict()
-        against = (*verdict.against, Doubt(Quality(0), sentence, blocking=False))
+        against = (*verdict.against, Doubt(bit, sentence, blocking=bool(bit)))
         return dataclasses.replace(self, verdict=dataclasses.replace(verdict, against=against))
 
     def checked_verdict(self) -> Verdict:

@@ -173,10 +173,11 @@ def left_behind(instrument: Instrument) -> tuple[str, ...]:
     bare = dataclasses.replace(instrument, effects=())
     names = []
     for effect in instrument.effects:
-        cameras = effect.patch(bare).cameras
+        there = effect.patch(bare)
+        cameras = there.cameras
         kept = all(is_undone(part, len(cameras)) for part in cameras.detectors)
         unknown = conditions_of_effect(bare, effect) - KNOWN
-        if cameras.ghosts or cameras.exposures or not kept or unknown:
+        if cameras.ghosts or cameras.exposures or there.sky_films or not kept or unknown:
             names.append(effect.name)
     return tuple(names)
 

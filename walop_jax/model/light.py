@@ -267,6 +267,8 @@ def stokes(instrument: Instrument, sight: Sight) -> Float[Array, "e 4"]:
     light = jnp.stack([one, qu[:, 0], qu[:, 1], zero], axis=-1)
     if instrument.telescope():
         light = jnp.where(indoors(instrument, sight)[:, None], light, light @ telescope(instrument, x, y).T)
+    for film in instrument.sky_films:
+        light = jnp.where(indoors(instrument, sight)[:, None], light, film.through(light, exposures, x, y))
     polariser = instrument.polariser
     if polariser is None:
         return light

@@ -71,6 +71,7 @@ def exposure_arrays(
         hours=array(hours_of(exposures)),
         temperature=array(exposures.temp),
         hour_angle=array(np.nan_to_num(exposures.ha)),
+        exptime=array(exposures.exptime),
         moving={  # NaN where they are out
             prefix: array(np.deg2rad(np.where(at.inside, at.angle, np.nan)))
             for prefix, at in exposures.positions.items()
@@ -85,7 +86,7 @@ def blank_exposures(instrument: Instrument, count: int) -> ExposureArrays:
     zero, off = array(np.zeros(count)), array(np.zeros(count, bool))
     return ExposureArrays(
         kind=array(np.zeros(count, int)), clp_in=off, clp_angle=zero, flux_known=off, rotator=zero, hours=zero,
-        temperature=zero, hour_angle=zero, moving=dict.fromkeys(instrument.patched().moving(), zero),
+        temperature=zero, hour_angle=zero, exptime=zero, moving=dict.fromkeys(instrument.patched().moving(), zero),
         kinds=instrument.kinds,
     )  # fmt: skip
 

@@ -33,7 +33,7 @@ class ExposureArrays(eqx.Module):
     `kind` counts the kinds of `kinds`. Angles in radians; `clp_angle` is 0 when the polariser is out, `rotator` where
     it has no meaning; `shared` is 1 where an exposure belongs to a group that has its fluxes in common, None: no
     exposures have. `moving` holds angles of elements that move behind the polariser (NaN: out). `hours` since the first
-    exposure, temperature in Celsius, hour angle in h.
+    exposure, temperature in Celsius, hour angle in h, exposure time in s.
     """
 
     kind: Int[Array, " e"]
@@ -44,6 +44,7 @@ class ExposureArrays(eqx.Module):
     hours: Float[Array, " e"]
     temperature: Float[Array, " e"]
     hour_angle: Float[Array, " e"]
+    exptime: Float[Array, " e"]
     median_counts: Float[Array, "e k"] | None = None
     shared: Float[Array, "e s"] | None = None
     moving: Mapping[str, Float[Array, " e"]] = dataclasses.field(default_factory=dict)

@@ -3,7 +3,9 @@
 import dataclasses
 import itertools
 import json
+from types import SimpleNamespace
 
+import builders
 import effect_scenes as scenes
 import jax
 import jax.numpy as jnp
@@ -12,15 +14,18 @@ import pytest
 from scipy.linalg import expm, expm_frechet
 
 from walop_jax.fit.model_file import model_without_data, render
-from walop_jax.model import mueller
+from walop_jax.model import light, mueller
 from walop_jax.model.compiled import compiled
+from walop_jax.model.conventions import OF_WALOP
 from walop_jax.model.dependence import left_behind
 from walop_jax.model.effects import Change, Described, effect_by_name
 from walop_jax.model.effects.change import AMPLITUDES, KINDS
-from walop_jax.model.effects.factors import PLAIN
+from walop_jax.model.effects.factors import PLAIN, factor
 from walop_jax.model.effects.optics import AXES
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import NAME
+from walop_jax.model.plan import exposure_arrays
+from walop_jax.model.sources import Sight
 
 OPTICAL = (*(f"{kind} {axis}" for kind in ("retardance", "diattenuation") for axis in AXES), "depolarisation")
 
@@ -363,8 +368,8 @@ def test_sentences_are_read_as_they_are_written():
 
 def test_every_kind_with_every_factor_is_a_parameter_name():
     plain = (*PLAIN, "ring 3", "cos 2 CLP", "sin 1 CHWP", "hours -0.5 to 20.5", "exposure 12", "gap 10.0775")
-    for kind, factor in itertools.product(KINDS, plain):
-        description = Change(kind, "behind", "half1.plate", (factor, "x"), "O1")
+    for kind, one in itertools.product(KINDS, plain):
+        description = Change(kind, "behind", "half1.plate", (one, "x"), "O1")
         assert Change.parsed(description.text) == description
         assert NAME.fullmatch(f"described.{description.label}")
 
@@ -382,3 +387,42 @@ def test_a_model_file_carries_sentences():
     assert again.names == moved.names
     assert again[name].start == 0.02
     assert again.template.effect("described").sentences == tuple(said)
+
+
+def test_factors_of_single_exposures_by_hand():
+    """Exposure times, the order, and the side from which an element came, in the order of time."""
+    at = SimpleNamespace(
+        exptime=np.array([3.0, 10.0, 0.0]),
+        number=np.arange(3),
+        hours=np.array([0.0, 2.0, 1.0]),
+        angle=lambda prefix: np.deg2rad([350.0, 10.0, 20.0]),
+    )
+    np.testing.assert_allclose(factor("per EXPTIME").value(at, OF_WALOP), [1 / 3, 0.1, 0.0])
+    np.testing.assert_allclose(factor("order").value(at, OF_WALOP), [0, 1, 2])
+    # 350° → 20° upward through 0, then 20° → 10° downward.
+    np.testing.assert_allclose(factor("side CLP").value(at, OF_WALOP), [0, -1, 1])
+
+
+def test_polarisation_that_a_telescope_adds_grows_with_time_in_light_from_the_sky_alone():
+    """(0, a h, 0, 0) per unit of light of the Moon after h hours; light through the polariser and stars have none."""
+    bare = nominal_instrument("WALOP-SOUTH")
+    said = Described.saying(["added polarisation q ahead of polariser * hours"], [1e-3])
+    exposures = exposure_arrays(
+        builders.exposures(
+            {"kind": "moon", "mjd": 61000.0},
+            {"kind": "moon", "mjd": 61000.0 + 2 / 24},
+            {"clp_angle": 30.0, "mjd": 61000.0 + 3 / 24},
+        ),
+        bare.kinds,
+        (),
+    )
+    sight = Sight(exposures, np.zeros((3, 2)), np.full(3, -1), np.asarray(0.1), np.asarray(0.0))
+    with_it, without = (
+        np.asarray(light.stokes(dataclasses.replace(bare, effects=effects), sight))
+        for effects in ((said,), ())
+    )
+    np.testing.assert_allclose(with_it - without, [[0] * 4, [0, 2e-3, 0, 0], [0] * 4], atol=1e-15)
+    there = dataclasses.replace(bare, effects=(said,))
+    zero = np.asarray(0.0)
+    np.testing.assert_array_equal(light.telescope(there, zero, zero), light.telescope(bare, zero, zero))
+    assert left_behind(there) == ("described",)

@@ -38,6 +38,13 @@ Term = tuple["Change", Scalar]
 Given = str | Callable[[Any], Any]
 """A factor: a text, or a function of the quantities that factors may ask for."""
 OPPOSITE = "opposite"  # the field point, as an origin of light
+SINGLE = (
+    "exposure",
+    "kind",
+    "side",
+    "order",
+    "per EXPTIME",
+)  # forms of factors that ask for the list of exposures
 SKY, BAND = "sky", "band"  # places that are no element
 
 
@@ -161,8 +168,8 @@ class Change:
     def of_stars(self) -> bool:
         """True if what it does to a star is known from the counts and the place of the star alone."""
         elsewhere = self.kind == "afterglow" or (self.kind == "light" and self.origin in ("", OPPOSITE))
-        return not elsewhere and all(
-            one.text.split()[0] not in ("hours", "exposure", "kind") for one in self.grows_with
+        return not elsewhere and not any(
+            one.text == "hours" or one.form in ("hours", *SINGLE) for one in self.grows_with
         )
 
     def times(self, *factors: str) -> Change:
@@ -201,7 +208,7 @@ class Change:
             if one.form == "kind":
                 check_names("KIND of exposures", one.given, instrument.kinds)
             known = angle is None or (one.form in ("cos", "sin") and one.given[-1] == angle)
-            single = one.form in ("cos", "sin", "exposure", "kind")
+            single = one.form in ("cos", "sin", *SINGLE)
             if one.depends_on not in allowed or (single and not known):
                 takes = ", ".join(allowed) or "nothing"
                 only = f"; of angles that of {angle} alone" if angle else ""

@@ -5,9 +5,9 @@ its own) and what it `depends_on`: FIELD, WAVELENGTH, EXPOSURE, COUNTS, or SHAPE
 one reader of their texts.
 
 A value is asked for with something that has x, y (deg), wavelength (µm), hours since the first exposure, hour_angle
-(h), temperature (Celsius), the number of the exposure in its list, `of_kind(name)`, true for exposures of a KIND, and
-`angle(prefix)` (rad) of the polariser or another moving element, NaN where that is out of the beam; all are scalars, or
-arrays that broadcast. With it come the scales of field and wavelength of the instrument.
+(h), temperature (Celsius), exposure time (s), the number of the exposure in its list, `of_kind(name)`, true for
+exposures of a KIND, and `angle(prefix)` (rad) of the polariser or another moving element, NaN where that is out of the
+beam; all are scalars, or arrays that broadcast. With it come the scales of field and wavelength of the instrument.
 """
 
 from __future__ import annotations
@@ -107,6 +107,24 @@ def _kind(name: str) -> Factor:
     )
 
 
+def _side(prefix: str) -> Factor:
+    """1 where a moving element came from smaller angles, −1 where from larger ones, 0 where it did not move."""
+
+    def value(at: Any, _: Units) -> Any:
+        angle = at.angle(prefix)
+        xp: Any = np if isinstance(angle, np.ndarray) else jnp
+        hours = xp.broadcast_to(at.hours, angle.shape)
+        order = xp.argsort(hours, axis=-1)
+        turned = xp.diff(xp.take_along_axis(angle, order, axis=-1), axis=-1)
+        side = xp.sign(xp.sin(xp.where(xp.abs(turned) > 1e-9, turned, 0.0)))
+        first = xp.zeros_like(angle[..., :1])
+        return xp.take_along_axis(xp.concatenate([first, side], axis=-1), xp.argsort(order, axis=-1), axis=-1)
+
+    words = f"with the side from which {prefix} came (1: from smaller angles)"
+    test = "each angle once more, reached from the other side"
+    return Factor(f"side {prefix}", EXPOSURE, words, test, value, "side", (prefix,))
+
+
 def _gap(thickness: str) -> Factor:
     """Thickness (µm) of the air whose fringes a change is: 1, the fringes themselves know it."""
     words = f"of {thickness} µm of air (amplitude at a maximum)"
@@ -119,6 +137,7 @@ FORMS: Mapping[str, tuple[str, Callable[..., Factor]]] = {
     "hours A to B": (rf"hours {NUMBER} to {NUMBER}", _span),
     "exposure N": (r"exposure (\d+)", _exposure),
     "kind KIND": (r"kind (\S+)", _kind),
+    "side PREFIX": (r"side (\S+)", _side),
     "gap N": (rf"gap (?!-){NUMBER}", _gap),
 }
 """Factors with numbers or names in them, as messages name them: how they are typed, and what makes one."""
@@ -158,6 +177,18 @@ def _plain() -> Mapping[str, Factor]:
         Factor(
             "kelvin", EXPOSURE, "growing with temperature (per kelvin above 10 °C)",
             "the same exposures at another temperature", lambda at, _: at.temperature - REFERENCE_TEMPERATURE,
+        ),
+        Factor(
+            "per EXPTIME", EXPOSURE, "falling with the exposure time (per 1/s)",
+            "the same exposures with other exposure times",
+            lambda at, _: 1.0 / np.where(at.exptime > 0, at.exptime, np.inf)
+            if isinstance(at.exptime, np.ndarray)
+            else 1.0 / jnp.where(at.exptime > 0, at.exptime, jnp.inf),
+            "per EXPTIME",
+        ),
+        Factor(
+            "order", EXPOSURE, "growing from exposure to exposure of the list", ONCE_MORE,
+            lambda at, _: 1.0 * at.number, "order",
         ),
         Factor(
             # The detector multiplies with its own counts.

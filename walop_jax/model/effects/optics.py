@@ -129,6 +129,26 @@ class Inside:
         return np.isfinite(at.angle(self.prefix)) * 1.0
 
 
+class SkyFilm(PolariserFilm):
+    """Changes of light from the sky ahead of the polariser that differ from exposure to exposure."""
+
+    def through(
+        self, light: Float[Array, "e 4"], exposures: ExposureArrays, x: Scalar, y: Scalar
+    ) -> Float[Array, "e 4"]:
+        """Stokes vectors of light from the sky at a field point, one per exposure."""
+        sizes = [
+            (change, size * in_exposures(change, exposures, x, y))
+            for change, size in zip(self.changes, self.amplitudes, strict=True)
+        ]
+        acting = [(change, size) for change, size in sizes if change.kind not in ADDED]
+        if acting:
+            light = jnp.einsum("est,et->es", matrix_of(acting, x, y), light)
+        for change, size in sizes:
+            if change.kind in ADDED:
+                light = light.at[:, 1 + "qu".index(change.kind[-1])].add(size * light[:, 0])
+        return light
+
+
 class Displaced(Element):
     """A change of where the optics behind see the field point."""
 
@@ -171,17 +191,33 @@ def _beside(instrument: Instrument, element: Element, change: Change) -> Instrum
 
 def _grows(instrument: Instrument, change: Change) -> Grows:
     """Optics with what a ray knows, and with the angle of the element that they are of; the polariser by exposure."""
+    polariser = instrument.polariser
+    if _is_ahead(instrument, change):
+        return Grows((FIELD, EXPOSURE), None)
     if change.where != "of":
         return Grows((FIELD, WAVELENGTH, EXPOSURE))
-    polariser = instrument.polariser
     if polariser is not None and change.place == polariser.name:
         return Grows((FIELD, EXPOSURE), None)
     return Grows((FIELD, WAVELENGTH, EXPOSURE), instrument.element(change.place).moves or "")
 
 
+def _is_ahead(instrument: Instrument, change: Change) -> bool:
+    """True for what acts on light from the sky alone, ahead of the polariser."""
+    polariser = instrument.polariser
+    return polariser is not None and change.where == "ahead of" and change.place == polariser.name
+
+
+def _differs(instrument: Instrument, terms: Sequence[Term]) -> bool:
+    """True for changes ahead of the polariser that differ from exposure to exposure."""
+    with_exposure = any(one.depends_on == EXPOSURE for change, _ in terms for one in change.grows_with)
+    return with_exposure and _is_ahead(instrument, terms[0][0])
+
+
 def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """One more element at the place; of an element that moves, or of the polariser: in the beam only when it is."""
     change, polariser = terms[0][0], instrument.polariser
+    if _differs(instrument, terms):
+        return instrument.changed("", sky_films=lambda films: (*films, SkyFilm(**_columns(terms))))
     if change.where == "of" and polariser is not None and change.place == polariser.name:
         film = PolariserFilm(**_columns(terms))
         return instrument.changed(change.place, films=lambda films: (*films, film))
@@ -205,10 +241,17 @@ def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
 
 def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """(0, q, u, 0) per unit of light added, as mirrors of a telescope do to weakly polarised light."""
+    if _is_ahead(instrument, terms[0][0]) and any(change.factors for change, _ in terms):
+        return instrument.changed("", sky_films=lambda films: (*films, SkyFilm(**_columns(terms))))
     own: dict[str, Any] = {"q": jnp.zeros(()), "u": jnp.zeros(())}
     for one, size in terms:
         own[one.kind[-1]] = own[one.kind[-1]] + size
     return _beside(instrument, AddedPolarisation(name="described", **own), terms[0][0])
+
+
+def _grows_added(instrument: Instrument, change: Change) -> Grows:
+    """Anything where light from the sky has it alone, nothing behind."""
+    return Grows((FIELD, EXPOSURE), None) if _is_ahead(instrument, change) else Grows()
 
 
 def _displaced(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -234,7 +277,7 @@ _OPTICAL |= {f"diattenuation {axis}": "share" for axis in AXES}
 KINDS |= {
     name: Kind(amplitude, _optics, _at, grows=_grows, slots=_slots) for name, amplitude in _OPTICAL.items()
 }
-KINDS |= {name: Kind("share", _added, _at, slots=itself("light")) for name in ADDED}
+KINDS |= {name: Kind("share", _added, _at, grows=_grows_added, slots=itself("light")) for name in ADDED}
 _OF_FIELD = "the same angles at several hour angles, and a star at known pixels in each"
 KINDS |= {
     name: Kind(

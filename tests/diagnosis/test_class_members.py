@@ -1,0 +1,85 @@
+"""Classes of what was added: whom data cannot tell from it, what each does to the matrix, and the product of them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from small_run import SMALL
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import instrument_matrices
+from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis.class_members import classes_of
+from walop_jax.diagnosis.class_product import averaged, only_a_class
+from walop_jax.diagnosis.examination import examine
+from walop_jax.fit.model_file import base_model
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import Described
+from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.simulation.simulate import simulate
+
+TOLD = "gain of O1 * kind moon"
+
+
+@pytest.fixture(scope="module")
+def told():
+    """A camera is brighter on the Moon by 0.3 %: the fit, the context, and the class of that description."""
+    context = SMALL.context()
+    calset = simulate(SMALL, seed=3, effects=[Described.saying([TOLD], [3e-3])]).calset
+    context = effect_context(base_model(calset).template, calset.exposures)
+    model = with_effects(base_model(calset), [Described.saying([TOLD], [0.0])], context)
+    result = fit(Likelihood.of(calset, model))
+    said = [
+        probe
+        for probe in grammar.sentences(model.template, calset.exposures, len(calset.points))
+        if probe.name.startswith("gain of")
+    ]
+    state = examine(result, (), np.random.default_rng(0), sentences=said)
+    return result, context, classes_of(state, context, {Described.name}, [TOLD])
+
+
+def test_what_one_kind_has_against_the_others_the_others_have_against_it(told):
+    result, _, (found,) = told
+    names = [member.name for member in found.members]
+    assert names[0] == TOLD
+    (other,) = (m for m in found.members if m.name == "gain of O1 * kind clp; gain of O1 * kind standard")
+    assert other.probability == pytest.approx(found.members[0].probability)
+    assert other.amplitudes == pytest.approx([3e-3], rel=0.1)
+    # With the polariser wrong and the Moon right, camera O1 is brighter everywhere: m21 grows by ½ (1 − m21²) 0.3 %.
+    m21 = instrument_matrices(result)[:, 0, 0]
+    np.testing.assert_allclose(other.change[:, 0], 0.5 * (1 - m21**2) * other.amplitudes[0], rtol=0.05)
+
+
+def test_the_product_lies_between_and_its_errors_hold_both(told):
+    result, context, classes = told
+    alone = Calibration.from_fit(result.judged())
+    product = averaged(alone, classes, context)
+    x, y = np.array([0.1, -0.2]), np.array([0.05, 0.2])
+    (m, c), (one, within) = product.matrix(x, y), alone.matrix(x, y)
+    shift = 0.5 * (1 - one[:, 0] ** 2) * 3e-3
+    np.testing.assert_allclose(m[:, 0] - one[:, 0], 0.5 * shift, rtol=0.15)
+    np.testing.assert_allclose(np.sqrt(c[:, 0, 0] - within[:, 0, 0]), 0.5 * shift, rtol=0.15)
+    assert np.linalg.eigvalsh(product.covariance).min() > -1e-12
+    sentence = " ".join(only_a_class(classes))
+    assert "only a class of causes was named" in sentence
+    assert "plan --criterion apart" in sentence
+
+
+def test_a_class_of_one_changes_nothing(told):
+    result, context, _ = told
+    alone = Calibration.from_fit(result.judged())
+    assert averaged(alone, (), context) is alone
+
+
+def test_the_product_is_read_as_it_was_written(told, tmp_path):
+    from walop_jax.calibration.product import write_calibration
+
+    result, context, classes = told
+    product = averaged(Calibration.from_fit(result.judged()), classes, context)
+    write_calibration(tmp_path / "calibration.fits", product)
+    again = Calibration.read(tmp_path / "calibration.fits")
+    assert again.content_hash() == dataclasses.replace(product, path=None).content_hash()
+    here = product.matrix(0.1, 0.1), again.matrix(0.1, 0.1)
+    for ours, theirs in zip(*here, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-15)

@@ -1,0 +1,64 @@
+"""Polariser, Moon and standards predict each other: ln p of each given the others, by hand."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from walop_jax.diagnosis.search import gains_of_units
+
+UNIT = np.repeat(["clp", "moon", "standard"], 100)
+
+
+def laid(columns, data, prior_of=()):
+    """A model with a row for each datum: data − columns · best values; priors of unit width come last."""
+    priors = np.eye(columns.shape[1])[list(prior_of)]
+    rows, values = np.vstack([-columns, -priors]), np.concatenate([data, np.zeros(len(priors))])
+    best = np.linalg.lstsq(-rows, values, rcond=None)[0]
+    return rows, values + rows @ best, len(data) - columns.shape[1] + len(priors), 1.0
+
+
+def by_hand(columns, data, kind, prior_of):
+    """ln p of the rows of a kind given all others, from the joint normal density."""
+    own = kind == UNIT
+    information = columns[~own].T @ columns[~own]
+    information[prior_of, prior_of] += 1.0
+    mean = np.linalg.solve(information, columns[~own].T @ data[~own])
+    spread = np.eye(own.sum()) + columns[own] @ np.linalg.solve(information, columns[own].T)
+    return stats.multivariate_normal(columns[own] @ mean, spread).logpdf(data[own])
+
+
+def test_gains_are_those_of_normal_densities():
+    """One number that all see, and one more that Moon and standards see."""
+    rng = np.random.default_rng(5)
+    common, more = np.ones((300, 1)), (UNIT != "clp")[:, None] * 1.0
+    both = np.hstack([common, more])
+    data = 0.2 + 0.2 * more[:, 0] + 0.5 * rng.standard_normal(300)  # quiet: χ² below its expectation
+    found = gains_of_units(UNIT, laid(common, data), laid(both, data, [1]))
+    for gain, kind in zip(found, np.unique(UNIT), strict=True):
+        by_densities = by_hand(both, data, kind, [1]) - by_hand(common, data, kind, [])
+        assert gain == pytest.approx(by_densities, rel=1e-6, abs=1e-6)
+
+
+def test_what_stands_in_for_something_else_is_contradicted():
+    """The standards alone are off. One number that Moon and standards would have in common takes the Moon along."""
+    rng = np.random.default_rng(6)
+    common, data = np.ones((300, 1)), rng.standard_normal(300) + 0.8 * (UNIT == "standard")
+    right, wrong = (np.isin(UNIT, some)[:, None] * 1.0 for some in (["standard"], ["moon", "standard"]))
+    base = laid(common, data)
+    true = gains_of_units(UNIT, base, laid(np.hstack([common, right]), data, [1]))
+    assert true.min() > -0.5
+    assert true[2] > 3.0
+    off = gains_of_units(UNIT, base, laid(np.hstack([common, wrong]), data, [1]))
+    assert off[1] < -3.0
+
+
+def test_errors_that_a_fit_has_scaled_make_its_densities_as_broad():
+    """The same residuals in units of five times the errors: as probable, where χ² is what those errors say."""
+    rng = np.random.default_rng(7)
+    columns, data = np.ones((300, 1)), rng.standard_normal(300)
+    rows, residual, free, _ = laid(columns, data)
+    scaled = rows / 5.0, residual / 5.0, free, 5.0
+    loss = gains_of_units(UNIT, (rows, residual, free, 1.0), scaled)
+    # ½ Σ r² − n ln 5 − ½ Σ r²/25, nearly: a unit of 100 rows is predicted by 200.
+    squares = np.array([np.sum(residual[kind == UNIT] ** 2) for kind in np.unique(UNIT)])
+    np.testing.assert_allclose(loss, 0.5 * squares * (1 - 1 / 25) - 100 * np.log(5.0), rtol=0.02)

@@ -1,0 +1,640 @@
+"""Physics that the search has never seen: is what a diagnosis hands on right, star by star and element by element?
+
+    python tests/studies/sealed.py [--sets 400] [--first 0] [--seed 53] [--side 8] [--budget MINUTES] [--refit-only]
+
+What is hidden in a set depends on its number and the seed alone, and is drawn from a grammar of its own. It shares no
+line with the sentences of a diagnosis (kinds, places and factors are other ones), and its light path is that of
+`tests/oracle`. A twelfth of the sets each holds nothing, or a mistake of the tables; the others
+
+    optics       M → (1 + a g f s A) M at a place of the train: ahead of the polariser, in it and turning with it,
+                 behind it, behind the collimator, ahead of the analyser of one half
+    detectors    counts of a camera or a half × (1 + a g f), or × (1 + a g (N/N₀)^γ), or + a share of the light of
+                 another place of the same camera
+    sky          polarisation added to the Moon sky, or to standards, by a law of time, angle or star
+
+A is a random sum of the six generators of the Poincaré sphere and of unequal depolarisations; f a random smooth pattern
+of the field (low-pass noise, a bump, a ridge at some angle, a power of the radius about a displaced centre), s one of
+wavelength, g one of time (drift, exponential settling, step), temperature, exposure time, order of the exposures, angle
+of an element, side from which it came, KIND (some of them, with stars or without), or of nothing; a is drawn over a
+decade and a half about what the data just show. Stars are taken at the time of the first exposure, at 10 °C, for 60 s.
+
+Printed are each set, and the table: pulls and errors of the matrix between the points, and of stars with p = 2 %, at
+400 places, where |det| is 0.1 or more. A set counts where the truth is Δχ² = 30 better than the base model.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+from oracle import forward  # noqa: E402
+
+from walop_jax.calibration.calibration import Calibration  # noqa: E402
+from walop_jax.data.records import CalibrationSet  # noqa: E402
+from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
+from walop_jax.data.write import write_calibration_set  # noqa: E402
+from walop_jax.diagnosis.trust import examined  # noqa: E402
+from walop_jax.diagnosis.workflow import diagnose  # noqa: E402
+from walop_jax.fit.refit import refit  # noqa: E402
+from walop_jax.io.errors import DataError  # noqa: E402
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
+from walop_jax.simulation.simulate import simulate  # noqa: E402
+
+WRONG, FEW = 3.0, 0.01
+HELD = 30.0
+WORSE = 1.2
+PLACES, TEFF, STAR_SECONDS, STAR_P = 400, 5772.0, 60.0, 0.02
+NODES = 24  # of the band: 10⁻⁹ of the whole table
+ELECTRONS = 1e6
+
+
+# ------------------------------------------------------------------------------------------------ the oracle's optics
+
+
+def full_mueller(jones: np.ndarray) -> np.ndarray:
+    """Mueller matrix (…, 4, 4) of a Jones matrix: ½ Tr(σ_i J σ_j J†), V = 2 Im(E_x* E_y)."""
+    sigma = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, -1j], [1j, 0]]])
+    return 0.5 * np.einsum("iab,...bc,jcd,...ad->...ij", sigma, jones, sigma, jones.conj()).real
+
+
+def halves(params: dict[str, Any], x: np.ndarray, y: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
+    """Mueller matrices (point, wavelength, half, 4, 4) of wedge and plate."""
+    k, each = forward.pupil_direction(params, x, y), []
+    for half, axis in ((1, 0.0), (2, np.radians(22.5))):
+        behind = forward.through_wedge(k, params[f"wedge_{half}"], wavelength)
+        thick = params[f"quartz_{half}"], params[f"mgf2_{half}"]
+        each.append(full_mueller(forward.plate_jones(behind, wavelength, *thick, axis)))
+    return np.stack(each, axis=2)
+
+
+class Hidden(NamedTuple):
+    """One thing that is hidden: where, how large, and its patterns; `text` says it in words."""
+
+    text: str
+    where: str
+    size: float
+    generator: np.ndarray
+    field: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    colour: Callable[[np.ndarray], np.ndarray]
+    law: np.ndarray
+    star: float
+    cameras: np.ndarray
+    gamma: float = 0.0
+
+
+def vectors(
+    params: dict[str, Any],
+    x: np.ndarray,
+    y: np.ndarray,
+    band: tuple[np.ndarray, np.ndarray],
+    one: Hidden | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Analysis vectors (point, camera, 4) of the instrument, and what the hidden optics add to them at g = 1."""
+    wavelength, weight = band
+    arms, coll = halves(params, x, y, wavelength), forward.collimator(params, x, y)
+    efficiency = np.array([params["eta_1"], params["eta_2"]])
+    rows = np.zeros((4, 4))  # of the four cameras, of what is ahead of their analyser
+    rows[:, 0] = 0.5
+    rows[:, 1] = 0.5 * np.array([1, -1, 1, -1]) * np.repeat(efficiency, 2)
+    half = np.array([0, 0, 1, 1])
+    through = forward.camera_throughput(params, x, y)
+    plain = np.einsum("w,ki,pwkij,pjl->pkl", weight, rows, arms[:, :, half], coll, optimize=True)
+    added = np.zeros_like(plain)
+    if one is not None and one.where in ("behind polariser", "behind collimator", "half 1", "half 2"):
+        pattern = one.size * one.field(x, y)
+        spectral = weight * one.colour(wavelength)
+        a = one.generator
+        if one.where == "behind polariser":
+            chain = np.einsum(
+                "w,ki,pwkij,pjl,lm->pkm", spectral, rows, arms[:, :, half], coll, a, optimize=True
+            )
+        elif one.where == "behind collimator":
+            chain = np.einsum(
+                "w,ki,pwkij,jl,plm->pkm", spectral, rows, arms[:, :, half], a, coll, optimize=True
+            )
+        else:
+            chain = np.einsum(
+                "w,ki,ij,pwkjl,plm->pkm", spectral, rows, a, arms[:, :, half], coll, optimize=True
+            )
+            chain *= (half == int(one.where[-1]) - 1)[None, :, None]
+        added = pattern[:, None, None] * chain
+    return through[..., None] * plain, through[..., None] * added
+
+
+# ------------------------------------------------------------------------------------------------------- what is drawn
+
+
+def generators(rng: np.random.Generator) -> np.ndarray:
+    """A random Mueller matrix near the identity, less the identity: retarder, diattenuator, depolarisation."""
+    a = np.zeros((4, 4))
+    d, r, k = rng.standard_normal((3, 3)) * (rng.random((3, 1)) < (0.45, 0.55, 0.3))
+    if not (d.any() or r.any() or k.any()):
+        r = rng.standard_normal(3)
+    a[0, 1:] = a[1:, 0] = d
+    a[1:, 1:] = np.array([[0, r[2], -r[1]], [-r[2], 0, r[0]], [r[1], -r[0], 0]]) - np.diag(np.abs(k))
+    return a / np.linalg.norm(a)
+
+
+def over_field(rng: np.random.Generator) -> tuple[str, Callable[[np.ndarray, np.ndarray], np.ndarray]]:
+    """A smooth pattern of the field (deg), about 1 at its largest."""
+    kind = rng.choice(["uniform", "noise", "bump", "ridge", "power"], p=[0.35, 0.2, 0.1, 0.15, 0.2])
+    angle, x0, y0 = rng.uniform(0, 2 * np.pi), *rng.uniform(-0.2, 0.2, 2)
+    width, power = rng.uniform(0.1, 0.35), rng.choice([1.0, 2.0, 3.0, 4.0])
+    waves, phases = rng.normal(0.0, 6.0, (4, 2)), rng.uniform(0, 2 * np.pi, 4)
+
+    def value(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        x, y = np.atleast_1d(x), np.atleast_1d(y)
+        if kind == "uniform":
+            return np.ones(x.shape)
+        if kind == "noise":
+            return np.cos(np.tensordot(waves, np.stack([x, y]), 1) + phases[:, None]).sum(axis=0) / 2.0
+        if kind == "bump":
+            return np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / (2 * width**2))
+        if kind == "ridge":
+            return np.tanh((np.cos(angle) * x + np.sin(angle) * y - x0) / width)
+        return (np.hypot(x - x0, y - y0) / 0.3) ** power
+
+    return kind, value
+
+
+def over_colour(rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+    """A smooth function of the wavelength (µm)."""
+    kind, slope, phase = rng.integers(3), rng.normal(0, 3.0), rng.uniform(0, 2 * np.pi)
+    if kind == 0:
+        return np.ones_like
+    if kind == 1:
+        return lambda w: 1.0 + slope * (w / 0.62 - 1.0)
+    return lambda w: np.cos(2 * np.pi * (w - 0.62) / 0.3 + phase)
+
+
+def law(rng: np.random.Generator, calset: CalibrationSet) -> tuple[str, np.ndarray, float]:
+    """A law over the exposures, about 1 at its largest, and its value for stars."""
+    e, n = calset.exposures, len(calset.exposures)
+    hours = 24.0 * (e.mjd - e.mjd.min())
+    kind = rng.choice(
+        ["none", "drift", "settling", "step", "kelvin", "1/exptime", "order", "angle", "side", "kinds"],
+        p=[0.37, 0.09, 0.05, 0.05, 0.08, 0.08, 0.05, 0.06, 0.05, 0.12],
+    )
+    star, value = 0.0, np.ones(n)
+    if kind == "none":
+        star = 1.0
+    elif kind == "drift":
+        value = (hours / hours.max()) ** rng.choice([0.7, 1.0, 1.5])
+    elif kind == "settling":
+        value = 1.0 - np.exp(-hours / (hours.max() * rng.uniform(0.1, 0.5)))
+    elif kind == "step":
+        value = 1.0 * (hours > rng.uniform(0.2, 0.8) * hours.max())
+    elif kind == "kelvin":
+        value = (e.temp - 10.0) / np.abs(e.temp - 10.0).max()
+    elif kind == "1/exptime":
+        value, star = e.exptime.min() / e.exptime, e.exptime.min() / STAR_SECONDS
+    elif kind == "order":
+        value = np.arange(n) / (n - 1.0)
+    elif kind == "angle":
+        value = np.where(
+            e.clp_in,
+            np.cos(rng.integers(1, 4) * np.radians(np.nan_to_num(e.clp_angle)) + rng.uniform(0, 6)),
+            0,
+        )
+    elif kind == "side":
+        angle = np.where(e.clp_in, np.nan_to_num(e.clp_angle), 0.0)
+        value = np.where(e.clp_in & (np.diff(angle, prepend=angle[0]) > 0), 1.0, 0.0)
+    else:
+        names = np.unique(e.kind)
+        some = rng.permutation(names)[: rng.integers(1, len(names))]
+        value, star = 1.0 * np.isin(e.kind, some), float(rng.integers(2))
+        kind = f"kinds {'+'.join(sorted(map(str, some)))}{' and stars' if star else ''}"
+    return str(kind), value, star
+
+
+def draw(rng: np.random.Generator, calset: CalibrationSet) -> Hidden:
+    """One thing that is hidden in a set."""
+    where = str(
+        rng.choice(
+            ["ahead of polariser", "polariser", "behind polariser", "behind collimator", "half 1", "half 2", "gain",
+             "power of counts", "leak", "moon", "standards"],
+            p=[0.11, 0.09, 0.13, 0.13, 0.08, 0.08, 0.16, 0.05, 0.05, 0.07, 0.05],
+        )
+    )  # fmt: skip
+    field_name, field = over_field(rng)
+    law_name, values, star = law(rng, calset)
+    cameras = np.zeros(4)
+    if rng.random() < 0.5:
+        cameras[rng.integers(4)] = 1.0
+    else:
+        cameras[2 * rng.integers(2) :][:2] = 1.0, rng.choice([-1.0, 1.0])
+    if where in ("moon", "standards"):
+        star = 0.0
+    size = 10.0 ** rng.uniform(-3.6, -2.1)
+    text = f"{where}, {field_name}, {law_name}, {size:.1e}"
+    return Hidden(
+        text,
+        where,
+        size,
+        generators(rng),
+        field,
+        over_colour(rng),
+        values,
+        star,
+        cameras,
+        rng.uniform(0.3, 2.0),
+    )
+
+
+# --------------------------------------------------------------------------------------------------------------- a set
+
+
+class Sealed(NamedTuple):
+    """A set, the text of what is hidden, its true matrix at places between the points, and χ² of the truth."""
+
+    calset: CalibrationSet
+    text: str
+    x: np.ndarray
+    y: np.ndarray
+    matrix: np.ndarray
+    chi2: float
+
+
+def observed(side: int, seed: int, rng: np.random.Generator) -> CalibrationSet:
+    """The exposures: times, temperatures and places, with light that is replaced."""
+    plan = ObservingPlan(
+        grid=side, standard_grid=3, polariser_angles=polariser_turn(18), moon_patches=6, standards=6
+    )
+    calset = simulate(plan, seed=seed, noiseless=True).calset
+    e, n = calset.exposures, len(calset.exposures)
+    seconds = np.where(e.clp_in, np.array([3.0, 10.0, 30.0])[np.arange(n) % 3], 60.0)
+    hours = 24.0 * (e.mjd - e.mjd.min())
+    kelvin = 10.0 + rng.uniform(-2, 2) + rng.uniform(-0.6, 0.6) * hours + 0.2 * rng.standard_normal(n)
+    return dataclasses.replace(calset, exposures=dataclasses.replace(e, exptime=seconds, temp=kelvin))
+
+
+def sealed(number: int, seed: int, side: int) -> Sealed:
+    """The set of a number."""
+    rng = np.random.default_rng([number, seed, 53])
+    calset = observed(side, 7 * seed + number, rng)
+    with tempfile.TemporaryDirectory() as folder:
+        write_calibration_set(Path(folder) / "set.fits", calset)
+        data = forward.load(Path(folder) / "set.fits")
+    params = forward.nominal(len(calset.sources.q))
+    params |= {name: params[name] + w * rng.standard_normal() for name, w in forward.PRIOR_WIDTH.items()}
+    params["eta_1"], params["eta_2"] = min(params["eta_1"], 1.0), min(params["eta_2"], 1.0)
+    params["delta"] = 0.8 + 0.03 * rng.standard_normal()
+    params["throughput"][:, 0] *= 1.0 + 0.03 * rng.standard_normal(4)
+    params["throughput"][:, 1:] = 0.004 * rng.standard_normal((4, 14))
+    sources = calset.sources
+    params["q"], params["u"] = (
+        np.asarray(getattr(sources, name))
+        + getattr(sources, f"{name}_err") * rng.standard_normal(len(sources.q))
+        for name in "qu"
+    )
+    what = ("nothing", "tables")[number % 12] if number % 12 < 2 else "physics"
+    one = draw(rng, calset) if what == "physics" else None
+    expected = counts(params, data, calset, one)
+    counted = rng.poisson(expected) + 5.0 * rng.standard_normal(expected.shape)
+    sigma = np.sqrt(np.maximum(counted, 1.0) + 25.0)
+    table = TableIntensities.of(calset.intensities, calset.points)
+    order = {
+        pair: row
+        for row, pair in enumerate(zip(data["point"].tolist(), data["exposure"].tolist(), strict=True))
+    }
+    numbers = np.array(
+        [order[pair] for pair in zip(table.point.tolist(), table.exposure.tolist(), strict=True)]
+    )
+    measured = dataclasses.replace(table, counts=counted[numbers], sigma=sigma[numbers])
+    calset = dataclasses.replace(calset, intensities=measured, origin="sealed")
+    text = what if one is None else one.text
+    if what == "tables":
+        text, calset = mistaken(rng, calset)
+    x, y = rng.uniform(-0.25, 0.25, (2, PLACES))
+    m = expected / sigma
+    flux = np.sum(m * counted / sigma, axis=1) / np.sum(m * m, axis=1)
+    chi2 = float(np.sum(((counted - flux[:, None] * expected) / sigma) ** 2))
+    return Sealed(calset, text, x, y, truth(params, calset, x, y, one), chi2)
+
+
+def counts(
+    params: dict[str, Any], data: dict[str, Any], calset: CalibrationSet, one: Hidden | None
+) -> np.ndarray:
+    """Expected counts of every row."""
+    x, y = data["x"], data["y"]
+    state = forward.source_states(params, data)
+    row, g = data["point"], np.zeros(len(data["point"]))
+    pattern = np.zeros(len(x))
+    if one is not None:
+        g, pattern = one.law[data["exposure"]], one.size * one.field(x, y)
+        h = (g * pattern[row])[:, None]
+        if one.where == "ahead of polariser":
+            sky = ~data["clp_in"]
+            state = np.where(sky[:, None], state + h * state @ one.generator.T, state)
+        elif one.where == "polariser":  # a layer that turns with it
+            two = 2 * np.radians(np.nan_to_num(data["clp_angle"]))
+            back = np.stack([state[:, 0], *_turned(state, two), state[:, 3]], axis=1)
+            own = back @ one.generator.T
+            turned = np.stack([own[:, 0], *_turned(own, -two), own[:, 3]], axis=1)
+            state = np.where(data["clp_in"][:, None], state + h * turned, state)
+        elif one.where in ("moon", "standards"):
+            chosen = data["kind"] == ("moon" if one.where == "moon" else "standard")
+            angle = 6.0 * one.generator[1, 2] + (0.0 if one.where == "moon" else 1.0) * data["source"]
+            extra = np.stack(
+                [np.zeros(len(row)), np.cos(angle) + 0 * g, np.sin(angle) + 0 * g, np.zeros(len(row))], 1
+            )
+            state = np.where(chosen[:, None], state + 3.0 * h * extra, state)
+    light = np.zeros((len(row), 4))
+    for number, (name, teff, _) in enumerate(data["configurations"]):
+        here = data["configuration"] == number
+        band = forward.gauss(*forward.band(*data["filters"][name][:2], teff), NODES)
+        plain, added = vectors(params, x, y, band, one)
+        seen = plain[row[here]] + g[here, None, None] * added[row[here]]
+        light[here] = np.einsum("rki,ri->rk", seen, state[here])
+    brightness = np.random.default_rng(len(row)).uniform(0.7, 1.0, len(row))
+    expected = 4.0 * ELECTRONS * brightness[:, None] * light
+    if one is not None and one.where in ("gain", "power of counts", "leak"):
+        change = (g * pattern[row])[:, None] * one.cameras
+        if one.where == "gain":
+            expected = expected * (1.0 + change)
+        elif one.where == "power of counts":
+            expected = expected * (1.0 + change * (expected / ELECTRONS) ** one.gamma)
+        else:
+            other = expected[:, [1, 2, 3, 0]]
+            expected = expected + np.abs(change) * other
+    return expected
+
+
+def _turned(state: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Q and U referred to axes turned by half of an angle."""
+    c, s = np.cos(two), np.sin(two)
+    return state[:, 1] * c + state[:, 2] * s, state[:, 2] * c - state[:, 1] * s
+
+
+def truth(
+    params: dict[str, Any], calset: CalibrationSet, x: np.ndarray, y: np.ndarray, one: Hidden | None
+) -> np.ndarray:
+    """The true matrix (place, 6) as stars see it."""
+    curve = calset.filters[str(calset.exposures.filter[0])]
+    band = forward.gauss(*forward.band(curve.wavelength, curve.throughput, TEFF), NODES)
+    plain, added = vectors(params, x, y, band, one)
+    seen = plain
+    if one is not None:
+        h = one.star * one.size * one.field(x, y)
+        seen = plain + one.star * added
+        if one.where == "ahead of polariser":
+            seen = seen + h[:, None, None] * (seen @ one.generator)
+        elif one.where == "gain":
+            seen = seen * (1.0 + h[:, None] * one.cameras)[..., None]
+        elif one.where == "leak":
+            seen = seen + np.abs(h[:, None] * one.cameras)[..., None] * seen[:, [1, 2, 3, 0]]
+        elif one.where == "power of counts":  # stars as bright as the exposures
+            level = (seen[..., :1] * 3.4) ** one.gamma
+            seen = seen * (1.0 + (h[:, None] * one.cameras)[..., None] * level)
+    return np.stack(list(forward.instrument_matrix(seen).values()), axis=1)
+
+
+def mistaken(rng: np.random.Generator, calset: CalibrationSet) -> tuple[str, CalibrationSet]:
+    """The set with one mistake in its tables."""
+    e, n = calset.exposures, len(calset.exposures)
+    through, sky = np.flatnonzero(e.clp_in), np.flatnonzero(e.kind == "moon")
+    kind = str(rng.choice(["clock", "angle", "pair", "rotator", "catalogue", "colour of a lamp", "band"]))
+    size = 10.0 ** rng.uniform(-1.0, 0.7)
+    if kind == "clock":
+        new = dataclasses.replace(e, mjd=np.where(np.isin(np.arange(n), sky), e.mjd + 0.02 * size, e.mjd))
+    elif kind == "angle":
+        angle = e.clp_angle.copy()
+        angle[rng.choice(through)] += 0.1 * size
+        new = dataclasses.replace(e, clp_angle=angle)
+    elif kind == "pair":
+        angle = e.clp_angle.copy()
+        i = int(rng.integers(len(through) - 1))
+        angle[through[[i, i + 1]]] = angle[through[[i + 1, i]]]
+        new = dataclasses.replace(e, clp_angle=angle)
+    elif kind == "rotator":
+        new = dataclasses.replace(e, rotator=e.rotator + 0.3 * size)
+    elif kind == "catalogue":
+        factor = 1.0 + 0.02 * size
+        changed = dataclasses.replace(
+            calset.sources, q=calset.sources.q * factor, u=calset.sources.u * factor
+        )
+        return f"tables: standards × {factor:.3f}", dataclasses.replace(calset, sources=changed)
+    elif kind == "colour of a lamp":
+        new = dataclasses.replace(e, teff=np.where(e.clp_in, np.nan_to_num(e.teff, nan=3200.0) * 1.3, e.teff))
+    else:
+        moved = {
+            k: dataclasses.replace(f, wavelength=f.wavelength + 0.002 * size)
+            for k, f in calset.filters.items()
+        }
+        return f"tables: band by {2 * size:.2g} nm", dataclasses.replace(calset, filters=moved)
+    return f"tables: {kind} ({size:.2g})", dataclasses.replace(calset, exposures=new)
+
+
+# -------------------------------------------------------------------------------------------------------------- judging
+
+
+class Judged(NamedTuple):
+    """A product held against the truth: error of stars, pulls of stars (place, q or u) and of elements."""
+
+    trusted: bool
+    error: float
+    stars: np.ndarray
+    elements: np.ndarray
+
+    @property
+    def beyond(self) -> float:
+        """Share of the stars beyond three stated errors."""
+        return float(np.mean(np.abs(self.stars).max(axis=1) > WRONG))
+
+    @property
+    def wrong(self) -> bool:
+        """True if more than 1 % of the stars, or the median pull of an element, lie beyond three stated errors."""
+        return self.beyond > FEW or bool(np.median(np.abs(self.elements), axis=0).max() > WRONG)
+
+
+def judged(calibration: Calibration, trusted: bool, one: Sealed) -> Judged:
+    """Hold a calibration against the true matrix."""
+    setting = calibration.usual_settings(len(one.x), calibration.usual_filter)
+    setting = dataclasses.replace(setting, teff=np.full(len(one.x), TEFF))
+    m, covariance = calibration.matrix(one.x, one.y, setting)
+    known = np.isfinite(m).all(axis=1)
+    true, found = (v.reshape(-1, 2, 3) for v in (one.matrix, m))
+    known &= np.abs(np.linalg.det(true[:, :, 1:])) >= 0.1
+    true, found, covariance = true[known], found[known], covariance[known]
+    pulls = (found - true).reshape(len(true), 6) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    angle = np.random.default_rng(5).uniform(0.0, 2.0 * np.pi, len(true))
+    star = np.stack([np.ones(len(true)), STAR_P * np.cos(angle), STAR_P * np.sin(angle)], axis=1)
+    inverse = np.linalg.inv(found[:, :, 1:])
+    error = np.einsum("pij,pjk,pk->pi", inverse, true - found, star)
+    slope = np.einsum("pij,pk->pijk", inverse, star).reshape(len(star), 2, 6)
+    stated = np.sqrt(np.einsum("pia,pab,pib->pi", slope, covariance, slope))
+    return Judged(trusted, float(np.sqrt(np.mean(error**2))), error / stated, pulls)
+
+
+class Outcome(NamedTuple):
+    """What became of a set."""
+
+    text: str
+    held: float
+    before: Judged | None
+    after: Judged | None
+    verdict: str
+    p: float
+    has_class: bool
+    seconds: float
+
+
+def outcome(number: int, options: argparse.Namespace) -> Outcome:
+    """Fit and diagnose the set of a number."""
+    one, began = sealed(number, options.seed, options.side), time.process_time()
+    try:
+        fitted = examined(refit(one.calset))
+    except (DataError, ValueError) as error:
+        return Outcome(
+            one.text,
+            np.nan,
+            None,
+            None,
+            f"refused: {str(error)[:80]}",
+            0.0,
+            False,
+            time.process_time() - began,
+        )
+    # The truth has no parameters that noise could take up; a fit of them takes as many from χ².
+    held = fitted.posterior.data - one.chi2 + len(fitted.model.free)
+    before = judged(Calibration.from_fit(fitted), bool(fitted.trusted), one) if fitted.converged else None
+    if options.refit_only:
+        return Outcome(one.text, held, before, None, "", np.nan, False, time.process_time() - began)
+    try:
+        found = diagnose(one.calset, seed=number, minutes=options.minutes)
+    except (DataError, ValueError) as error:
+        return Outcome(
+            one.text,
+            held,
+            before,
+            None,
+            f"refused: {str(error)[:80]}",
+            0.0,
+            False,
+            time.process_time() - began,
+        )
+    trusted = found.after.trusted and found.verdict != "unexplained"
+    after = judged(found.calibration(), trusted, one)
+    names = ", ".join(
+        step.effect if not step.told else "; ".join(c.text for c, *_ in step.told) for step in found.steps
+    )
+    verdict = f"{found.verdict} {names}".strip()
+    return Outcome(
+        one.text,
+        held,
+        before,
+        after,
+        verdict,
+        found.p_value,
+        bool(found.members),
+        time.process_time() - began,
+    )
+
+
+def line(number: int, one: Outcome) -> str:
+    """The outcome of a set in a line."""
+
+    def words(judged: Judged | None) -> str:
+        if judged is None:
+            return "no product"
+        worst = np.median(np.abs(judged.elements), axis=0).max()
+        trusted = "trusted" if judged.trusted else "not trusted"
+        wrong = " and WRONG" * (judged.trusted and judged.wrong)
+        return f"{trusted}{wrong} {judged.error:.1e} {100 * judged.beyond:.0f}% {worst:.1f}σ"
+
+    return (
+        f"{number}: {one.text} | Δχ² {one.held:.0f} | {words(one.before)} | p {one.p:.1e} {one.verdict} | "
+        f"{words(one.after)} | {one.seconds:.0f} s"
+    )
+
+
+def table(found: list[Outcome]) -> str:
+    """Rates, as they are asked for."""
+
+    def rate(count: int, of: int) -> str:
+        return f"{count} of {of}" + (f" ({100 * count / of:.1f} %)" if of else "")
+
+    products = [one for one in found if one.after is not None]
+    rows = []
+    judged = {
+        "fit": [(o, o.before) for o in found if o.before is not None],
+        "diagnosis": [(o, o.after) for o in found if o.after is not None],
+    }
+    for name, some in judged.items():
+        trusted = [(o, j) for o, j in some if j.trusted]
+        rows.append((f"{name}: trusted", rate(len(trusted), len(some))))
+        seen = [(o, j) for o, j in trusted if o.held >= HELD]
+        rows.append(
+            (
+                f"{name}: trusted and wrong, Δχ² of the truth ≥ 30",
+                rate(sum(j.wrong for _, j in seen), len(seen)),
+            )
+        )
+        rows.append((f"{name}: trusted and wrong, all", rate(sum(j.wrong for _, j in trusted), len(trusted))))
+    both = [o for o in products if o.before is not None]
+    worse = [o for o in both if o.after and o.before and o.after.error > WORSE * o.before.error]
+    rows.append(("matrix worse by more than 1.2 × after the diagnosis", rate(len(worse), len(both))))
+    rows.append(("that, and trusted", rate(sum(bool(o.after and o.after.trusted) for o in worse), len(both))))
+    disagree = [o for o in both if o.before and o.before.trusted and o.p < 1e-4]
+    rows.append(("fit trusted while the diagnosis has p < 10⁻⁴", rate(len(disagree), len(both))))
+    null = [o for o in found if o.text == "nothing"]
+    rows.append(
+        ("nothing hidden: alarms", rate(sum(not o.verdict.startswith("consistent") for o in null), len(null)))
+    )
+    untrusted = sum(o.before is None or not o.before.trusted for o in null)
+    rows.append(("nothing hidden: fits not trusted", rate(untrusted, len(null))))
+    shown = [o for o in products if o.held >= HELD]
+    rows.append(
+        (
+            "unexplained, of those with Δχ² ≥ 30",
+            rate(sum("unexplained" in o.verdict for o in shown), len(shown)),
+        )
+    )
+    classes = [o.after for o in products if o.has_class]
+    for what in ("stars", "elements") if classes else ():
+        pulls = np.concatenate([getattr(one, what).ravel() for one in classes])
+        inside = ", ".join(f"{100 * np.mean(np.abs(pulls) < k):.0f}" for k in (1.0, 2.0))
+        rows.append(
+            (
+                f"products with a class: pulls of {what} rms; inside 1σ, 2σ",
+                f"{np.sqrt(np.mean(pulls**2)):.2f}; {inside} %",
+            )
+        )
+    return "\n".join(f"{name:70s} {value}" for name, value in rows)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sets", type=int, default=400)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=53)
+    parser.add_argument("--side", type=int, default=8)
+    parser.add_argument("--minutes", type=float, default=3.0)
+    parser.add_argument("--budget", type=float, default=np.inf, help="minutes after which no set is begun")
+    parser.add_argument("--refit-only", action="store_true")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    found, end = [], time.monotonic() + 60.0 * options.budget
+    for number in range(options.first, options.first + options.sets):
+        if time.monotonic() > end:
+            break
+        found.append(outcome(number, options))
+        print(line(number, found[-1]), flush=True)
+    print(table(found))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,322 @@
+"""The class of what a diagnosis has added: all that these data cannot tell from it, with what each does to stars.
+
+Additions    effects with a name, and groups of sentences. Of each the members of its class are all candidates that, in
+             its place, are not improbable (`Policy.improbable`), by one linear step (`class_average`). They are as
+             probable beforehand: that somebody has thought of a name for one does not make it true.
+Kinds        What is found in exposures of one KIND is a difference between that KIND and all others: which of the two
+             is wrong no residual can say. "In all other kinds, with the other sign" is a member, as probable.
+Stars        A member changes the matrix by its own column, and by what it moves the other parameters. Members that do
+             the same count once. The product is their mean, and its covariance has their spread: values and covariance
+             of a model that holds all of them, each amplitude 0 in the models of the others.
+Limits       To first order. Structural effects, other descriptions and patterns of a single place have no sentence and
+             no part in it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Collection, Iterator, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
+from walop_jax.calibration.matrix import first_setting, matrix_slopes
+from walop_jax.diagnosis.class_average import distinct, moved, probabilities
+from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum
+from walop_jax.diagnosis.exact import signature
+from walop_jax.diagnosis.examination import Examination
+from walop_jax.diagnosis.hidden_mistakes import of_matrix, usual_exposure
+from walop_jax.diagnosis.score import Projector, log_bayes
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood.columns import Columns
+from walop_jax.likelihood.inverses import whitening
+from walop_jax.likelihood.starlight import added_to_starlight
+from walop_jax.model.effects import Context, Described
+from walop_jax.model.effects.change import AMPLITUDES, KINDS, patched
+from walop_jax.model.effects.change import Change as Sentence
+
+Vector = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "_ _"]
+ALIKE = 0.5  # of the errors of the matrix: members that differ by less are one
+MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members that differ in what they do to stars
+LINEAR = 0.01  # of the evidence, which a linear step may miss
+LEAST_PROBABLE, PLAUSIBLE = 1e-3, 0.02  # of members that are kept, and of those that must not be far off
+
+
+def classes_of(
+    state: Examination,
+    context: Context,
+    names: Collection[str],
+    said: Sequence[str],
+    alike: Collection[str] = (),
+) -> tuple[ClassOf, ...]:
+    """The classes of the effects of a model that have some names; without those of which the class is that alone.
+
+    `said` are the names of the groups of sentences that were added, `alike` those of effects and groups that were told
+    as not to be distinguished: of far larger residuals, where one linear step says little, they count as probable.
+    """
+    additions = list(_additions(state.result, context, names, said))
+    if not additions or not state.result.model.template.cameras.pairs:
+        return ()
+    laid = _Laid(state, alike)
+    return tuple(one for one in itertools.starmap(laid.class_of, additions) if one.names)
+
+
+def _additions(
+    fit: FitResult, context: Context, names: Collection[str], said: Sequence[str]
+) -> Iterator[tuple[str, Int[np.ndarray, " a"], Vector, tuple[Sum, ...]]]:
+    """Name, positions among the free parameters, change of the data rows without it, its amplitudes in sentences."""
+    model = fit.model
+    place = {int(i): k for k, i in enumerate(model.free)}
+    slope: Matrix | None = None
+    for effect in model.effects:
+        if effect.kind.is_structural() or effect.name not in names:
+            continue
+        if not isinstance(effect, Described):
+            at = [place[i] for i in model.positions(effect.name).tolist() if i in place]
+            if at:
+                change = signature(fit, effect.name, context)
+                yield effect.name, np.array(at), change, tuple(map(tuple, effect.first_order(model.template)))
+            continue
+        for group in _groups(effect, said):
+            indices = [model.index(f"{Described.name}.{Sentence.parsed(text).label}") for text in group]
+            at = [place[i] for i in indices if i in place]
+            if not at:
+                continue
+            slope = fit.likelihood.jacobian(fit.values) / fit.noise_scale if slope is None else slope
+            change = -slope[:, at] @ fit.values[model.free[at]]
+            yield "; ".join(group), np.array(at), change, tuple(((1.0, Sentence.parsed(t)),) for t in group)
+
+
+def _groups(effect: Described, said: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """The sentences of a model as they were added, group by group; what no group holds stands by itself."""
+    left = list(effect.sentences)
+    for name in said:
+        group = tuple(text for text in left if text in name.split("; "))
+        left = [text for text in left if text not in group]
+        if group:
+            yield group
+    yield from ((text,) for text in left)
+
+
+class _Laid:
+    """An examination laid out for one linear step from model to model."""
+
+    def __init__(self, state: Examination, alike: Collection[str]) -> None:
+        self.alike = alike
+        self.state, self.fit, self.design = state, state.result, state.design
+        calset, model = self.fit.calset, self.fit.model
+        self.template = model.template
+        self.columns = Columns(self.fit.likelihood, self.fit.values)
+        self.usual = usual_exposure(calset, self.template)
+        self._added: dict[Sum, Float[np.ndarray, "p k 3"]] = {}
+        self._vectors: Float[np.ndarray, "p k 3"] | None = None
+        instrument = model.instrument(self.fit.values)
+        setting = first_setting(calset, instrument, self.usual)
+        at = setting, calset.filters, calset.points.x, calset.points.y
+        matrix, slopes = matrix_slopes(instrument, *at)
+        self.matrix = matrix.reshape(len(matrix), -1)
+        self.slopes = slopes.reshape(*self.matrix.shape, -1) @ model.selection()
+        self.errors = np.sqrt(
+            np.einsum("pmf,fg,pmg->pm", self.slopes, covariance_of_free(self.fit), self.slopes)
+        )
+
+    def added(self, sums: Sequence[Sum]) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
+        """Analysis vectors of a star at the field points, and what one unit of each amplitude adds to them."""
+        missing = [each for each in dict.fromkeys(sums) if each not in self._added]
+        if missing or self._vectors is None:
+            self._vectors, new = added_to_starlight(self.columns, missing, self.usual)
+            self._added |= dict(zip(missing, np.moveaxis(new, -1, 0), strict=True))
+        each = [self._added[one] for one in sums]
+        return self._vectors, np.stack(each, axis=-1) if each else np.zeros((*self._vectors.shape, 0))
+
+    def class_of(self, name: str, at: Int[np.ndarray, " a"], lost: Vector, sums: tuple[Sum, ...]) -> ClassOf:
+        """The class of what has the amplitudes `at`, without which the residuals change by `lost`."""
+        step = _Step(self, at, lost)
+        told = step.told(name, sums)
+        members = [told, *step.candidates(told.evidence)]
+        members += [other for one in members if (other := step.in_other_kinds(one)) is not None]
+        best = max(member.evidence for member in members)
+        least = best - self.state.policy.improbable
+        members = [told, *(member for member in members[1:] if member.evidence > least)]
+        changes = np.stack([member.change for member in members])
+        evidence = np.array([np.inf, *(member.evidence for member in members[1:])])
+        members = [members[i] for i in distinct(evidence, changes, self.errors, ALIKE)][:MOST_MEMBERS]
+        weights = probabilities([member.evidence for member in members])
+        members = [
+            member._replace(probability=float(weight))
+            for member, weight in zip(members, weights, strict=True)
+            if weight > LEAST_PROBABLE or member is told
+        ]
+        return ClassOf(name, at, tuple(members), *self._spread(members))
+
+    def _spread(self, members: Sequence[Likeness]) -> tuple[float, float, float]:
+        """Error of p of stars between members, that of the fit, and how far the farthest lies off (`ClassOf`)."""
+        weights = np.array([member.probability for member in members])
+        away = np.stack([member.change for member in members])
+        away = away - np.tensordot(weights, away, 1)
+        between = np.einsum("k,kpi,kpj->pij", weights, away, away)
+        total = np.sqrt(self.errors**2 + np.diagonal(between, axis1=1, axis2=2))
+        far = np.median(np.abs(away) / np.where(total > 0, total, np.inf), axis=1).max(axis=1)
+        off = float(far[weights > PLAUSIBLE].max(initial=0.0))
+        within = self.slopes @ covariance_of_free(self.fit) @ np.swapaxes(self.slopes, 1, 2)
+        if self.matrix.shape[1] == 6:
+            good = measures_u(self.matrix.reshape(-1, 2, 3))
+            each = [p_errors(self.matrix[good], part[good], sample_stars()) for part in (between, within)]
+        else:  # no single exposure gives q and u
+            each = [
+                np.sqrt(np.diagonal(part, axis1=1, axis2=2).max(axis=1, initial=0.0))
+                for part in (between, within)
+            ]
+        spread, stated = (float(np.median(errors)) if errors.size else 0.0 for errors in each)
+        return spread, stated, off
+
+
+class _Step:
+    """One linear step from the fit to a model without some amplitudes and with others."""
+
+    def __init__(self, laid: _Laid, at: Int[np.ndarray, " a"], lost: Vector) -> None:
+        self.laid, self.at = laid, at
+        design = laid.design
+        self.lost = np.pad(lost, (0, len(design.residual) - len(lost)))
+        self.rest = np.delete(np.arange(design.jacobian.shape[1]), at)
+        self.jacobian = design.jacobian[:, self.rest]
+        self.projector = Projector(self.jacobian, design.eliminated)
+        self.left = self.projector(design.residual + self.lost)
+
+    def told(self, name: str, sums: tuple[Sum, ...]) -> Likeness:
+        """The member that was added, as the fit has it."""
+        fit, design, floor = self.laid.fit, self.laid.design, self.laid.state.floor
+        positions = fit.model.free[self.at]
+        column = design.jacobian[:, self.at]
+        column[design.rows :] = 0.0  # without its own prior, which comes in with the widths
+        own = self.projector(column)
+        parameters = [fit.model.parameters[i] for i in positions.tolist()]
+        widths = np.array([p.scale if p.prior is None else p.prior[1] for p in parameters])
+        evidence = log_bayes(own.T @ own, own.T @ self.left, widths) / floor**2
+        nothing = np.zeros(len(fit.model.free))
+        return Likeness(
+            name, evidence, sums, np.zeros(0), np.zeros((0, 0)), nothing, np.zeros((len(nothing), 0)),
+            np.zeros_like(self.laid.matrix),
+        )  # fmt: skip
+
+    def candidates(self, told: float) -> Iterator[Likeness]:
+        """Candidates that are not improbable beside what was added, the most probable first."""
+        state, design = self.laid.state, self.laid.design
+        own = self.projector(design.jacobian[:, self.at])
+        basis = own @ whitening(own.T @ own)
+        along = design.products(state.columns, basis)
+        gram, scores = state.bare.gram + along @ along.T, design.products(state.columns, self.left)
+        places, found = state.bare.places(), []
+        number = {name: i for i, name in enumerate(state.bare.names)}
+        for probe in (*state.probes, *state.sentences, *(probe for probe, _ in state.parts)):
+            at = places[probe.name]
+            evidence = log_bayes(gram[at, at], scores[at], probe.widths) / state.floor**2
+            if {probe.name, probe.effect.name} & set(self.laid.alike):
+                evidence = max(evidence, told)
+            found.append((evidence, probe, gram[at, at], scores[at]))
+        found.sort(key=lambda one: -one[0])
+        least = max(told, found[0][0] if found else told) - state.policy.improbable
+        chosen = []
+        for evidence, probe, square, along_residual in found[:MOST_ASKED]:
+            if evidence <= least:
+                break
+            sums = tuple(tuple(each) for one in probe.group for each in one.first_order(self.laid.template))
+            if len(sums) == len(probe.widths) and self._can_be_said(sums):
+                chosen.append((probe, evidence, sums, square, along_residual))
+        self.laid.added([each for _, _, sums, *_ in chosen for each in sums])  # all of them in one go
+        for probe, evidence, sums, square, along_residual in chosen:
+            column = design.stacked([state.columns[number[probe.name]]])
+            yield self._member(probe.name, evidence, sums, column, square, along_residual, probe.widths)
+
+    def in_other_kinds(self, member: Likeness) -> Likeness | None:
+        """A member that is about exposures of one KIND, in all others instead; None for any other."""
+        each = [_kinds_of(sentence) for one in member.sums for _, sentence in one]
+        exposures, design = self.laid.fit.calset.exposures, self.laid.design
+        kinds = set(itertools.chain(*each))
+        others = [str(name) for name in np.unique(exposures.kind) if str(name) not in kinds]
+        if len(kinds) != 1 or not all(each) or not others:
+            return None
+        (kind,) = kinds
+        sums = tuple(
+            tuple((-size, _in_kind(sentence, kind, other)) for size, sentence in each for other in others)
+            for each in member.sums
+        )
+        column = design.stacked([self.laid.columns.of(sums)])
+        projected = self.projector(column)
+        square, along = projected.T @ projected, projected.T @ self.left
+        widths = np.array([_width(each) for each in sums])
+        evidence = log_bayes(square, along, widths) / self.laid.state.floor**2
+        # The same difference, seen from the other side: as probable, however its throughputs are known.
+        alike = max(self.laid.state.policy.even_odds, LINEAR * abs(member.evidence))
+        evidence = member.evidence if abs(evidence - member.evidence) < alike else evidence
+        name = "; ".join(sentence.text for each in sums for _, sentence in each)
+        return self._member(name, evidence, sums, column, square, along, widths)
+
+    def _member(
+        self,
+        name: str,
+        evidence: float,
+        sums: tuple[Sum, ...],
+        column: Matrix,
+        square: Matrix,
+        along: Vector,
+        widths: Vector,
+    ) -> Likeness:
+        laid = self.laid
+        covariance = np.linalg.inv(square + np.diag(widths**-2.0))
+        amplitudes = -covariance @ along
+        count = len(laid.fit.model.free)
+        values, slopes = np.zeros(count), np.zeros((count, len(widths)))
+        basis = self.projector.basis
+        values[self.rest] = moved(self.jacobian, basis, self.lost + column @ amplitudes)
+        slopes[self.rest] = moved(self.jacobian, basis, column)
+        values[self.at] = -laid.fit.values[laid.fit.model.free[self.at]]
+        vectors, added = laid.added(sums)
+        change = of_matrix(vectors, added @ amplitudes, laid.template.cameras.pairs)
+        change = change.reshape(laid.matrix.shape) + laid.slopes @ values
+        return Likeness(name, evidence, sums, amplitudes, covariance, values, slopes, change)
+
+    def _can_be_said(self, sums: Sequence[Sum]) -> bool:
+        """True if a model can hold all sentences."""
+        sentences = [sentence for each in sums for _, sentence in each]
+        if not all(map(self.laid.columns.has, sums)):
+            return False
+        if any(
+            one.kind not in KINDS or not all(isinstance(f, str) for f in one.factors) for one in sentences
+        ):
+            return False
+        stated = {text for effect in self.laid.fit.model.effects for text in effect.stated}
+        if stated.intersection(one.text for one in sentences):
+            return False
+        try:
+            patched(
+                dataclasses.replace(self.laid.template, effects=()),
+                [(one, jnp.zeros(())) for one in sentences],
+            )
+        except ValueError:
+            return False
+        return True
+
+
+def _kinds_of(sentence: Sentence) -> list[str]:
+    """The KINDs of exposures that a sentence is about."""
+    return [str(text).removeprefix("kind ") for text in sentence.factors if str(text).startswith("kind ")]
+
+
+def _in_kind(sentence: Sentence, kind: str, other: str) -> Sentence:
+    """A sentence about exposures of another KIND."""
+    factors = tuple(f"kind {other}" if text == f"kind {kind}" else text for text in sentence.factors)
+    return dataclasses.replace(sentence, factors=factors)
+
+
+def _width(each: Sum) -> float:
+    return AMPLITUDES[each[0][1].parameter].width
+
+
+def covariance_of_free(fit: FitResult) -> Matrix:
+    """Covariance of the free parameters of a fit."""
+    return fit.covariance[np.ix_(fit.model.free, fit.model.free)]

@@ -1,0 +1,170 @@
+"""The product of a diagnosis: the mean over the classes of what was added, with their spread in its covariance.
+
+Model        that of the fit with the sentences of all members of all classes. An amplitude is 0 in the models of the
+             others, so that values and covariance of the mixture (`class_average`) are all there is to it: the matrix,
+             errors of stars and maps follow as for any other calibration.
+Trust        Where members differ in what they do to stars by more than the goal, or by more than the errors of the fit,
+             only a class was named, and nothing of it is trusted: most of the error is then what is open.
+Limits       to first order; what was added to one and the other is taken as independent.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.thresholds import GOAL
+from walop_jax.diagnosis.class_average import known_apart_from, mixture
+from walop_jax.diagnosis.policy import POLICY
+from walop_jax.io.text import some, two_digits
+from walop_jax.model.effects import Context, Described
+from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.specification import Model, model_without, with_effects
+
+Vector = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "_ _"]
+Sum = tuple[tuple[float, Sentence], ...]
+"""One amplitude: a sum of sentences with their coefficients."""
+
+FAR = 3.0  # errors of the product that no plausible member may lie from an element of it, in the median
+_SHOWN = 4  # members that are told in a sentence
+
+
+class Likeness(NamedTuple):
+    """One member of a class: its words, ln B against the model without what was added, its amplitudes in sentences.
+
+    `values` is the change of the free parameters of the fit, where those of what was added become 0, `slopes` is that
+    by its amplitudes, which have a `covariance`; `change` that of the elements of the matrix at the field points.
+    """
+
+    name: str
+    evidence: float
+    sums: tuple[Sum, ...]
+    amplitudes: Vector
+    covariance: Matrix
+    values: Vector
+    slopes: Matrix
+    change: Float[np.ndarray, "p m"]
+    probability: float = 0.0
+
+
+class ClassOf(NamedTuple):
+    """An addition, and the members of its class, itself first.
+
+    `at` are the positions of its amplitudes among the free parameters. `spread` is the error of p of stars between
+    members, `stated` that of the fit, medians over the field; `off` by how many errors of the product the farthest
+    member lies from it, in the median of the field, the worst element.
+    """
+
+    added: str
+    at: Int[np.ndarray, " a"]
+    members: tuple[Likeness, ...]
+    spread: float
+    stated: float
+    off: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Members beside what was added."""
+        return tuple(member.name for member in self.members[1:])
+
+
+def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Context) -> Calibration:
+    """The calibration of a fit as the mean over the classes of what was added, with their spread in its covariance.
+
+    Its model holds all members, in sentences; what was added to one and the other is taken as independent.
+    """
+    if not classes:
+        return calibration
+    old, model = calibration.model, _holding(calibration, classes, context)
+    place = np.array([model.index(name) for name in old.names])
+    count, free = len(model.parameters), old.free
+    start, told = np.zeros(count), np.zeros((count, count))
+    start[place] = calibration.values
+    told[np.ix_(place, place)] = calibration.covariance
+    into = np.zeros((count, len(old.names)))
+    into[place, np.arange(len(old.names))] = 1.0
+    into = into @ old.selection()
+    of_free = calibration.covariance[np.ix_(free, free)]
+    values, covariance = start.copy(), told.copy()
+    for one in classes:
+        rest = into @ known_apart_from(of_free, one.at) @ into.T
+        each, errors = [start], [told]
+        for member in one.members[1:]:
+            slopes = into @ member.slopes
+            for j, parts in enumerate(member.sums):
+                for size, sentence in parts:
+                    slopes[model.index(f"{Described.name}.{sentence.label}"), j] += size
+            moved_to = start + into @ member.values
+            own = slopes - into @ member.slopes
+            each.append(moved_to + own @ member.amplitudes)
+            errors.append(rest + slopes @ member.covariance @ slopes.T)
+        found = mixture(np.array([member.probability for member in one.members]), np.stack(each), errors)
+        values += found.mean - start
+        covariance += found.covariance - told
+    hidden = calibration.hidden
+    if hidden is not None:
+        changes = np.zeros((len(hidden), count))
+        changes[:, place] = hidden.changes
+        hidden = dataclasses.replace(hidden, changes=changes)
+    return dataclasses.replace(
+        calibration, model=model, values=values, covariance=_positive(covariance), hidden=hidden
+    )
+
+
+def _holding(calibration: Calibration, classes: Sequence[ClassOf], context: Context) -> Model:
+    """The model with the sentences of all members."""
+    texts = dict.fromkeys(
+        sentence.text
+        for one in classes
+        for member in one.members[1:]
+        for each in member.sums
+        for _, sentence in each
+    )
+    model = calibration.model
+    said = Described.saying(list(texts), np.zeros(len(texts)))
+    if Described.name in model.effect_names:
+        earlier = model.instrument(calibration.values).effect(Described.name)
+        assert isinstance(earlier, Described)
+        known = {p.name: p for p in model.parameters}
+        wider = with_effects(model_without(model, Described.name), [earlier.joined(said)], context)
+        return dataclasses.replace(wider, parameters=tuple(known.get(p.name, p) for p in wider.parameters))
+    return with_effects(model, [said], context)
+
+
+def _positive(matrix: Matrix) -> Matrix:
+    """The symmetric matrix without directions of negative variance, which differences of rounding make."""
+    scale = np.sqrt(np.clip(np.diag(matrix), 0.0, None))
+    unit = np.where(scale > 0, scale, 1.0)
+    value, vector = np.linalg.eigh(0.5 * (matrix + matrix.T) / np.outer(unit, unit))
+    if value.min(initial=0.0) >= 0.0:
+        return 0.5 * (matrix + matrix.T)
+    found = (vector * np.clip(value, 0.0, None)) @ vector.T * np.outer(unit, unit)
+    return np.where(np.outer(scale > 0, scale > 0), 0.5 * (found + found.T), 0.0)
+
+
+def only_a_class(classes: Sequence[ClassOf]) -> Iterator[str]:
+    """A sentence on each class whose members differ by so much that nothing of it may be trusted."""
+    for one in classes:
+        apart = one.spread > min(GOAL, max(one.stated, POLICY.negligible))
+        if not (apart or one.off > FAR):
+            continue
+        names = some([f"{m.name} ({100 * m.probability:.0f} %)" for m in one.members[1:]], _SHOWN)
+        yield (
+            f"only a class of causes was named: {one.added} ({100 * one.members[0].probability:.0f} %) or {names}, and "
+            f"they differ in what they do to stars (p by {two_digits(100 * one.spread)} %, median, where the errors of "
+            f"the fit are {two_digits(100 * one.stated)} %; elements of the matrix by up to "
+            f"{two_digits(one.off)} errors): {_deciding(one)}"
+        )
+
+
+def _deciding(one: ClassOf) -> str:
+    """Observations that would tell the members apart."""
+    tests = [s.tested_by for member in one.members for each in member.sums for _, s in each[:1]]
+    told = some(list(dict.fromkeys(tests)), 2) if tests else "other exposures"
+    return f"what would decide: {told}; walop-jax plan --criterion apart finds the exposures"
