@@ -416,13 +416,13 @@ def test_polarisation_that_a_telescope_adds_grows_with_time_in_light_from_the_sk
         bare.kinds,
         (),
     )
-    sight = Sight(exposures, np.zeros((3, 2)), np.full(3, -1), np.asarray(0.1), np.asarray(0.0))
+    sight = Sight(exposures, jnp.zeros((3, 2)), jnp.full(3, -1), jnp.asarray(0.1), jnp.asarray(0.0))
     with_it, without = (
         np.asarray(light.stokes(dataclasses.replace(bare, effects=effects), sight))
         for effects in ((said,), ())
     )
     np.testing.assert_allclose(with_it - without, [[0] * 4, [0, 2e-3, 0, 0], [0] * 4], atol=1e-15)
     there = dataclasses.replace(bare, effects=(said,))
-    zero = np.asarray(0.0)
+    zero = jnp.asarray(0.0)
     np.testing.assert_array_equal(light.telescope(there, zero, zero), light.telescope(bare, zero, zero))
     assert left_behind(there) == ("described",)
