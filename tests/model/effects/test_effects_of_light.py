@@ -123,8 +123,7 @@ def test_moon_patch_is_of_its_exposure():
         stokes(
             dataclasses.replace(
                 make("moon_patch").replaced(q=jnp.array([0.003]), u=jnp.array([-0.004])),
-                positions=(1,),
-                ids=(7,),
+                moon=((1, 7),),
             )
         )
         - stokes()
