@@ -182,23 +182,23 @@ def test_the_core_is_reached_without_the_rest(entry):
 
 
 MOST_LINES = {
-    "io": 1650,
+    "io": 1600,
     "instruments": 250,
-    "data": 4400,
+    "data": 4450,
     "sky": 250,
     "model": 9000,
-    "likelihood": 3600,
+    "likelihood": 3300,
     "simulation": 900,
     "fit": 2200,
-    "calibration": 2750,
+    "calibration": 2850,
     "posterior": 2400,
-    "science": 4950,
+    "science": 4750,
     "diagnosis": 7500,
     "nights": 2800,
     "plans": 2350,
     "paper": 860,
-    "reports": 2750,
-    "commands": 4600,
+    "reports": 2800,
+    "commands": 3900,
 }
 """Lines of each room: raising one is a decision of its own."""
 

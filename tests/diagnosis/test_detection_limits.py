@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -121,15 +120,13 @@ def test_without_rivals_what_is_detected_is_named(fitted):
     assert found.separation.shape == (1, 1)
 
 
-class Twin(effect_by_name("wollaston_axis")):
-    """What another effect does, under another name."""
-
-    name: ClassVar[str] = "twin"
+TWIN = dataclasses.replace(effect_by_name("wollaston_axis"), name="twin")
+"""What another effect does, under another name."""
 
 
 def test_two_effects_that_do_the_same_are_told_as_a_class(fitted):
     """Neither can ever be named, and each may be taken for the other."""
-    found = detection_limits(fitted, catalogue=(effect_by_name("wollaston_axis"), Twin))
+    found = detection_limits(fitted, catalogue=(effect_by_name("wollaston_axis"), TWIN))
     assert {(e.effect, e.taken_for) for e in found.limits} == {
         ("wollaston_axis", ("twin",)),
         ("twin", ("wollaston_axis",)),

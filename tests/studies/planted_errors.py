@@ -45,8 +45,8 @@ ERRORS = (
     planted("io/text.py", "places = 1 - math.floor", "places = 2 - math.floor", "io/test_rounding.py"),
     planted("io/fits_reading.py", "_MOST = 999", "_MOST = 9999", "data/test_hostile_headers.py"),
     # data
-    planted("data/merge.py", "/ math.sqrt(math.pi)", "* math.sqrt(math.pi)", _REPEATS),
-    planted("data/merge.py", "return smallest > _NOISE", "return smallest < _NOISE", _REPEATS),
+    planted("data/table_intensities.py", "2 * np.bincount(row, again) > ", "4 * np.bincount(row, again) > ", _REPEATS),
+    planted("data/table_intensities.py", "[block.x[at], block.y[at], *block", "[block.x[at], *block", _REPEATS),
     planted("data/checks.py", "refuse(np.abs(table[name]) > limit, f", "refuse(table[name] > limit, f",
             "data/test_bad_inputs.py"),
     planted("data/table_intensities.py", "isfinite(sigma) & (sigma <= 0)", "isfinite(sigma) & (sigma < 0)",

@@ -64,9 +64,7 @@ def test_clp_wobble_from_its_linear_directions():
     found = kind.combine(group, (0.06 * np.cos(1.1), 0.06 * np.sin(1.1)))
     assert float(found.amplitude) == pytest.approx(0.06)
     assert float(found.phase) == pytest.approx(1.1)
-    mirrored = dataclasses.replace(
-        found, amplitude=-found.amplitude, phase=found.phase - np.pi
-    ).standard_form()
+    mirrored = found.replaced(amplitude=-found.amplitude, phase=found.phase - np.pi).standard_form()
     assert float(mirrored.amplitude) == pytest.approx(0.06)
     assert float(mirrored.phase) == pytest.approx(1.1)
 
@@ -124,7 +122,8 @@ def test_moon_patch_is_of_its_exposure():
     found = (
         stokes(
             dataclasses.replace(
-                make("moon_patch"), q=jnp.array([0.003]), u=jnp.array([-0.004]), positions=(1,), ids=(7,)
+                make("moon_patch").replaced(q=jnp.array([0.003]), u=jnp.array([-0.004])),
+                moon=((1, 7),),
             )
         )
         - stokes()
