@@ -51,13 +51,13 @@ class ExposureArrays(eqx.Module):
     kinds: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
-    def median(self) -> Float[Array, "e k"]:
+    def median(self) -> Float[Array | np.ndarray, "e k"]:
         """Median counts over the field of every camera."""
         if self.median_counts is None:
             raise NotPlannedError("median")
         return self.median_counts
 
-    def of_kind(self, name: str) -> Bool[Array, " e"]:
+    def of_kind(self, name: str) -> Bool[Array | np.ndarray, " e"]:
         """True in exposures of a KIND."""
         return self.kind == (self.kinds.index(name) if name in self.kinds else -1)
 
