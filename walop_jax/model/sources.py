@@ -51,7 +51,7 @@ class ExposureArrays(eqx.Module):
     kinds: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
-    def median(self) -> Float[Array | np.ndarray, "e k"]:
+    def median(self) -> Float[Array, "e k"]:
         """Median counts over the field of every camera."""
         if self.median_counts is None:
             raise NotPlannedError("median")
@@ -90,7 +90,7 @@ class Source(Component):
 
     def shines(self, sight: Sight) -> Bool[Array, " e"]:
         """The exposures that see it."""
-        return sight.exposures.of_kind(self.kind)
+        return jnp.asarray(sight.exposures.of_kind(self.kind))
 
     def polarisation(self, sight: Sight) -> Float[Array, "e 2"]:
         """(q, u) in the instrument frame; unpolarised unless a source says otherwise."""
