@@ -186,7 +186,7 @@ MOST_LINES = {
     "instruments": 250,
     "data": 4450,
     "sky": 250,
-    "model": 9020,
+    "model": 9014,
     "likelihood": 3300,
     "simulation": 900,
     "fit": 2200,

@@ -101,9 +101,7 @@ class Instrument(Component):
     effects: tuple[Any, ...] = ()  # patches: `effects.base.Effect`
     rotator_zero: Scalar | None = number(unit="deg", about="true ROTATOR minus the header's", default=None)
     filter_shift: Scalar | None = number(unit="um", about="displacement of broad bands", default=None)
-    sky_films: tuple[
-        Any, ...
-    ] = ()  # what light from the sky meets in single exposures (`effects.optics.SkyFilm`)
+    sky_films: tuple[Any, ...] = ()  # what light from the sky meets in single exposures (`optics.SkyFilm`)
     field_limit: float = eqx.field(static=True, default=90.0)
     site: tuple[str, float, float, float, float] = eqx.field(static=True, default=NO_SITE)
     raster: tuple[str, float] = eqx.field(static=True, default=("square", 0.0))

@@ -403,6 +403,14 @@ def test_factors_of_single_exposures_by_hand():
     np.testing.assert_allclose(factor("side CLP").value(at, OF_WALOP), [0, -1, 1])
 
 
+@pytest.mark.parametrize(
+    "given", ["hours", "hours 0 to 2", "exposure 3", "kind moon", "side CLP", "order", "per EXPTIME"]
+)
+def test_a_change_in_single_exposures_is_not_known_for_stars(given):
+    assert Change.parsed("gain of O1").of_stars
+    assert not Change.parsed(f"gain of O1 * {given}").of_stars
+
+
 def test_polarisation_that_a_telescope_adds_grows_with_time_in_light_from_the_sky_alone():
     """(0, a h, 0, 0) per unit of light of the Moon after h hours; light through the polariser and stars have none."""
     bare = nominal_instrument("WALOP-SOUTH")
