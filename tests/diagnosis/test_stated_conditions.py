@@ -177,7 +177,7 @@ def test_a_name_that_explains_a_fit_far_off_is_kept():
     turn = effect_from_text("wollaston_axis=0.3", SMALL.context())
     calset = simulate(SMALL, seed=SEED, effects=[turn]).calset
     wrong = refit(calset)
-    named = refit(calset, with_effects(wrong.model, [turn.neutral(SMALL.context())], SMALL.context()))
+    named = refit(calset, with_effects(wrong.model, [turn.kind.neutral(SMALL.context())], SMALL.context()))
     assert wrong.noise_scale > 2.0
     assert named.noise_scale == 1.0
     every = dataclasses.replace(POLICY, alarm=np.inf)

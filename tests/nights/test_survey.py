@@ -303,7 +303,7 @@ def kept(sets, single, tmp_path_factory):
 def test_the_program_stacks_what_python_does(kept, sets, single, monkeypatch):
     """Resumed, from a run and two sets in another order, with the law of the model file; as if they were many."""
     survey = stacking.read_survey(kept / "SURVEY")
-    monkeypatch.setattr(stacking, "MANY", 2)
+    monkeypatch.setattr(stacking, "Maker", lambda like, folder, count: making.Maker(like, folder, 1000))
     laws = {"throughput.n1.p00": {"per": "walk", "rate": 1e-4}}
     other = stack([single, *sets[1:3]], laws)
     assert survey.changing == other.changing

@@ -337,7 +337,9 @@ def documented_command(name: str) -> list[str]:
 )
 def test_the_documented_command_makes_the_set_in_fits_data(tmp_path: Path, name: str, truth: str):
     arguments = [
-        str(tmp_path / Path(word).name) if word.startswith("fits_data/") else word
+        str((FITS_DATA if word.endswith(".toml") else tmp_path) / Path(word).name)
+        if word.startswith("fits_data/")
+        else word
         for word in documented_command(name)
     ]
     run([sys.executable, "-c", "from walop_jax.commands import main; main()", *arguments], check=True)
