@@ -172,6 +172,15 @@ def test_a_name_that_explains_no_more_than_a_stated_number_is_told_beside_it():
     assert "the equinox of RA and DEC 20" in told
 
 
+def test_a_number_that_would_be_impossible_is_no_rival():
+    """An encoder's wobble of 0.3°: Newton's steps in the latitude of the site end beyond the pole."""
+    wobble = effect_from_text("clp_wobble=amplitude:0.3,phase:1.0", SMALL.context())
+    wrong = refit(simulate(SMALL, seed=SEED, effects=[wobble]).calset)
+    neutral = wobble.kind.neutral(SMALL.context())
+    right = refit(wrong.calset, with_effects(wrong.model, [neutral], SMALL.context()))
+    assert instead_of_names(wrong, right) == ""
+
+
 def test_a_name_that_explains_a_fit_far_off_is_kept():
     """Wollaston prisms turned by 0.3°: χ² in multiplied errors is not compared with χ² in those that are stated."""
     turn = effect_from_text("wollaston_axis=0.3", SMALL.context())

@@ -223,6 +223,8 @@ def instead_of_names(before: FitResult, after: FitResult, policy: Policy = POLIC
         found, size, result, now = one.stated, 0.0, before, one
         for _ in range(_ROUNDS):  # Gauss and Newton: hours are no small step
             size += float(now.score.amplitudes[0])
+            if abs(size) >= found.width:  # a latitude beyond the pole, a negative temperature
+                break
             likelihood = Likelihood.of(found.changed(size), before.model)
             result = fit(likelihood, start=result.values, noise_scale=before.noise_scale)
             there = {one.stated.what: one for one in condition_scores(Design.of(result))}
@@ -232,7 +234,7 @@ def instead_of_names(before: FitResult, after: FitResult, policy: Policy = POLIC
         score, square = now.score, now.square
         worth = 0.5 * (before.posterior.objective - result.posterior.objective)
         worth -= 0.5 * float(np.log1p(square * found.width**2))
-        if result.converged and worth > best:
+        if result.converged and abs(size) < found.width and worth > best:
             value = size if found.value is None else found.value + size
             sigma = float(np.sqrt(score.covariance[0, 0]))
             by = " changed by" if found.value is None else ""
@@ -463,7 +465,8 @@ def _of_sky(calset: CalibrationSet) -> Iterator[_Stated]:
             there = float(getattr(site, name))
 
             def elsewhere(step: float, name: str = name, there: float = there) -> CalibrationSet:
-                return dataclasses.replace(calset, site=dataclasses.replace(site, **{name: there + step}))
+                moved = float(np.clip(there + step, -90.0, 90.0)) if name == "latitude" else there + step
+                return dataclasses.replace(calset, site=dataclasses.replace(site, **{name: moved}))
 
             remedy, shown_by = "check the site in the header", "the position of the telescope on a map"
             yield _Stated(f"the {name} of the site", "deg", remedy, shown_by, width, elsewhere, there)
