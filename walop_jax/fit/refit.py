@@ -209,7 +209,7 @@ class FitResult(Fitted):
         return self[name][:2]
 
     def to_arviz(self, draws: int = 1000, seed: int = 0) -> Any:
-        """ArviZ InferenceData of the parameters that vary: 4 chains of independent draws from values and covariance.
+        """The parameters that vary, for ArviZ: 4 chains of independent draws from values and covariance.
 
         Exact as far as the model is linear within the errors; `walop_jax.sample` draws from the posterior itself.
         """

@@ -80,7 +80,7 @@ class Run(RunFolder, Result):
 
     @functools.cached_property
     def posterior(self) -> Any:
-        """The draws as ArviZ InferenceData."""
+        """The draws, in the groups of ArviZ."""
         return read_groups(self.folder / POSTERIOR) if POSTERIOR in self else None
 
     @functools.cached_property

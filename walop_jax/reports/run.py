@@ -121,7 +121,7 @@ class FigureSource:
 
     @property
     def posterior(self) -> Any:
-        """The draws as ArviZ InferenceData; None without any."""
+        """The draws, in the groups of ArviZ; None without any."""
         return self.held.get(POSTERIOR) if self.run is None else self.run.posterior
 
     @property
