@@ -13,7 +13,7 @@ TRUTH = Path(__file__).resolve().parents[2] / "fits_data/walop_south_small_truth
 def test_the_demonstration_runs(tmp_path: Path):
     fit = walop.demo(output=tmp_path / "demo")
     assert fit.trusted
-    assert "(median error for p ≤ 5 %)" in (tmp_path / "demo/RUN/report.html").read_text()
+    assert "median error for p" in (tmp_path / "demo/RUN/report.html").read_text()
     truth = json.loads(TRUTH.read_text())["parameters"]["pupil.magnification"]["value"]
     found = fit["pupil.magnification"]
     assert abs(found.value - truth) < 4 * found.sigma
