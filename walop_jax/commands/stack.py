@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -69,10 +68,8 @@ def stack(
             "workers and scheduler exclude each other: a cluster has its own workers", "scheduler"
         )
     given: list[Any] = list(nights) if isinstance(nights, list | tuple) else [nights]
-    with contextlib.ExitStack() as hold:
-        job = hold.enter_context(job.reserved(output, FILES))
+    with job.reserved(output, FILES) as job, executor_of(workers, scheduler) as executor:
         job.begin("reading")
-        executor = hold.enter_context(executor_of(workers, scheduler))
         survey = stacked(
             given,
             laws,

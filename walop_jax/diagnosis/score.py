@@ -127,6 +127,10 @@ class ScoreTable:
         """p of a candidate corrected for the number of candidates tried."""
         return corrected_p(score.log_p, self.trials)
 
+    def significant(self, alarm: float, most: int) -> tuple[str, ...]:
+        """Names of up to `most` candidates with a corrected p below `alarm`, the smallest first."""
+        return tuple(score.name for score in self.ranked if self.corrected(score) < alarm)[:most]
+
     def local(self, p: float) -> float:
         """The local p that the smallest of all candidates undercuts with probability `p` under the base."""
         return local_p(p, self.trials)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from scipy import linalg
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar
@@ -47,10 +48,7 @@ def sentence_scores(design: Design) -> ScoreTable:
     if not names:
         return ScoreTable((), noise, 1.0, 1.0)
     widths, before, scores = (np.concatenate(each) for each in list(zip(*parts, strict=True))[:3])
-    gram, first = np.zeros((len(widths),) * 2), 0
-    for *_, block in parts:
-        at = slice(first, first + len(block))
-        gram[at, at], first = block, at.stop
+    gram = np.asarray(linalg.block_diag(*(block for *_, block in parts)))
     space = ScoreSpace(tuple(names), tuple(sizes), widths, before, gram, design.projector.free)
     return space.table_after(ScoreTable((), noise, 1.0, float(len(names))), scores)
 
@@ -77,7 +75,7 @@ def described_doubts(design: Design, policy: Policy = POLICY) -> Iterator[str]:
     table = sentence_scores(design)
     if table.p_global >= policy.alarm:
         return
-    names = [score.name for score in table.ranked if table.corrected(score) < policy.alarm][:_SHOWN]
+    names = table.significant(policy.alarm, _SHOWN)
     yield (
         f"the residuals are explained better with something that the model has not (p = {table.p_global:.2g}, limit "
         f"{policy.alarm:g}; nearest: {' | '.join(names)}): walop-jax diagnose looks for the cause"

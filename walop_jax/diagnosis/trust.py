@@ -214,7 +214,7 @@ def sampled(result: FitResult, most: int) -> FitResult:
 def _patterns(table: ScoreTable, policy: Policy) -> Iterator[str]:
     if table.p_global >= policy.alarm:
         return
-    names = [score.name for score in table.ranked if table.corrected(score) < policy.alarm][:_SHOWN]
+    names = table.significant(policy.alarm, _SHOWN)
     yield (
         f"the residuals hold patterns that noise does not make (p = {table.p_global:.2g}, limit {policy.alarm:g}: "
         f"{', '.join(names)}): walop-jax diagnose looks for the cause"
