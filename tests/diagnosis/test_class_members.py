@@ -1,6 +1,7 @@
 """Classes of what was added: whom data cannot tell from it, what each does to the matrix, and the product of them."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -14,9 +15,11 @@ from walop_jax.diagnosis.class_product import averaged, only_a_class
 from walop_jax.diagnosis.examination import examine
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
+from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described
 from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.posterior.run import Run
 from walop_jax.simulation.simulate import simulate
 
 TOLD = "gain of O1 * kind moon"
@@ -83,3 +86,11 @@ def test_the_product_is_read_as_it_was_written(told, tmp_path):
     here = product.matrix(0.1, 0.1), again.matrix(0.1, 0.1)
     for ours, theirs in zip(*here, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-15)
+
+
+def test_a_mean_over_a_class_is_not_made_anew_as_one_fit(tmp_path):
+    """Nothing can be sampled around it: the advice is the fit of the model that comes with it."""
+    entry = {"added": TOLD, "members": [{"name": TOLD, "probability": 0.5}]}
+    (tmp_path / "diagnosis.json").write_text(json.dumps({"members": [entry]}))
+    with pytest.raises(DataError, match=r"mean over .* refit --model .*model\.toml"):
+        Run(tmp_path).fit()

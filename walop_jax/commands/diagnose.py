@@ -14,6 +14,7 @@ from walop_jax.commands.inputs import (
     Sets,
     set_and_model,
 )
+from walop_jax.io.names import DIAGNOSIS, FIGURE_DATA, MODEL, PRODUCT, SUMMARY
 from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
@@ -21,8 +22,7 @@ if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult
     from walop_jax.io.display import Display
 
-MODEL = "model.toml"
-OUTPUTS = ("calibration.fits", "summary.json", "diagnosis.json", "diagnosis.fits", MODEL)
+OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA, MODEL)
 
 
 MINUTES = Option(
@@ -63,7 +63,6 @@ def diagnose(
     from walop_jax.diagnosis.workflow import diagnose as diagnosis_of
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.model_file import render
-    from walop_jax.io.names import DIAGNOSIS, FIGURE_DATA, PRODUCT, SUMMARY
     from walop_jax.science.field_accuracy import answered
 
     job.begin("reading")

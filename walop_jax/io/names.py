@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-PRODUCT = "calibration.fits"
+PRODUCT, MODEL = "calibration.fits", "model.toml"
 SUMMARY, FAILED = "summary.json", "summary.failed.json"
 DIAGNOSIS, FIGURE_DATA = "diagnosis.json", "diagnosis.fits"
 POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "posterior_corner.png", "sample.json"

@@ -21,7 +21,7 @@ from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.verdict import STATED
 from walop_jax.io.display import Display, Result
 from walop_jax.io.errors import errors_naming, fail
-from walop_jax.io.names import POSTERIOR, PRODUCT
+from walop_jax.io.names import MODEL, POSTERIOR, PRODUCT
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import two_digits
 from walop_jax.likelihood import limits
@@ -114,9 +114,15 @@ class Run(RunFolder, Result):
         """The fit of the run, made once more from where it ended; `model_text` is the model file of the fit.
 
         Raises `DataError` when the data are missing, not those of the fit or too many to be sampled, and when the fit
-        does not come out as the calibration says (another model, or another version of the physics). Errors are made as
-        those of the calibration were, and the verdict is its verdict.
+        does not come out as the calibration says (another model, or another version of the physics), or is a mean over
+        a class. Errors are made as those of the calibration were, and the verdict is its verdict.
         """
+        if self.documents.get("diagnosis", {}).get("members"):
+            raise fail(
+                "is the mean over what its data cannot tell apart, and no fit of one model",
+                file=self.folder,
+                advice=f"fit one: walop-jax refit --model {self.folder / MODEL}, and take that run",
+            )
         calibration, calset = self.rebuilt, self.calset
         text = "\n".join(calibration.product.model_lines) if model_text is None else model_text
         model = model_for(calset, text, calibration.design, self.catalogue)

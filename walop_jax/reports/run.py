@@ -74,12 +74,16 @@ class FigureSource:
             return cls(given, **options)
         if isinstance(given, PosteriorSample):
             return cls(held={POSTERIOR: given.groups()}, sample=given, **options)
-        held = {FIGURE_DATA: figure_data(given)} if isinstance(given, Diagnosis) else {}
-        fit = given.after if isinstance(given, Diagnosis) else given
-        if isinstance(fit, FitResult):
-            held |= {DATA: fit.likelihood, PRODUCT: Calibration.from_fit(fit)}
+        if isinstance(given, Diagnosis):
+            product = given.calibration()  # of a class its model has the members as well
+            data = given.after.likelihood
+            if product.model is not given.after.model:
+                data = Likelihood.of(given.after.calset, product.model)
+            held = {FIGURE_DATA: figure_data(given), DATA: data, PRODUCT: product}
+        elif isinstance(given, FitResult):
+            held = {DATA: given.likelihood, PRODUCT: Calibration.from_fit(given)}
         else:
-            held |= {PRODUCT: fit}
+            held = {PRODUCT: given}
         return cls(held=held, **options)
 
     def __contains__(self, name: str) -> bool:
