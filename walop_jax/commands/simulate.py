@@ -15,9 +15,11 @@ from walop_jax.io.text import json_text, parse_toml, read_text, rounded
 if TYPE_CHECKING:
     from walop_jax import Effect, Instrument, ObservingPlan
     from walop_jax.model.effects import EffectKind
-    from walop_jax.simulation.simulate import Simulated
 
 PLAN = Argument("Observing plan (TOML); default: the usual one of the instrument.", "[PLAN.toml]", Path)
+STARS = Option(
+    "Make a catalogue of so many stars in place of the set: of the same instrument.", "N", int, least=1
+)
 EFFECT = Option(
     "Effect to hide in the data; NAME=par:value,par:value for several parameters (a/b/c/d for one "
     "value per element), NAME alone where there is none to give. May be repeated.",
@@ -36,26 +38,34 @@ def simulate(
     effect: Annotated[str | Sequence[str | Effect] | Mapping[str, Any] | None, EFFECT] = None,
     effects: Effects = None,
     truth: Annotated[PathLike | None, Option("Write the true parameters here.", "FILE.json", Path)] = None,
+    stars: Annotated[int | None, STARS] = None,
     noiseless: bool = False,
     catalogue_seed: int | None = None,
-) -> Outcome[Simulated]:
+) -> Outcome[Any]:
     """Make a calibration set of an instrument whose as-built values are drawn from their priors.
 
     The light path is the one that a fit uses; noise is that of photons and of the detectors (30 electrons). What is
     observed is said by a plan file (see walop-jax docs files): field points, angles, Moon patches, standards, filters.
 
-    In Python: the set and the true instrument. `effect` may be a dict, {"hwp1_axis": 0.3}, or `Effect` objects; with a
-    plan, an `Instrument` as `instrument` is the true one, not drawn. `noiseless`: expected counts, with the errors that
-    they would have. The same plan, seed and effects give the same set, bit for bit. `catalogue_seed` draws the
-    standards apart from the rest: nights of one survey have theirs in common.
+    With `stars` it is a catalogue of the sky for `apply`, `gather` and `watch` (RA, DEC, BP_RP and all): the same plan,
+    seed and effects give the stars of the instrument that the set calibrates.
+
+    In Python: the set and the true instrument; with `stars` the catalogue, an astropy table. `effect` may be a dict,
+    {"hwp1_axis": 0.3}, or `Effect` objects; with a plan, an `Instrument` as `instrument` is the true one, not drawn.
+    `noiseless`: expected counts, with the errors that they would have. The same plan, seed and effects give the same
+    set, bit for bit. `catalogue_seed` draws the standards apart from the rest: nights of one survey have theirs in
+    common.
 
     >>> calset, truth = walop.simulate(walop.ObservingPlan(grid=4), effect={"hwp1_axis": 0.3})  # doctest: +SKIP
     """
     from walop_jax import Instrument, ObservingPlan
     from walop_jax.data.write import write_calibration_set
     from walop_jax.io.atomic import atomic_path, check_output
+    from walop_jax.io.plain_tables import astropy_table, write_table
     from walop_jax.model.instrument import nominal_instrument
+    from walop_jax.science.simulated_stars import simulated_stars
     from walop_jax.simulation.observing_plan import instrument_named, read_plan
+    from walop_jax.simulation.simulate import Simulated, true_instrument
     from walop_jax.simulation.simulate import simulate as simulated
 
     true = instrument if isinstance(instrument, Instrument) and plan is not None else None
@@ -70,36 +80,40 @@ def simulate(
         raise UsageError(str(error)) from None
     if truth is not None:
         check_output(truth, overwrite=job.overwrite)
+    drawn: dict[str, Any] = {"instrument": true, "effects": hidden, "catalogue_seed": catalogue_seed}
+    about: dict[str, Any] = {"output": output, "instrument": plan.name, "seed": job.seed, "truth": truth}
+    about["effects"] = [one.name for one in hidden]
     job.tell("following the light", "following")
-    made = simulated(
-        plan,
-        job.seed,
-        instrument=true,
-        effects=hidden,
-        noiseless=noiseless,
-        catalogue_seed=catalogue_seed,
-    )
+    made: Any
+    if stars is not None:
+        if "standard" not in plan.design.kinds:
+            raise UsageError(f"{plan.name} sees no stars", "stars")
+        instrument_there = true_instrument(plan, job.seed, **drawn)[1]
+        seen = simulated_stars(plan, instrument_there, stars, job.seed, noiseless=noiseless)
+        made = astropy_table(seen.columns, {"INSTRUME": plan.name})
+        known = truth_document(plan, job.seed, instrument_there) | {"stars": seen.document()}
+        about["stars"] = stars
+        text = f"{output}: {plan.name}, {stars} stars of the instrument of seed {job.seed}"
+        suggested = (f"walop-jax apply RUN {output} -o OUT.fits",)
+    else:
+        made = simulated(plan, job.seed, noiseless=noiseless, **drawn)
+        known = truth_document(plan, job.seed, made.truth)
+        about["exposures"], about["points"] = len(made.calset.exposures), len(made.calset.points)
+        about["rows"] = made.calset.intensities.rows
+        text = f"{output}: {plan.name}, {about['exposures']} exposures of {about['points']} points"
+        fit = f"walop-jax refit {output} --instrument {file} -o RUN"
+        suggested = (fit,) if plan.design.description else ()
     job.begin("writing")
     with contextlib.ExitStack() as stack:
         if truth is not None:
             temporary = stack.enter_context(atomic_path(truth, overwrite=job.overwrite))
-            temporary.write_text(json_text(truth_document(plan, job.seed, made.truth)), encoding="utf-8")
-        if output is not None:
+            temporary.write_text(json_text(known), encoding="utf-8")
+        if output is not None and isinstance(made, Simulated):
             write_calibration_set(output, made.calset, overwrite=job.overwrite)
-    document = {
-        "output": output,
-        "instrument": plan.name,
-        "seed": job.seed,
-        "exposures": len(made.calset.exposures),
-        "points": len(made.calset.points),
-        "rows": made.calset.intensities.rows,
-        "effects": [one.name for one in hidden],
-        "truth": truth,
-    }
-    text = f"{output}: {plan.name}, {document['exposures']} exposures of {document['points']} points; "
-    text += f"{'; '.join(map(_sized, hidden)) or 'nothing'} beyond the base model"
-    suggested = f"walop-jax refit {output} --instrument {file} -o RUN"
-    return Outcome(made, document, text, next=(suggested,) if plan.design.description else ())
+        elif output is not None:
+            write_table(output, made, overwrite=job.overwrite)
+    text += f"; {'; '.join(map(_sized, hidden)) or 'nothing'} beyond the base model"
+    return Outcome(made, about, text, next=suggested)
 
 
 def _hidden(given: Any, plan: ObservingPlan, catalogue: Sequence[EffectKind]) -> list[Effect]:

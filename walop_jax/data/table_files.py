@@ -20,6 +20,8 @@ from walop_jax.io.text import check_input, some, unpacking
 
 _PACKED = (".gz", ".bz2", ".xz")
 _ALSO = {".tsv": "ascii.csv", ".txt": "ascii.csv", ".dat": "ascii.csv", ".xml": "votable"}
+_SEXTRACTOR = b"#   1 "
+"""The begin of a text (ASCII_HEAD) of SExtractor: its first column, by number."""
 _SEPARATORS = (",", ";", "\t", "|")
 _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
 _CLASSES = bytes.maketrans(b'123456789,;\t|\n" ', b"ddddddddd" + b"s" * 7)  # digits and what separates cells
@@ -43,6 +45,8 @@ def read_table_file(path: Path, needed: Collection[str]) -> tuple[Path, Any, tup
             warnings.simplefilter("ignore")
             if _begins(path, b"SIMPLE  ="):  # whatever its name is
                 return path, *_from_fits(path, extension, needed)
+            if _begins(path, _SEXTRACTOR):
+                return path, _astropy_table(_content(path)[0].decode(), "ascii.sextractor"), ()
             kind = "" if path.suffix.lower() == ".zip" else _format(path)
             if kind == "fits":
                 return path, *_from_fits(path, extension, needed)

@@ -13,6 +13,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from walop_jax.data.camera_catalogues import OF_STARS
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, finite, plain_column
 from walop_jax.data.settings import TEMPERATURE, Settings
 from walop_jax.data.table_intensities import equal_rows
@@ -26,6 +27,8 @@ from walop_jax.data.user_tables import (
 )
 from walop_jax.io.errors import rows_text
 from walop_jax.model.instrument import Instrument
+from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
+from walop_jax.sky.directions import same_stars
 
 _NEGATIVE = 5.0  # sigma: what noise about a subtracted background may do, and no more
 _SINGLE = 1  # point: it may lie outside without a doubt about its unit
@@ -168,7 +171,7 @@ def true_matrices(
 class Catalogue:
     """The rows of a science catalogue.
 
-    `points` are positions and settings; `counts` and `sigma` [electron] are NaN where a camera is not used;
+    `points` are positions and settings, `teff_err` the errors of the colour temperatures (K; 0: none); `counts` and `sigma` [electron] are NaN where a camera is not used;
     `spoilt` marks rows in which a camera was flagged, `copy` those that repeat another row of their star to the last
     bit, which are not used, and `repeated` those that have the counts of another star or setting. `star` numbers the
     stars from 0; `rotator` [deg] is NaN for results in the instrument frame, `time` [MJD, d] where it is not known.
@@ -176,6 +179,7 @@ class Catalogue:
     """
 
     points: FieldPoints
+    teff_err: Float[np.ndarray, " n"]
     counts: Float[np.ndarray, "n k"]
     sigma: Float[np.ndarray, "n k"]
     spoilt: Bool[np.ndarray, " n"]
@@ -223,6 +227,7 @@ def read_catalogue(
     points, cameras = field_points(source, instrument, always_in, never_in), len(instrument.cameras)
     rule = Column("float", "electron", width=cameras, shape_advice=f"one row holds all {cameras} cameras")
     counts, sigma = vector_columns(source, ("N", "N_ERR"), rule, instrument.cameras.names)
+    points, teff_err = _with_colours(source, points, place)
     advice = "standard errors in electrons; NaN for a camera that is not to be used"
     place.refuse(np.isfinite(counts) & (sigma <= 0), "is not above 0", "N_ERR", advice)
     flagged = _flagged(source, instrument.cameras.names, place)
@@ -245,6 +250,7 @@ def read_catalogue(
     bad |= copy[:, None]
     return Catalogue(
         points=points,
+        teff_err=teff_err,
         counts=np.where(bad, np.nan, counts),
         sigma=np.where(bad, np.nan, sigma),
         spoilt=np.any(bad, axis=1) & ~copy,
@@ -255,6 +261,37 @@ def read_catalogue(
         time=time,
         remarks=source.about(),
     )
+
+
+CARRIED = ("RA", "DEC", *OF_STARS)
+"""Columns that are about the stars, and go through as they are."""
+
+
+def _with_colours(
+    source: InputTable, points: FieldPoints, place: Place
+) -> tuple[FieldPoints, Float[np.ndarray, " n"]]:
+    """Field points with the temperatures that BP_RP gives where there is no TEFF, and the errors of all of them (K)."""
+    source.used.update(set(CARRIED) & set(source.names))
+    columns = {name: Column("float", unit, missing=np.nan) for name, (unit, _) in OF_STARS.items()}
+
+    def numbers(name: str) -> Float[np.ndarray, " n"]:
+        return numeric_column(source, name, columns[name]) if name in source.names else np.full(source.rows, np.nan)
+
+    teff, error = points.settings.teff, np.nan_to_num(numbers("TEFF_ERR"))
+    place.refuse(error < 0, "is below 0", "TEFF_ERR", "standard errors in K")
+    error = np.where(np.isnan(teff), 0.0, error)
+    colour = numbers("BP_RP")
+    asked = np.isnan(teff) & np.isfinite(colour)
+    if not asked.any():
+        return points, error
+    made, off = temperature_of(np.where(asked, colour, np.nan), numbers("BP_RP_ERR"))
+    within = np.isfinite(made)
+    source.remarks.append(f"TEFF of {int(within.sum())} rows is made of BP_RP ({SOURCE})")
+    if beyond := int(np.sum(asked & ~within)):
+        limits = f"{LIMITS[0]:g} … {LIMITS[1]:g} mag"
+        source.remarks.append(f"BP_RP of {beyond} rows lies beyond {limits}: their errors are those of unknown colours")
+    settings = dataclasses.replace(points.settings, teff=np.where(within, made, teff))
+    return dataclasses.replace(points, settings=settings), np.where(within, off, error)
 
 
 _OF_RESULTS = ({"QU_COV", "P_DEBIASED"}, {"M21_ERR", "M22_ERR", "P_ERR"})

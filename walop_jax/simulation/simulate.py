@@ -176,15 +176,10 @@ def simulate(
     with `plan.context()`. `catalogue_seed` draws the standards apart from the rest (default: from `seed`): nights of
     one survey share their stars.
     """
-    build, stars, sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
-    if catalogue_seed is not None:
-        stars = np.random.default_rng(np.random.SeedSequence(catalogue_seed).spawn(4)[1])
-    sources, standards = _catalogue(plan, stars)
-    if instrument is None:
-        nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
-        instrument = draw_instrument(make_model(plan.name, nominal), build)
-    active = in_order((*instrument.effects, *effects))
-    truth = jax.tree.map(array, dataclasses.replace(instrument.with_source(standards), effects=active))
+    sources, truth = true_instrument(
+        plan, seed, instrument=instrument, effects=effects, catalogue_seed=catalogue_seed
+    )
+    sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)[2:])
     blank = _without_light(plan, sources, seed, len(truth.cameras))
     expected = _expected(blank, truth, fluxes(plan, None if steady else sky))
     detector = PhotonNoise(plan.read_noise)
@@ -198,6 +193,28 @@ def simulate(
     at = table.point, table.exposure
     measured = dataclasses.replace(table, counts=counts[at], sigma=sigma[at])
     return Simulated(dataclasses.replace(blank, intensities=measured), truth)
+
+
+def true_instrument(
+    plan: ObservingPlan,
+    seed: int = 0,
+    *,
+    instrument: Instrument | None = None,
+    effects: Sequence[Effect] = (),
+    catalogue_seed: int | None = None,
+) -> tuple[Sources, Instrument]:
+    """The catalogue of standards and the true instrument of `simulate`, by the same arguments."""
+    build, stars = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)[:2])
+    if catalogue_seed is not None:
+        stars = np.random.default_rng(np.random.SeedSequence(catalogue_seed).spawn(4)[1])
+    sources, standards = _catalogue(plan, stars)
+    if instrument is None:
+        nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
+        instrument = draw_instrument(make_model(plan.name, nominal), build)
+    active = in_order((*instrument.effects, *effects))
+    return sources, jax.tree.map(
+        array, dataclasses.replace(instrument.with_source(standards), effects=active)
+    )
 
 
 def as_planned(plan: ObservingPlan) -> CalibrationSet:
