@@ -26,7 +26,9 @@ def of_camera(stars, k: int, rng, scatter=0.1, keep=None) -> dict[str, np.ndarra
         "FLUXERR_AUTO": np.asarray(stars["N_ERR"])[rows, k],
         "FLAGS": np.zeros(len(rows), np.int16),
     }
-    columns |= {name: np.asarray(stars[name])[rows] for name in ("SOURCE_ID", "BP_RP") if name in stars.colnames}
+    columns |= {
+        name: np.asarray(stars[name])[rows] for name in ("SOURCE_ID", "BP_RP") if name in stars.colnames
+    }
     return columns
 
 
@@ -47,7 +49,7 @@ def ascii_head(path: Path, columns: dict[str, np.ndarray]) -> Path:
     """ASCII_HEAD: a line of comment for each column, then numbers."""
     table = _table(columns)
     lines = [f"#{k + 1:4d} {name:<22} about it" for k, name in enumerate(table.colnames)]
-    lines += [" ".join(repr(value) for value in row) for row in zip(*(table[n].tolist() for n in table.colnames))]
+    lines += [" ".join(repr(value) for value in row) for row in table.iterrows()]
     path.write_text("\n".join(lines) + "\n")
     return path
 

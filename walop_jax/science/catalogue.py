@@ -31,6 +31,8 @@ from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
 from walop_jax.sky.directions import same_stars
 
 _NEGATIVE = 5.0  # sigma: what noise about a subtracted background may do, and no more
+SAME_PLACE = 1.0  # arcsec
+ANOTHER_PLACE = 0.005  # deg in the field, of rows without a time
 _SINGLE = 1  # point: it may lie outside without a doubt about its unit
 _WHOLE = 1e-4  # deg: angles in radians that are so close to whole degrees are not read as degrees
 _FINITE = finite("correct or remove these rows")
@@ -171,10 +173,11 @@ def true_matrices(
 class Catalogue:
     """The rows of a science catalogue.
 
-    `points` are positions and settings, `teff_err` the errors of the colour temperatures (K; 0: none); `counts` and `sigma` [electron] are NaN where a camera is not used;
-    `spoilt` marks rows in which a camera was flagged, `copy` those that repeat another row of their star to the last
-    bit, which are not used, and `repeated` those that have the counts of another star or setting. `star` numbers the
-    stars from 0; `rotator` [deg] is NaN for results in the instrument frame, `time` [MJD, d] where it is not known.
+    `points` are positions and settings, `teff_err` the errors of the colour temperatures [K] (0: none); `counts` and
+    `sigma` [electron] are NaN where a camera is not used; `spoilt` marks rows in which a camera was flagged, `copy`
+    those that repeat another row of their star to the last bit, which are not used, and `repeated` those that have the
+    counts of another star or setting. `star` numbers the stars from 0; `rotator` [deg] is NaN for results in the
+    instrument frame, `time` [MJD, d] where it is not known.
     `remarks` say what is odd in the table, and what of it is not used.
     """
 
@@ -275,7 +278,11 @@ def _with_colours(
     columns = {name: Column("float", unit, missing=np.nan) for name, (unit, _) in OF_STARS.items()}
 
     def numbers(name: str) -> Float[np.ndarray, " n"]:
-        return numeric_column(source, name, columns[name]) if name in source.names else np.full(source.rows, np.nan)
+        return (
+            numeric_column(source, name, columns[name])
+            if name in source.names
+            else np.full(source.rows, np.nan)
+        )
 
     teff, error = points.settings.teff, np.nan_to_num(numbers("TEFF_ERR"))
     place.refuse(error < 0, "is below 0", "TEFF_ERR", "standard errors in K")
@@ -289,7 +296,9 @@ def _with_colours(
     source.remarks.append(f"TEFF of {int(within.sum())} rows is made of BP_RP ({SOURCE})")
     if beyond := int(np.sum(asked & ~within)):
         limits = f"{LIMITS[0]:g} … {LIMITS[1]:g} mag"
-        source.remarks.append(f"BP_RP of {beyond} rows lies beyond {limits}: their errors are those of unknown colours")
+        source.remarks.append(
+            f"BP_RP of {beyond} rows lies beyond {limits}: their errors are those of unknown colours"
+        )
     settings = dataclasses.replace(points.settings, teff=np.where(within, made, teff))
     return dataclasses.replace(points, settings=settings), np.where(within, off, error)
 
@@ -344,15 +353,16 @@ _NO_ID = (*MISSING, "-1", "unknown")
 
 
 def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndarray, " n"]:
-    """Number of the star of every row: by ID and FILTER; a row without an ID is a star of its own.
+    """Number of the star of every row: by FILTER, and ID, SOURCE_ID or position; a row without is a star of its own.
 
     IDs that are missing, empty or negative are none.
     """
     rows = np.arange(source.rows)
-    column = source.column("ID")
+    named = next((name for name in ("ID", "SOURCE_ID") if name in source.names), "ID")
+    column = source.column(named)
     if column is None:
-        return rows
-    values, missing, _ = plain_column(column, "ID", Column("str"), place)
+        return _by_position(source, points) if {"RA", "DEC"} <= set(source.names) else rows
+    values, missing, _ = plain_column(column, named, Column("str"), place)
     if values.ndim == 2 and values.shape[1] == 1:
         values, missing = values[:, 0], missing[:, 0]
     if values.ndim != 1:
@@ -373,13 +383,48 @@ def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndar
     if unknown.any():
         which = rows_text(np.flatnonzero(unknown))
         source.remarks.append(
-            f"ID is {values[unknown][0]} in {which}: unknown, a star of its own in each row"
+            f"{named} is {values[unknown][0]} in {which}: unknown, a star of its own in each row"
         )
-    _, name = np.unique(values, return_inverse=True)
-    _, band = np.unique(points.settings.filter, return_inverse=True)
-    key = name.reshape(-1) * (band.max() + 1) + band.reshape(-1)
-    alone = key.max() + 1 + rows
-    return np.unique(np.where(missing | unknown, alone, key), return_inverse=True)[1].reshape(-1)
+    name = np.unique(values, return_inverse=True)[1].reshape(-1)
+    return _numbered(name, missing | unknown, points)
+
+
+def _numbered(
+    name: Int[np.ndarray, " n"], alone: Bool[np.ndarray, " n"], points: FieldPoints
+) -> Int[np.ndarray, " n"]:
+    """Numbers of stars by their name and filter; rows that are `alone` have each a number of their own."""
+    band = np.unique(points.settings.filter, return_inverse=True)[1].reshape(-1)
+    key = name * (band.max() + 1) + band
+    single = key.max() + 1 + np.arange(len(key))
+    return np.unique(np.where(alone, single, key), return_inverse=True)[1].reshape(-1)
+
+
+def _by_position(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n"]:
+    """Numbers of stars by RA and DEC: rows within `SAME_PLACE` that are not of one exposure are one star."""
+    ra, dec, time = (
+        numeric_column(source, name, Column("float", unit, missing=np.nan))
+        for name, unit in (("RA", "deg"), ("DEC", "deg"), ("MJD", "d"))
+    )
+    known = np.isfinite(ra) & np.isfinite(dec)
+    name = np.zeros(len(ra), int)
+    name[known] = same_stars(ra[known], dec[known], SAME_PLACE)
+    # Two stars of one exposure are two stars, however close: by time, or by the place in the field where it is unknown.
+    cell = np.round(np.stack([points.x, points.y], axis=1) / ANOTHER_PLACE)
+    exposure = np.where(
+        np.isfinite(time)[:, None], np.stack([time, np.full(len(time), np.inf)], axis=1), cell
+    )
+    _, of, count = np.unique(
+        np.column_stack([name, exposure]), axis=0, return_inverse=True, return_counts=True
+    )
+    crowded = np.zeros(name.max() + 1, bool)
+    crowded[name[count[of.reshape(-1)] > 1]] = True
+    alone = ~known | crowded[name]
+    star = _numbered(name, alone, points)
+    if (several := len(star) - star.max() - 1) > 0:
+        source.remarks.append(
+            f"{several} rows are further rows of stars at the same RA and DEC (within {SAME_PLACE:g} arcsec): combined"
+        )
+    return star
 
 
 def _copies(

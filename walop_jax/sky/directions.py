@@ -89,6 +89,20 @@ def galactic(
     return longitude, latitude, north
 
 
+def designations(ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"]) -> np.ndarray:
+    """Names of directions (deg) by their coordinates, Jhhmmss.ss+ddmmss.s, cut off as the IAU asks."""
+    seconds = np.floor(np.mod(ra, 360.0) / 15.0 * 360000.0 + 1e-6).astype(int)  # hundredths
+    arcsec = np.floor(np.abs(dec) * 36000.0 + 1e-6).astype(int)  # tenths
+    sign = np.where(np.asarray(dec) < 0, "-", "+")
+    return np.array(
+        [
+            f"J{s // 360000:02d}{s // 6000 % 60:02d}{s % 6000 / 100:05.2f}"
+            f"{plus}{a // 36000:02d}{a // 600 % 60:02d}{a % 600 / 10:04.1f}"
+            for s, plus, a in zip(seconds.tolist(), sign.tolist(), arcsec.tolist(), strict=True)
+        ]
+    )
+
+
 def same_stars(
     ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"], tolerance: float
 ) -> Int[np.ndarray, " n"]:
