@@ -32,9 +32,9 @@ def of_camera(stars, k: int, rng, scatter=0.1, keep=None) -> dict[str, np.ndarra
     return columns
 
 
-def ldac(path: Path, columns: dict[str, np.ndarray], **words) -> Path:
+def ldac(path: Path, columns: dict[str, np.ndarray], words=CENTRE) -> Path:
     """FITS_LDAC: the header of the image as a table of one row, then the objects."""
-    header = fits.Header(CENTRE | words)
+    header = fits.Header(words)
     cards = np.array([[card.image for card in header.cards]])
     image = fits.BinTableHDU.from_columns(
         [fits.Column("Field Header Card", f"{cards.size * 80}A", dim=f"(80, {cards.size})", array=cards)],
@@ -49,7 +49,7 @@ def ascii_head(path: Path, columns: dict[str, np.ndarray]) -> Path:
     """ASCII_HEAD: a line of comment for each column, then numbers."""
     table = _table(columns)
     lines = [f"#{k + 1:4d} {name:<22} about it" for k, name in enumerate(table.colnames)]
-    lines += [" ".join(repr(value) for value in row) for row in table.iterrows()]
+    lines += [" ".join(str(value) for value in row) for row in table.iterrows()]
     path.write_text("\n".join(lines) + "\n")
     return path
 

@@ -253,7 +253,7 @@ def _fluxes(
             )
             raise place.fail(f"has the unit {unit}", _plain(name)[0], advice)
         plain = Column("float", missing=np.nan)
-        one = in_memory({name: np.ma.filled(np.ma.asarray(column, float), np.nan)}, str(source.path))
+        one = in_memory({name: np.ma.asarray(column)}, str(source.path))  # without its unit
         values.append(numeric_column(one, name.upper(), plain))
     flux, error = values
     unit = unit_of(_one(source, names[0], place)).strip().lower() or known.unit

@@ -136,7 +136,7 @@ def _place(catalogue: CameraCatalogue, pointing: Pointing) -> Float[np.ndarray, 
 
 
 def _registrations(
-    catalogues: Sequence[CameraCatalogue], places: Sequence[Float[np.ndarray, "n 2"]], tolerance: float
+    catalogues: Sequence[CameraCatalogue], places: Sequence[Float[np.ndarray, "_ 2"]], tolerance: float
 ) -> tuple[Registration, ...]:
     """Shift and rotation of each camera, against the median of all."""
     first, moves = catalogues[0], [NOT_MOVED]
@@ -169,7 +169,7 @@ def _about_moves(moves: Sequence[Registration], names: Sequence[str], tolerance:
 
 
 def _matched(
-    places: Sequence[Float[np.ndarray, "n 2"]], tolerance: float
+    places: Sequence[Float[np.ndarray, "_ 2"]], tolerance: float
 ) -> tuple[Int[np.ndarray, "s k"], Bool[np.ndarray, "s k"], Float[np.ndarray, "s 2"]]:
     """The row of each star in every camera (-1: none), where that is ambiguous, and the mean position.
 
