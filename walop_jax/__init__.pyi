@@ -54,6 +54,7 @@ from walop_jax.model.specification import with_effects as with_effects
 from walop_jax.posterior.result import Options as Options
 from walop_jax.posterior.result import arviz_of_fit as _to_arviz  # noqa: F401
 from walop_jax.posterior.run import Run as Run
+from walop_jax.science.common_table import check_common_table as check_common_table
 from walop_jax.simulation.observing_plan import ObservingPlan as ObservingPlan
 
 __version__: str

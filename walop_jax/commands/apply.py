@@ -156,10 +156,10 @@ def _table_of(catalogue: Any) -> tuple[InputTable, Sequence[str]]:
 def _common(made: Any) -> tuple[Any, Sequence[str]]:
     """The common table of what `apply` makes, and remarks: its faults, if it has any, among them."""
     from walop_jax.data.user_tables import in_memory
-    from walop_jax.science.common_table import common_table, faults
+    from walop_jax.science.common_table import check_common_table, common_table
 
     table, remarks = common_table(in_memory(made, "the result"))
-    return table, (*remarks, *faults(table))
+    return table, (*remarks, *check_common_table(table))
 
 
 def _counted(alone: bool) -> dict[Any, str]:

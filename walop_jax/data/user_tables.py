@@ -27,7 +27,7 @@ from walop_jax.io.text import in_ascii, some
 _LISTED = 12  # columns, in a message
 _LIKE = 0.7  # of names, for "did you mean"
 _COLOUR = re.compile(
-    r"T_?EFF|TEMPERATURE|COLOU?R|BP.?RP|SP(EC)?_?TYPE|(?<![A-Z])[UBVRIGZYJHK]([-_]|_M_)[UBVRIGZYJHK](?![A-Z])"
+    r"T_?EFF|TEMPERATURE|COLOU?R|BP.?RP|SP(EC(TRAL)?)?_?TYPE|(?<![A-Z])[UBVRIGZYJHK]([-_]|_M_)[UBVRIGZYJHK](?![A-Z])"
 )
 """Names, in capitals, of columns that say which colour a star has."""
 

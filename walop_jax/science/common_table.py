@@ -12,6 +12,7 @@ description.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.schema import Column
-from walop_jax.data.user_tables import InputTable, numeric_column
+from walop_jax.data.user_tables import InputTable, numeric_column, read_input_table
 from walop_jax.io.errors import fail
 from walop_jax.io.plain_tables import astropy_table, faults_of_ucds
 from walop_jax.sky.directions import designations, galactic
@@ -192,8 +193,18 @@ def _about_north(
     ]
 
 
-def faults(table: Any) -> tuple[str, ...]:
-    """Faults of a common table (an astropy table), each with what to do; none: it is one."""
+def check_common_table(table: Any) -> tuple[str, ...]:
+    """Faults of a common table of stellar polarisation, in sentences; none: it is one.
+
+    `table` is an astropy table or a path. Asked are columns, units, UCDs and descriptions, and whether the numbers
+    agree with each other: Pol and PA with q and u (IAU, not COSMO), Galactic with equatorial values, errors with
+    covariances.
+
+    >>> walop.check_common_table("stars.vot")  # doctest: +SKIP
+    ()
+    """
+    if isinstance(table, str | os.PathLike):
+        table = read_input_table(table, ("Pol",)).table
     found = [
         f"{name}: the column is missing"
         for name, entry in COLUMNS.items()
