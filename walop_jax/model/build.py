@@ -59,7 +59,10 @@ def parts(
     `DataError`, naming table and key, for what is wrong.
     """
     kinds = {kind.kind: kind for kind in (*ELEMENTS, *elements)}
-    make = _Maker(description.read, description.source, kinds, description.text, _farthest(description))
+    edge = (description.edge or description.field_scale) * (
+        1.0 if description.raster == "line" else np.sqrt(2.0)
+    )
+    make = _Maker(description.read, description.source, kinds, description.text, edge)
     common = tuple(make.elements(description.elements, description.path, "elements"))
     arms = tuple(make.arm(name, table) for name, table in description.arms.items())
     coefficients = np.zeros((len(description.cameras), len(legendre.terms(description.degree))))
@@ -71,12 +74,6 @@ def parts(
         declared=Parameter("", "", SERIES, FREE, scale=description.scale, loose=description.loose),
     )
     return common, arms, series, _cameras(description, arms)
-
-
-def _farthest(description: Description) -> float:
-    """Distance (deg) of the farthest field point of a simulated run from the centre."""
-    edge = description.edge or description.field_scale
-    return edge if description.raster == "line" else float(np.hypot(edge, edge))
 
 
 def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:
@@ -183,24 +180,17 @@ class _Maker:
 
     def check_edge(self, made: Element, place: str) -> None:
         """Raise `DataError` for numbers that, as sure as they are, leave no possible light at the edge of the field."""
-        r, share, most = self.farthest, 0.0, 1.0
-        if isinstance(made, PupilMapping):
-            most = 1.0 / 3.0  # r (1 + κ r²) grows with r
-        for key, number in numbers_of(type(made)).items():
-            value, said = getattr(made, key), made.declarations().get(key)
-            if value is None or (power := PER_FIELD.fullmatch(number.unit)) is None:
-                continue
-            grown = r ** int(power[1])
-            share = (float(np.max(np.abs(value))) + SURE * ((said.width if said else None) or 0.0)) * grown
-            if share >= most:
-                what = f"{key} may be {share:.3g} at the edge of the field ({r:.3g} deg from its centre), where less "
-                what += f"than {most:.2g} is possible: |value| + {SURE:g} sigma below {most / grown:.2g} {number.unit}"
-                what += ", or a smaller field"
-                raise self.read.fault(place, what)
-        if (
-            isinstance(made, PupilMapping)
-            and (turn := r * abs(float(made.magnification)) * (1.0 + share)) >= 90.0
-        ):
+        mapping = isinstance(made, PupilMapping)  # r (1 + κ r²) must grow with r, and stay ahead of 90 deg
+        r, share, most = self.farthest, 0.0, 1.0 / 3.0 if mapping else 1.0
+        for key, said in made.declarations().items():
+            if power := PER_FIELD.fullmatch(said.unit):
+                grown = r ** int(power[1])
+                share = (float(np.max(np.abs(getattr(made, key)))) + SURE * (said.width or 0.0)) * grown
+                if share >= most:
+                    what = f"{key} may be {share:.3g} at the edge of the field ({r:.3g} deg from its centre), where "
+                    what += f"less than {most:.2g} is possible: |value| + {SURE:g} sigma below {most / grown:.2g} "
+                    raise self.read.fault(place, f"{what}{said.unit}, or a smaller field")
+        if mapping and (turn := r * abs(float(made.magnification)) * (1.0 + share)) >= 90.0:
             what = f"magnification = {float(made.magnification):g} turns rays from the edge of the field ({r:.3g} deg "
             what += f"from its centre) by {turn:.0f} deg, 90 at most: correct it, or give a smaller field"
             raise self.read.fault(place, what)
