@@ -372,10 +372,8 @@ def experiment_of(
     families = tuple(family.turned(pairs) for family in families)
     # Where a rival has fewer parameters than another the rest are known.
     idle = np.stack([np.diag(1.0 * ~pair.any(axis=0)) for pair in pairs])
-    prior = pairs.swapaxes(1, 2) @ before @ pairs + idle
-    return Experiment(
-        np.tile(prior, (len(found.values), 1, 1)), criterion.targets, families, budget, len(pairs)
-    )
+    prior = np.tile(pairs.swapaxes(1, 2) @ before @ pairs + idle, (len(found.values), 1, 1))
+    return Experiment(prior, criterion.targets, families, budget, len(pairs))
 
 
 def _errors(

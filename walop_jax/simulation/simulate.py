@@ -20,6 +20,7 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre, light
+from walop_jax.model.cameras import with_floor
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, EffectKind, effect_by_name, in_order
@@ -189,6 +190,7 @@ def simulate(
         # A generator for each point: a last digit that another machine computes differently stays where it is.
         drawn = [detector.draw(*pair) for pair in zip(noise.spawn(len(expected)), expected, strict=True)]
         counts, sigma = (np.stack(part) for part in zip(*drawn, strict=True))
+        counts += _beyond_photons(detector.sigma(expected), expected, truth.cameras.floor, noise)
     table = TableIntensities.of(blank.intensities, blank.points)
     at = table.point, table.exposure
     measured = dataclasses.replace(table, counts=counts[at], sigma=sigma[at])
@@ -215,6 +217,14 @@ def true_instrument(
     return sources, jax.tree.map(
         array, dataclasses.replace(instrument.with_source(standards), effects=active)
     )
+
+
+def _beyond_photons(sigma: Cube, expected: Cube, floor: float, rng: np.random.Generator) -> Cube | float:
+    """Noise that brings an error up to the `floor` of the cameras, which fits take it to have and N_ERR does not."""
+    if floor == 0.0:
+        return 0.0
+    total = with_floor(sigma, expected, floor)
+    return np.sqrt(total**2 - sigma**2) * rng.standard_normal(expected.shape)
 
 
 def as_planned(plan: ObservingPlan) -> CalibrationSet:
