@@ -24,7 +24,7 @@ from jaxtyping import Float, Int
 from walop_jax.data.schema import Column
 from walop_jax.data.table_files import read_table_file
 from walop_jax.data.units import Place, unit_of
-from walop_jax.data.user_tables import InputTable, hints, in_memory, numeric_column
+from walop_jax.data.user_tables import OF_STARS, InputTable, hints, in_memory, numeric_column
 from walop_jax.io.errors import DataError, rows_text
 from walop_jax.io.fits_reading import open_fits
 from walop_jax.io.text import parse_toml, read_text, some
@@ -34,17 +34,6 @@ SHIPPED = ("sextractor", "photutils")
 BITS = (1, 2, 4, 8, 16)
 """Bits of FLAG that a catalogue may set."""
 BAD_PIXEL = 2
-OF_STARS: Mapping[str, tuple[str, str]] = {
-    "SOURCE_ID": ("", "source identifier, of Gaia"),
-    "BP_RP": ("mag", "colour of Gaia"),
-    "BP_RP_ERR": ("mag", "standard error of BP_RP"),
-    "TEFF": ("K", "colour temperature"),
-    "TEFF_ERR": ("K", "standard error of TEFF"),
-    "PHOT_G_MEAN_MAG": ("mag", "magnitude G of Gaia"),
-    "PARALLAX": ("mas", "parallax"),
-    "PARALLAX_ERROR": ("mas", "standard error of PARALLAX"),
-}
-"""Columns about the stars themselves, with unit and description: they go with a star into every result."""
 OF_EXPOSURES = ("FILTER", "MJD", "TEMP", "HA", "CHWP_ANGLE", "CHWP_IN")
 """Columns, or words of a header, about the exposure: they go with its stars."""
 _LDAC, _HEADER = "LDAC_OBJECTS", "LDAC_IMHEAD"
@@ -334,7 +323,7 @@ def _flags(
 
 
 def _of_all(source: InputTable, header: Mapping[str, Any], name: str, place: Place) -> Any:
-    """What a column or a word of the header says of the exposure; None: nothing. Refuses several values."""
+    """The value of a column, or of a word of the header, of the exposure; None: none. Refuses several values."""
     if name not in source.names:
         value = header.get(name)
         return value.strip() if isinstance(value, str) else value

@@ -40,6 +40,8 @@ def read_table_file(path: Path, needed: Collection[str]) -> tuple[Path, Any, tup
     """
     path, extension = _extension_of(path)
     path = check_input(path)
+    from astropy.table import Table  # imported here: it takes a third of a second
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -50,6 +52,8 @@ def read_table_file(path: Path, needed: Collection[str]) -> tuple[Path, Any, tup
             kind = "" if path.suffix.lower() == ".zip" else _format(path)
             if kind == "fits":
                 return path, *_from_fits(path, extension, needed)
+            if kind == "parquet":
+                return path, Table.read(path, format=kind), ()
             content, inside = _content(path)
             kind = kind or _format(Path(inside))
             if kind == "ascii.csv":
@@ -57,6 +61,9 @@ def read_table_file(path: Path, needed: Collection[str]) -> tuple[Path, Any, tup
             return path, _astropy_table(content, kind), ()
     except DataError:
         raise
+    except ImportError as error:
+        what = f"needs {error.name or 'a library'}, which is not installed"
+        raise fail(what, file=path, advice="pip install 'walop-jax[parquet]'") from error
     except UNREADABLE as error:
         what = f"cannot be read as a table: {one_line(error)}"
         raise fail(what, file=path, advice="write it again") from error

@@ -31,6 +31,18 @@ _COLOUR = re.compile(
 )
 """Names, in capitals, of columns that say which colour a star has."""
 
+OF_STARS: Mapping[str, tuple[str, str]] = {
+    "SOURCE_ID": ("", "source identifier, of Gaia"),
+    "BP_RP": ("mag", "colour of Gaia"),
+    "BP_RP_ERR": ("mag", "standard error of BP_RP"),
+    "TEFF": ("K", "colour temperature"),
+    "TEFF_ERR": ("K", "standard error of TEFF"),
+    "PHOT_G_MEAN_MAG": ("mag", "magnitude G of Gaia"),
+    "PARALLAX": ("mas", "parallax"),
+    "PARALLAX_ERROR": ("mas", "standard error of PARALLAX"),
+}
+"""Columns about the stars themselves, with unit and description: they go with a star into every result."""
+
 
 @dataclasses.dataclass(frozen=True)
 class InputTable:

@@ -32,7 +32,7 @@ _SAME = 1e-6  # of fractions that are computed in two ways
 _SAME_ANGLE = 1e-3  # deg, likewise
 
 
-class Entry(NamedTuple):
+class CommonColumn(NamedTuple):
     """A column of the common table; `of` is the column of `apply` that it is, "" where it is made of others."""
 
     unit: str
@@ -42,44 +42,44 @@ class Entry(NamedTuple):
     needed: bool = True
 
 
-COLUMNS: Mapping[str, Entry] = {
-    "Name": Entry("", "meta.id;meta.main", "designation by the position, ICRS"),
-    "GaiaID": Entry("", "meta.id", "source identifier, of Gaia", "SOURCE_ID", False),
-    "RAJ2000": Entry("deg", "pos.eq.ra;meta.main", "right ascension, ICRS", "RA"),
-    "DEJ2000": Entry("deg", "pos.eq.dec;meta.main", "declination, ICRS", "DEC"),
-    "GLON": Entry("deg", "pos.galactic.lon", "Galactic longitude"),
-    "GLAT": Entry("deg", "pos.galactic.lat", "Galactic latitude"),
-    "Gmag": Entry("mag", "phot.mag;em.opt", "magnitude G of Gaia", "PHOT_G_MEAN_MAG", False),
-    "Plx": Entry("mas", "pos.parallax.trig", "parallax", "PARALLAX", False),
-    "e_Plx": Entry("mas", "stat.error;pos.parallax.trig", "standard error of Plx", "PARALLAX_ERROR", False),
-    "Filter": Entry("", "meta.id;instr.filter", "filter", "FILTER"),
-    "Inst": Entry("", "meta.id;instr", "instrument"),
-    "JD": Entry("d", "time.epoch", "Julian date of mid-exposure, UTC", "", False),
-    "q": Entry("", "phys.polarization.stokes.Q", "Q/I, north through east, IAU"),
-    "u": Entry("", "phys.polarization.stokes.U", "U/I, north through east, IAU"),
-    "e_q": Entry("", f"{_ERROR}.Q", "standard error of q: photons and calibration"),
-    "e_u": Entry("", f"{_ERROR}.U", "standard error of u: photons and calibration"),
-    "cov_qu": Entry("", "stat.covariance;phys.polarization.stokes", "covariance of q and u"),
-    "e_q_sys": Entry("", f"{_SYSTEMATIC}.Q", "share of calibration and colour in e_q"),
-    "e_u_sys": Entry("", f"{_SYSTEMATIC}.U", "share of calibration and colour in e_u"),
-    "cov_qu_sys": Entry("", "stat.covariance;phys.polarization.stokes", "share of calibration and colour in cov_qu"),
-    "q_hid": Entry("", f"{_SYSTEMATIC}.Q", "shift by a mistake that may hide, not in e_q", "Q_HIDDEN"),
-    "u_hid": Entry("", f"{_SYSTEMATIC}.U", "shift by a mistake that may hide, not in e_u", "U_HIDDEN"),
-    "Pol": Entry("", "phys.polarization.linear", "degree of polarisation, as measured", "P"),
-    "e_Pol": Entry("", "stat.error;phys.polarization.linear", "standard error of Pol", "P_ERR"),
-    "PolDeb": Entry("", "phys.polarization.linear", "degree of polarisation without its bias", "P_DEBIASED"),
-    "PA": Entry("deg", "pos.posAng;phys.polarization.linear", "position angle, north through east, IAU", "EVPA"),
-    "e_PA": Entry("deg", "stat.error;pos.posAng", "standard error of PA", "EVPA_ERR"),
-    "q_gal": Entry("", "phys.polarization.stokes.Q", "q from Galactic north through Galactic east"),
-    "u_gal": Entry("", "phys.polarization.stokes.U", "u from Galactic north through Galactic east"),
-    "e_q_gal": Entry("", f"{_ERROR}.Q", "standard error of q_gal"),
-    "e_u_gal": Entry("", f"{_ERROR}.U", "standard error of u_gal"),
-    "cov_qu_gal": Entry("", "stat.covariance;phys.polarization.stokes", "covariance of q_gal and u_gal"),
-    "PA_gal": Entry("deg", "pos.posAng;phys.polarization.linear", "position angle from Galactic north"),
-    "chi2": Entry("", "stat.fit.chi2", "chi squared of the measurements of the star", "CHI2"),
-    "dof": Entry("", "stat.fit.dof", "degrees of freedom of chi2", "DOF"),
-    "Nobs": Entry("", "meta.number", "measurements that were combined", "NROWS"),
-    "Flag": Entry("", "meta.code.qual", "quality bits of walop-jax, 0 is good", "FLAG"),
+COLUMNS: Mapping[str, CommonColumn] = {
+    "Name": CommonColumn("", "meta.id;meta.main", "designation by the position, ICRS"),
+    "GaiaID": CommonColumn("", "meta.id", "source identifier, of Gaia", "SOURCE_ID", False),
+    "RAJ2000": CommonColumn("deg", "pos.eq.ra;meta.main", "right ascension, ICRS", "RA"),
+    "DEJ2000": CommonColumn("deg", "pos.eq.dec;meta.main", "declination, ICRS", "DEC"),
+    "GLON": CommonColumn("deg", "pos.galactic.lon", "Galactic longitude"),
+    "GLAT": CommonColumn("deg", "pos.galactic.lat", "Galactic latitude"),
+    "Gmag": CommonColumn("mag", "phot.mag;em.opt", "magnitude G of Gaia", "PHOT_G_MEAN_MAG", False),
+    "Plx": CommonColumn("mas", "pos.parallax.trig", "parallax", "PARALLAX", False),
+    "e_Plx": CommonColumn("mas", "stat.error;pos.parallax.trig", "standard error of Plx", "PARALLAX_ERROR", False),
+    "Filter": CommonColumn("", "meta.id;instr.filter", "filter", "FILTER"),
+    "Inst": CommonColumn("", "meta.id;instr", "instrument"),
+    "JD": CommonColumn("d", "time.epoch", "Julian date of mid-exposure, UTC", "", False),
+    "q": CommonColumn("", "phys.polarization.stokes.Q", "Q/I, north through east, IAU"),
+    "u": CommonColumn("", "phys.polarization.stokes.U", "U/I, north through east, IAU"),
+    "e_q": CommonColumn("", f"{_ERROR}.Q", "standard error of q: photons and calibration"),
+    "e_u": CommonColumn("", f"{_ERROR}.U", "standard error of u: photons and calibration"),
+    "cov_qu": CommonColumn("", "stat.covariance;phys.polarization.stokes", "covariance of q and u"),
+    "e_q_sys": CommonColumn("", f"{_SYSTEMATIC}.Q", "share of the calibration in e_q, colours included"),
+    "e_u_sys": CommonColumn("", f"{_SYSTEMATIC}.U", "share of the calibration in e_u, colours included"),
+    "cov_qu_sys": CommonColumn("", "stat.covariance;phys.polarization.stokes", "share of the calibration in cov_qu"),
+    "q_hid": CommonColumn("", f"{_SYSTEMATIC}.Q", "shift by a mistake that may hide, not in e_q", "Q_HIDDEN"),
+    "u_hid": CommonColumn("", f"{_SYSTEMATIC}.U", "shift by a mistake that may hide, not in e_u", "U_HIDDEN"),
+    "Pol": CommonColumn("", "phys.polarization.linear", "degree of polarisation, as measured", "P"),
+    "e_Pol": CommonColumn("", "stat.error;phys.polarization.linear", "standard error of Pol", "P_ERR"),
+    "PolDeb": CommonColumn("", "phys.polarization.linear", "degree of polarisation without its bias", "P_DEBIASED"),
+    "PA": CommonColumn("deg", "pos.posAng;phys.polarization.linear", "position angle, north through east, IAU", "EVPA"),
+    "e_PA": CommonColumn("deg", "stat.error;pos.posAng", "standard error of PA", "EVPA_ERR"),
+    "q_gal": CommonColumn("", "phys.polarization.stokes.Q", "q from Galactic north through Galactic east"),
+    "u_gal": CommonColumn("", "phys.polarization.stokes.U", "u from Galactic north through Galactic east"),
+    "e_q_gal": CommonColumn("", f"{_ERROR}.Q", "standard error of q_gal"),
+    "e_u_gal": CommonColumn("", f"{_ERROR}.U", "standard error of u_gal"),
+    "cov_qu_gal": CommonColumn("", "stat.covariance;phys.polarization.stokes", "covariance of q_gal and u_gal"),
+    "PA_gal": CommonColumn("deg", "pos.posAng;phys.polarization.linear", "position angle from Galactic north"),
+    "chi2": CommonColumn("", "stat.fit.chi2", "chi squared of the measurements of the star", "CHI2"),
+    "dof": CommonColumn("", "stat.fit.dof", "degrees of freedom of chi2", "DOF"),
+    "Nobs": CommonColumn("", "meta.number", "measurements that were combined", "NROWS"),
+    "Flag": CommonColumn("", "meta.code.qual", "quality bits of walop-jax, 0 is good", "FLAG"),
 }  # fmt: skip
 UNITS = {entry.of: entry.unit for entry in COLUMNS.values()} | {"ROTATOR": "deg", "MJD": "d"}
 """Units of columns of `apply`."""
