@@ -148,7 +148,7 @@ def hdus_of(c: Product, path: object) -> list[Any]:
         "FILTERS": filter_columns(c.filters),
         "MODEL": {"LINE": _strings(c.model_lines)},
         "INSTRUMENT": {"LINE": _strings(c.description)},
-        "SOURCES": {name: getattr(c.sources, name.lower()) for name in schema.SOURCES},
+        "SOURCES": c.sources.columns(),
         "INPUTS": {
             "PATH": _strings(in_ascii(str(entry.path)) for entry in c.inputs),
             "SHA256": _strings(entry.sha256 for entry in c.inputs),
@@ -384,7 +384,9 @@ class _Reader:
             ),
             filters=filters,
             exposures=make_exposures(exposures, filters, site, place, kinds=None),
-            sources=make_sources(sources, Place(self.path, "SOURCES")) if sources else empty_sources(),
+            sources=make_sources(sources, Place(self.path, "SOURCES"), filters)
+            if sources
+            else empty_sources(),
             site=site,
             origin=self.text("ORIGIN"),
             field=(low_x, high_x, low_y, high_y),
