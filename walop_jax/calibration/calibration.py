@@ -38,7 +38,7 @@ from walop_jax.data.settings import (
     builtin_filter,
     single_wavelength,
 )
-from walop_jax.fit.model_file import model_without_data, render, standards_of
+from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
 from walop_jax.fit.verdict import NOT_MEASURED, Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
@@ -53,6 +53,7 @@ from walop_jax.model.instrument import Instrument, adapted, build, nominal_instr
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model, Vector, effect_context
+from walop_jax.model.standards import standards_of
 
 if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult

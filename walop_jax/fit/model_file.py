@@ -13,12 +13,11 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import tomlkit
 
 from walop_jax.data.merge import parts_of
-from walop_jax.data.records import POLARISER, CalibrationSet, Exposures, FilterCurve, Sources
-from walop_jax.data.settings import PHOTOMETRIC_BANDS, Settings, builtin_filter
+from walop_jax.data.records import POLARISER, CalibrationSet
+from walop_jax.data.settings import Settings
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import parse_toml
@@ -28,9 +27,9 @@ from walop_jax.model.effects.catalogue import entries, is_own
 from walop_jax.model.instrument import Instrument, adapted, as_designed, nominal_instrument
 from walop_jax.model.laws import laws_of
 from walop_jax.model.parameters import Parameter, check_names, unknown_name
-from walop_jax.model.quadrature import moments
 from walop_jax.model.sources import MoonSky, Standards
 from walop_jax.model.specification import THROUGHPUT, Model, effect_context, make_model, with_effects
+from walop_jax.model.standards import half_range, standards_of
 
 LEVEL_POINTS = 256
 """Field points from which the start value of a throughput is taken: a start need not be exact."""
@@ -173,8 +172,6 @@ Catalogue = Sequence[EffectKind]
 GAUGE = "throughput.n0.p00"
 SKY_AND_STARS = (MoonSky.name, Standards.name)  # parts that are not the instrument's
 LEVEL = 0.5  # of a throughput whose scale is a gauge
-LEAST_RANGE = 0.01  # µm
-WIDTHS_PER_RMS = 2.355  # full width at half maximum of a Gaussian
 
 
 def base_model(
@@ -219,7 +216,7 @@ def base_model(
         priors[f"standard.{name}.u"] = (float(sources.u[i]), float(sources.u_err[i]))
     for i in standards.unknown:
         wavelength, _ = standards.bands[i]
-        width = _half_range(sources, i, calset.exposures, calset.filters)
+        width = half_range(sources, i, calset.exposures, calset.filters)
         priors[f"standard.{standards.names[i]}.wavelength"] = (wavelength, width)
     model = make_model(calset.instrument, instrument, priors=priors)
     for i in model.positions(THROUGHPUT):
@@ -264,69 +261,6 @@ def instrument_of(calset: CalibrationSet) -> Instrument:
             "its description, --instrument FILE or instrument=Instrument.read(FILE)"
         )
     return nominal_instrument(calset.instrument)
-
-
-def standard_names(sources: Sources) -> tuple[str, ...]:
-    """Unique names of the values of standards, usable in parameter names: of the star, with the band if it is known."""
-    plain = [
-        _usable(str(name)) or f"source{number}"
-        for number, name in zip(sources.source, sources.name, strict=True)
-    ]
-    names: dict[int, str] = {}
-    for number, name in zip(sources.source.tolist(), plain, strict=True):
-        # A name that another star bears by right is not given to a namesake.
-        unique = name
-        while number not in names and (unique in names.values() or (unique != name and unique in plain)):
-            unique = f"{unique}_{number}"
-        names.setdefault(number, unique)
-    bands = [f".{_usable(str(band), '-+')}" if band else "" for band in sources.filter]
-    return tuple(names[number] + band for number, band in zip(sources.source.tolist(), bands, strict=True))
-
-
-def _usable(name: str, further: str = "") -> str:
-    return "".join(c if c.isalnum() or c in further else "_" for c in name.strip())
-
-
-Curves = Mapping[str, FilterCurve]
-
-
-def standards_of(sources: Sources, exposures: Exposures, filters: Curves) -> Standards:
-    """The standards of a set, with their values as they are.
-
-    They have a colour where a band is stated for any of them, or where they were seen in several filters: else a value
-    is that of the only filter.
-    """
-    names, qu = standard_names(sources), np.stack([sources.q, sources.u])
-    seen = _filters_seen(exposures)
-    stated = sources.filter != ""
-    if not (stated.any() or len(seen) > 1):
-        return Standards(names=names, q=qu[0], u=qu[1])
-    bands = []
-    for teff, band in zip(sources.teff.tolist(), sources.filter.tolist(), strict=True):
-        each = [_band(name, teff, filters) for name in ([band] if band else seen)]
-        wavelength, width = np.mean(each, axis=0) if each else _band("V", teff, filters)
-        bands.append((float(wavelength), float(width)))
-    unknown = np.flatnonzero(~stated).tolist() if len(seen) > 1 else ()
-    return Standards.coloured(names, qu, bands, sources.stars.tolist(), unknown)
-
-
-def _filters_seen(exposures: Exposures) -> list[str]:
-    return np.unique(exposures.filter[exposures.direct("standard")]).tolist()
-
-
-def _half_range(sources: Sources, row: int, exposures: Exposures, filters: Curves) -> float:
-    """Half of the range of the mean wavelengths in which a star was seen (µm)."""
-    seen = [_band(name, float(sources.teff[row]), filters)[0] for name in _filters_seen(exposures)]
-    return 0.5 * max(max(seen) - min(seen), LEAST_RANGE)
-
-
-def _band(name: str, teff: float, filters: Curves) -> tuple[float, float]:
-    """Mean wavelength and rms width (µm) of a band; of a photometric one those of any light."""
-    if name in PHOTOMETRIC_BANDS and name not in filters:
-        wavelength, width = PHOTOMETRIC_BANDS[name]
-        return wavelength, width / WIDTHS_PER_RMS
-    curve = filters[name] if name in filters else builtin_filter(name)
-    return moments(curve.wavelength, curve.throughput, teff)
 
 
 def has_known_flux(calset: CalibrationSet) -> bool:

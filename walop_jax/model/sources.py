@@ -206,10 +206,16 @@ class Standards(Source):
     ) -> Standards:
         """Standards that follow the law of interstellar polarisation from band to band."""
         each = len(set(stars))
+        numbers: dict[str, Any] = {
+            "q": qu[0],
+            "u": qu[1],
+            "lmax": np.full(each, lmax),
+            "turn": np.zeros(each),
+            "wavelength": [bands[i][0] for i in unknown],
+        }
         return cls(
-            names=tuple(names), q=qu[0], u=qu[1], lmax=np.full(each, lmax), turn=np.zeros(each),
-            wavelength=[bands[i][0] for i in unknown], bands=tuple(bands), stars=tuple(stars), unknown=tuple(unknown),
-        )  # fmt: skip
+            names=tuple(names), bands=tuple(bands), stars=tuple(stars), unknown=tuple(unknown), **numbers
+        )
 
     @property
     def star_names(self) -> tuple[str, ...]:
@@ -220,7 +226,7 @@ class Standards(Source):
     def labels(self, field: str) -> Sequence[str]:
         """One name per value, or per star."""
         if field in ("lmax", "turn"):
-            return tuple(f"{name}.{field}" for name in self.star_names)
+            return tuple(f"{name}.{field}" for name in self.star_names) if self.bands else ()
         names = [self.names[i] for i in self.unknown] if field == "wavelength" else self.names
         return tuple(f"{name}.{field}" for name in names)
 
