@@ -31,6 +31,7 @@ from walop_jax.model.ray import NotPlannedError
 
 Scalar = Float[Array, ""]
 PAPER_II = "Maharana et al. 2022, Paper II"
+COLOUR_OF_STANDARDS = "Serkowski, Mathewson & Ford 1975, ApJ 196, 261; Whittet et al. 1992, ApJ 386, 562"
 WHITTET = "Whittet et al. 1992, ApJ 386, 562: 0.55 µm, most stars within 0.1 µm"
 TURN_SOURCE = "rms between V and R of the standards of Schmidt, Elston & Lupie 1992, AJ 104, 1563"
 LMAX = 0.55  # µm
