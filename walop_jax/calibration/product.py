@@ -354,7 +354,7 @@ class _Reader:
             self.text("TELESCOP"), *(self.number(f"SITE{n}", np.nan) for n in ("LAT", "LONG", "ELEV"))
         )
         filters = make_filters(self.table("FILTERS"), Place(self.path, "FILTERS"))
-        sources, inputs = self.table("SOURCES", optional=True), self.table("INPUTS", optional=True)
+        stars, inputs = self.table("SOURCES", optional=True), self.table("INPUTS", optional=True)
         warnings, description = self.table("WARNINGS", optional=True), self.table("INSTRUMENT", optional=True)
         exposures, place = self.table("EXPOSURES"), Place(self.path, "EXPOSURES")
         low_x, high_x, low_y, high_y = map(self.number, _FIELD)
@@ -384,9 +384,7 @@ class _Reader:
             ),
             filters=filters,
             exposures=make_exposures(exposures, filters, site, place, kinds=None),
-            sources=make_sources(sources, Place(self.path, "SOURCES"), filters)
-            if sources
-            else empty_sources(),
+            sources=make_sources(stars, Place(self.path, "SOURCES"), filters) if stars else empty_sources(),
             site=site,
             origin=self.text("ORIGIN"),
             field=(low_x, high_x, low_y, high_y),
