@@ -112,7 +112,10 @@ class ObservingPlan:
     plate in `plate` (deg, None: out); Moon patches and standards take the settings in turn, in the first filter.
     `filters` are names of those that are built in, and `FilterCurve`s; also a dict of curves by name. The Moon is
     observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after.
-    `electrons` is the level of a camera in unpolarised light of full transparency, ahead of reflections.
+    `star_lmax` are the wavelengths (µm) of largest polarisation of the polarised standards, in turn: these are then
+    observed in every filter, and the catalogue has their values in the first one; none: they are observed in that one,
+    unless stops say, and have 0.55 µm. `electrons` is the level of a camera in unpolarised light of full transparency,
+    ahead of reflections.
 
     `instrument` is one that comes with the package, by name, or any other; None: the first of the family. `moving`
     holds the positions (deg, None: out) of further moving elements by the prefix of their columns: the polariser goes
@@ -136,6 +139,7 @@ class ObservingPlan:
     standards: int = 8
     unpolarised: int = 2
     catalogue_error: float = 2e-4
+    star_lmax: tuple[float, ...] = ()
     filters: Sequence[str | FilterCurve] | Mapping[str, Any] = (DEFAULT_FILTER,)
     plate: tuple[float | None, ...] = (None,)
     electrons: float = 1e6
@@ -178,6 +182,8 @@ class ObservingPlan:
             )
         if min(self.moon_patches, self.standards, self.unpolarised) < 0:
             raise ValueError("numbers of Moon patches and standards cannot be negative")
+        if any(not 0.3 <= lmax <= 1.0 for lmax in self.star_lmax):
+            raise ValueError(f"star_lmax = {list(self.star_lmax)}: give wavelengths from 0.3 to 1.0 um")
         if not self.electrons > 0:
             raise ValueError(f"{self.electrons} electrons: a camera needs some light")
         if not (self.filters and self.plate):
@@ -254,7 +260,7 @@ class ObservingPlan:
             fields["filters"] = {_name_of(entry): _curve_document(entry) for entry in self.filters}
         # Named only where there are any: plans of other instruments read as they always did.
         fields["stops"] = [stop.document() for stop in self.stops]
-        later = {"moving": {}, "lamps": 0, "stops": [], "patches": None, "stars": None}
+        later = {"moving": {}, "lamps": 0, "stops": [], "patches": None, "stars": None, "star_lmax": ()}
         return {key: value for key, value in fields.items() if key not in later or value != later[key]}
 
     @property
@@ -321,11 +327,12 @@ class ObservingPlan:
         plates = self.plate[:1] if self.stops else self.plate
         kinds = {stop.kind for stop in self.stops}
         sky = [
-            Stop(None, self.filter_names[0], plates[i % len(plates)], further[0], kind=kind, number=number)
+            Stop(None, name, plates[i % len(plates)], further[0], kind=kind, number=number)
             for kind, numbers, total in (
                 ("moon", self.patches, self.moon_patches),
                 ("standard", self.stars, self.standards),
             )
+            for name in self.filter_names[: None if kind == "standard" and self.star_lmax else 1]
             for i, number in enumerate(
                 numbers if numbers is not None else () if kind in kinds else range(total)
             )

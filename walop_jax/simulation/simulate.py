@@ -31,6 +31,7 @@ from walop_jax.model.parameters import leaves, unknown_name, values_of
 from walop_jax.model.plan import with_median
 from walop_jax.model.sources import Standards
 from walop_jax.model.specification import Model, make_model, series_indices
+from walop_jax.model.standards import standards_of
 from walop_jax.simulation.observing_plan import EXPOSED, ObservingPlan
 
 Cube = Float[np.ndarray, "p e k"]
@@ -121,8 +122,16 @@ def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, 
         q_err=np.full(n, plan.catalogue_error),
         u_err=np.full(n, plan.catalogue_error),
         teff=rng.uniform(*_STAR_TEFF, n),
+        filter=np.full(n, plan.filter_names[0] if plan.star_lmax else ""),
     )
-    return sources, Standards(q=true[0], u=true[1], names=plan.star_names)
+    standards = standards_of(sources, plan.exposures(), plan.curves())
+    lmax = np.asarray(standards.lmax).copy()
+    if plan.star_lmax:
+        polarised = np.arange(n) - plan.unpolarised
+        lmax = np.where(
+            polarised < 0, lmax, np.resize(plan.star_lmax, polarised.max(initial=0) + 1)[polarised]
+        )
+    return sources, dataclasses.replace(standards, q=array(true[0]), u=array(true[1]), lmax=array(lmax))
 
 
 @dataclasses.dataclass(frozen=True)
