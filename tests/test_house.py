@@ -135,7 +135,7 @@ MOST_REACHED = {
     "model.light": 6300,
     "likelihood.flux": 100,
     "diagnosis.score": 800,
-    "commands.matrix": 22700,
+    "commands.matrix": 22950,
     "commands.refit": 28400,
     "commands.diagnose": 30700,
     "commands.apply": 28700,
