@@ -132,10 +132,10 @@ def test_no_room_calls_upward_through_a_string():
 
 
 MOST_REACHED = {
-    "model.light": 6200,
+    "model.light": 6300,
     "likelihood.flux": 100,
     "diagnosis.score": 800,
-    "commands.matrix": 22700,
+    "commands.matrix": 22950,
     "commands.refit": 28400,
     "commands.diagnose": 30700,
     "commands.apply": 28700,
@@ -186,7 +186,7 @@ MOST_LINES = {
     "instruments": 250,
     "data": 4550,
     "sky": 250,
-    "model": 9330,
+    "model": 9400,
     "likelihood": 3300,
     "simulation": 900,
     "fit": 2200,

@@ -332,9 +332,8 @@ def from_arrays(
     >>> made.exposures.clp_angle
     array([ 0., 30., 60., 90.])
     """
-    units = {"counts": unit_of(counts), "errors": unit_of(errors)}
+    check_units({"counts": unit_of(counts), "errors": unit_of(errors)}, "electron", Place(NAME, ""))
     counts, errors = in_unit(counts, "electron", "counts"), in_unit(errors, "electron", "errors")
-    check_units(units, "electron", Place(NAME, ""))
     x, y, angles = (np.atleast_1d(in_unit(v, "deg", n)) for v, n in ((x, "x"), (y, "y"), (angles, "angles")))
     if counts.ndim != 3 or counts.shape[:2] != (len(x), len(angles)) or len(x) != len(y):
         raise fail(
