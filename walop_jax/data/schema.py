@@ -132,13 +132,14 @@ _SHARE = within(1.0, "fractions are wanted: are these per cent?", "exceeds 1")
 _FRACTION = Column("float", rules=(finite("remove the source"), _SHARE))
 _ERROR = Column("float", rules=(_POSITIVE,))
 SOURCES: Mapping[str, Column] = {
-    "SOURCE": Column("int", rules=(UNIQUE, _NUMBERED)),
+    "SOURCE": Column("int", rules=(_NUMBERED,)),
     "NAME": Column("str"),
     "Q": _FRACTION,
     "U": _FRACTION,
     "Q_ERR": _ERROR,
     "U_ERR": _ERROR,
     "TEFF": _TEFF,
+    "FILTER": Column("str", missing="", remarked=False),
 }
 _PADDED = "use one length, padded with NaN"
 FILTERS: Mapping[str, Column] = {
