@@ -124,6 +124,12 @@ def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, 
     return sources, Standards(q=true[0], u=true[1], names=plan.star_names)
 
 
+def _first_stars(number: int, catalogue: Sources, stars: Standards) -> tuple[Sources, Standards]:
+    """The first standards of a catalogue, and what they really are."""
+    fields = {f.name: getattr(catalogue, f.name)[:number] for f in dataclasses.fields(catalogue)}
+    return Sources(**fields), Standards(q=stars.q[:number], u=stars.u[:number], names=stars.names[:number])
+
+
 @dataclasses.dataclass(frozen=True)
 class PhotonNoise:
     """Photon noise and read noise (electron rms per measurement): N = Poisson(μ) + Normal(0, read_noise²).
@@ -166,6 +172,8 @@ def simulate(
     noiseless: bool = False,
     steady: bool = False,
     catalogue_seed: int | None = None,
+    catalogue: Sources | None = None,
+    night: int | None = None,
 ) -> Simulated:
     """Simulate a calibration run: the same plan, seed and effects give the same set, bit for bit.
 
@@ -174,12 +182,20 @@ def simulate(
     counts as they are and states the errors that they would have; `steady` gives every exposure the mean transparency
     and every star the mean brightness. Effects that depend on the run are made
     with `plan.context()`. `catalogue_seed` draws the standards apart from the rest (default: from `seed`): nights of
-    one survey share their stars.
+    one survey share their stars. With a `catalogue` nothing is drawn: the standards of `instrument` are what its stars
+    really are, and the plan takes the first of them. `night` is the number of days after the start of the plan; each
+    has noise and weather of its own, also with the same seed.
     """
+    plan = plan if not night else dataclasses.replace(plan, mjd=plan.start + night)
     build, stars, sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
+    if night:
+        sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence((seed, night)).spawn(2))
     if catalogue_seed is not None:
         stars = np.random.default_rng(np.random.SeedSequence(catalogue_seed).spawn(4)[1])
-    sources, standards = _catalogue(plan, stars)
+    if catalogue is None or instrument is None:
+        sources, standards = _catalogue(plan, stars)
+    else:
+        sources, standards = _first_stars(plan.standards, catalogue, instrument.standard)
     if instrument is None:
         nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
         instrument = draw_instrument(make_model(plan.name, nominal), build)
