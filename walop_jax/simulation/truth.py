@@ -30,7 +30,7 @@ _CATALOGUE = {field.name for field in dataclasses.fields(Sources)}
 
 @dataclasses.dataclass(frozen=True)
 class Template:
-    """What all nights of one instrument have in common: the instrument as it is, and the catalogue of its standards.
+    """Common to all nights of one instrument: the instrument as it is, and the catalogue of its standards.
 
     `plan` is the one that it was simulated with, if any.
     """
