@@ -31,6 +31,7 @@ from walop_jax.reports.style import (
     SMALL,
     AnyFigure,
     Canvas,
+    angle_ticks,
     colour_bar,
     field_axes,
     largest_size,
@@ -100,7 +101,7 @@ def _maps(
     shown = np.any([np.isfinite(values).any(axis=1) for values in maps.values()], axis=0)
     shown = shown if shown.any() else np.ones(len(points), bool)
     size, grid = (0.6 + 2.0 * len(cameras), 0.55 + 1.75 * len(maps)), (len(maps), len(cameras))
-    figure, axes = on.panels(*size, *grid, sharex=True, sharey=True, squeeze=False)
+    figure, axes = on.panels(*size, *grid, sharex=True, sharey=True, squeeze=False, least=1.0)
     tiles: Any = None
     for number, values in enumerate(maps.values()):
         for k, axis in enumerate(axes[number]):
@@ -111,8 +112,10 @@ def _maps(
             if signs:
                 _signs(axis, points, values[:, k], norm)
     outer_labels(axes)
-    for axis, title in zip(axes[:, 0], maps, strict=True):
-        axis.set_ylabel(f"{title}\n\nY (deg)", fontsize=FONT)
+    for row, title in zip(axes, maps, strict=True):
+        for axis in row:
+            if axis.get_subplotspec().is_first_col():
+                axis.set_ylabel(f"{title}\n\nY (deg)", fontsize=FONT)
     colour_bar(figure, tiles, axes, label, pad=0.015, aspect=18 * len(maps), fraction=0.03)
     return figure
 
@@ -151,9 +154,7 @@ def signature_figure(
         upper[k].set_title(f"camera {camera}", fontsize=FONT)
         lower[k].set_xlabel(label, fontsize=FONT)
         if angular:
-            lower[k].set_xticks(
-                np.arange(0, 361, 90) if np.max(x, initial=0.0) > 180 else np.arange(0, 181, 45)
-            )
+            angle_ticks(lower[k].xaxis, figure, lower[k].get_subplotspec().get_gridspec().ncols)
     upper[0].set_ylabel("residual (σ)", fontsize=FONT)
     lower[0].set_ylabel("remaining (σ)", fontsize=FONT)
     upper[0].legend(frameon=False, fontsize=SMALL, loc="best")
