@@ -81,7 +81,7 @@ def calibration_figure(
     matrix_panels(
         figure, axes[: maps.arms, :3], maps.values, field_of(maps), range(3 * maps.arms), smooth=True
     )
-    _before_and_after(figure, axes[:2, 3], likelihood, before, values)
+    _before_and_after(figure, tuple(axes[:2, 3]), likelihood, before, values)
     for axis in (*axes[maps.arms :, :3].ravel(), *axes[2:, 3]):
         axis.remove()
     outer_labels(axes)

@@ -85,7 +85,7 @@ def retardance_wavelength_figure(calibration: Calibration, on: Canvas = PAGE) ->
     places |= {with_minus_sign(f"Y = {y:+.2f}°"): (0.0, y) for y in (low_y, high_y)}
     x, y = (np.array(values) for values in zip(*places.values(), strict=True))
     found = _unwrapped_retardances(instrument, line, x, y)
-    figure, axes = on.panels(3.9 * len(names), 3.1, 1, len(names), squeeze=False)
+    figure, axes = on.panels(3.9 * len(names), 3.5, 1, len(names), squeeze=False)
     for name, axis, curves in zip(names, axes[0], found, strict=True):
         for n, (place, curve) in enumerate(zip(places, curves, strict=True)):
             style = ("-", "--", "-.", ":", (0, (4, 4)))[n]

@@ -140,7 +140,8 @@ class Canvas:
         if self.width is not None:
             before = (width / (rows if turned else columns), height / (columns if turned else rows))
             scale = self.width / group / before[0]
-            size = self.width, rows * groups * (LABELS + scale * (before[1] - LABELS))
+            lowest = 1.1 if rows * groups == 1 else 0.8
+            size = self.width, rows * groups * (LABELS + max(scale * (before[1] - LABELS), lowest))
         squeeze = options.pop("squeeze", True)
         figure = self.figure(*size)
         axes = figure.subplots(rows * groups, group, squeeze=False, **options)
