@@ -115,12 +115,14 @@ class Canvas:
         columns: int = 1,
         *,
         least: float = NARROWEST,
+        labels: float = LABELS,
         turned: bool = False,
         **options: Any,
     ) -> tuple[Any, Any]:
         """A figure, and panels in it with small numbers, as `subplots` makes them.
 
-        `least` is the width (inches) of the narrowest panel that can be read; where columns are narrower, rows become
+        `least` is the width (inches) of the narrowest panel that can be read, `labels` the height of what is written
+        around each at any size; where columns are narrower, rows become
         columns (`turned`), or groups of columns go below each other.
         """
         turned = turned and self._narrow(columns, least) and rows < columns
@@ -140,8 +142,8 @@ class Canvas:
         if self.width is not None:
             before = (width / (rows if turned else columns), height / (columns if turned else rows))
             scale = self.width / group / before[0]
-            lowest = 1.1 if rows * groups == 1 else 0.8
-            size = self.width, rows * groups * (LABELS + max(scale * (before[1] - LABELS), lowest))
+            lowest = 0.0 if labels < LABELS else 1.1 if rows * groups == 1 else 0.8
+            size = self.width, rows * groups * (labels + max(scale * (before[1] - labels), lowest))
         squeeze = options.pop("squeeze", True)
         figure = self.figure(*size)
         axes = figure.subplots(rows * groups, group, squeeze=False, **options)
@@ -302,8 +304,13 @@ def angle_ticks(axis: Axis, figure: Any, columns: int) -> None:
 
 
 def calendar(axis: Axes, mjd: Any) -> bool:
-    """Write dates (UTC) along X, of times that are MJD; False, and nothing, where they are only numbers."""
+    """Write dates (UTC), a day at least, along X where times are MJD; False where they only count."""
     mjd = np.asarray(mjd, float)
+    low, high = (
+        axis.dataLim.intervalx
+    )  # of a single date matplotlib would draw a tenth of all days since 1970
+    margin = max(0.05 * (high - low), 0.5 * (1.0 - (high - low)))
+    axis.set_xlim(low - margin, high + margin)
     if not mjd.size or not np.nanmin(mjd) > EARLIEST:
         return False
     locator = AutoDateLocator(minticks=3, maxticks=7)

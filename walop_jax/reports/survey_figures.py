@@ -110,3 +110,4 @@ def watch_figure(found: Watch) -> Figure:
 def _events(axis: Any, events: Sequence[Mapping[str, Any]]) -> None:
     for event in events:
         axis.axvline(float(day_of(event["mjd"])), color="0.4", lw=0.8, ls=":")
+        axis.update_datalim([(float(day_of(event["mjd"])), 0.0)], updatey=False)

@@ -14,14 +14,13 @@ from walop_jax.data.records import Sources
 from walop_jax.instruments.description import parsed
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.text import read_text
-from walop_jax.model.compiled import array
 from walop_jax.model.dependence import left_behind
 from walop_jax.model.effects import EFFECTS, EffectKind, effect_by_name
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.elements import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build
 from walop_jax.model.parameters import leaves, with_values
-from walop_jax.model.sources import Standards
+from walop_jax.model.standards import standards_of
 from walop_jax.simulation.observing_plan import ObservingPlan, plan_of_document
 from walop_jax.simulation.simulate import LEVEL, Simulated, truth_values
 
@@ -41,7 +40,7 @@ class Template:
 
     def planned(self, plan: ObservingPlan | None) -> ObservingPlan:
         """A plan for a night (None: that of the template, or the usual one), checked."""
-        stars = len(self.catalogue)
+        stars = len(np.unique(self.catalogue.stars))
         if plan is None:
             return self.plan or dataclasses.replace(ObservingPlan.usual(self.instrument), standards=stars)
         if plan.name != self.instrument.name:
@@ -83,7 +82,6 @@ def truth_document(plan: ObservingPlan, seed: int, made: Simulated) -> dict[str,
         "plan": plan.document(),
         "effects": {effect.name: effect.choices() for effect in made.truth.effects},
         "catalogue": {name: getattr(sources, name).tolist() for name in sorted(_CATALOGUE)},
-        "standards": list(made.truth.standard.names),
         "parameters": {
             name: {"value": value, "unit": units[name]} for name, value in truth_values(made.truth).items()
         },
@@ -96,7 +94,7 @@ def read_truth(path: str | os.PathLike[str], effects: Sequence[EffectKind] = EFF
     try:
         content = json.loads(text)
         plan, names, values = content["plan"], content["effects"], content["parameters"]
-        catalogue, stars = content["catalogue"], tuple(content["standards"])
+        catalogue = content["catalogue"]
     except (ValueError, KeyError, TypeError):
         advice = (
             "give the file that walop-jax simulate --truth wrote (with its catalogue, which older ones lack)"
@@ -106,11 +104,11 @@ def read_truth(path: str | os.PathLike[str], effects: Sequence[EffectKind] = EFF
         design = _design(content)
         made = plan_of_document(plan, design)
         sources = Sources(**{name: np.asarray(catalogue[name]) for name in _CATALOGUE})
-        standards = Standards(q=array(sources.q), u=array(sources.u), names=stars)
+        standards = standards_of(sources, made.exposures(), made.curves())
         bare = adapted(design, throughput_degree=made.throughput_degree, throughput=LEVEL).with_source(
             standards
         )
-        context = made.context()._replace(sources=stars)
+        context = made.context()._replace(sources=standards.star_names)
         active = tuple(_effect(name, choices, context, effects) for name, choices in names.items())
         template = dataclasses.replace(bare, effects=active)
         order = [leaf.name for leaf in leaves(template)]
