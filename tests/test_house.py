@@ -188,7 +188,7 @@ MOST_LINES = {
     "sky": 250,
     "model": 9400,
     "likelihood": 3300,
-    "simulation": 900,
+    "simulation": 1040,
     "fit": 2200,
     "calibration": 2850,
     "posterior": 2400,
