@@ -50,15 +50,18 @@ def simulated_stars(
     count: int,
     seed: int,
     *,
+    night: int = 0,
     noiseless: bool = False,
     pointing: Pointing = POINTING,
 ) -> SimulatedStars:
     """Stars over the field of a plan, dwarfs and giants alike, seen once by an instrument in the plan's first filter.
 
-    The random numbers are apart from those of `simulate`, whose instrument the same seed gives.
+    The random numbers are apart from those of `simulate`, whose instrument the same seed gives. Each `night`, in days
+    after the first, sees the same stars with noise of its own.
     """
     field, curve = plan.field, next(iter(plan.curves().values()))
-    draw, photons = (np.random.default_rng(s) for s in np.random.SeedSequence(seed, spawn_key=(4,)).spawn(2))
+    draw = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(4, 0)))
+    photons = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(4, 1 + night)))
     x, y = draw.uniform(-field, field, (2, count))
     ra, dec = pointing.sky_of(x, y)
     degree, angle = draw.uniform(0.0, _DEGREE, count), draw.uniform(0.0, 2.0 * np.pi, count)
@@ -97,6 +100,6 @@ def simulated_stars(
         "BP_RP": (colour + _COLOUR_ERROR * draw.standard_normal(count), "mag", "colour of Gaia"),
         "BP_RP_ERR": (np.full(count, _COLOUR_ERROR), "mag", "standard error of BP_RP"),
         "FILTER": (np.full(count, curve.name), "", "filter"),
-        "MJD": (np.full(count, _NIGHT), "d", "mid-exposure, UTC"),
+        "MJD": (np.full(count, _NIGHT + night), "d", "mid-exposure, UTC"),
     }
     return SimulatedStars(columns, qu, teff)
