@@ -14,8 +14,7 @@ from walop_jax.commands.inputs import (
     Posterior,
     Product,
     TableFile,
-    calibration_of,
-    catalogue_of,
+    calibration_for,
     table_of,
     table_outcome,
 )
@@ -70,7 +69,6 @@ def apply(
     """
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.plain_tables import table_format
-    from walop_jax.nights.stacking import calibration_of_stars, is_survey, read_survey
     from walop_jax.posterior.draws import with_moments
     from walop_jax.science.apply import apply as apply_to_rows
     from walop_jax.science.catalogue import read_catalogue
@@ -85,10 +83,7 @@ def apply(
         table_format(output)
     job.begin("reading")
     table = table_of(catalogue, {})
-    if is_survey(calibration):
-        held = calibration_of_stars(read_survey(calibration, catalogue_of(effects)), table, force=force)
-    else:
-        held = calibration_of(calibration, effects)
+    held = calibration_for(calibration, table, effects, force=force)
     instrument, limit = held.model.template.patched(), math.inf if saturation is None else saturation
     rows = read_catalogue(table, instrument, limit, always_in=held.always_in, never_in=held.never_in)
     job.tell("tabulating the analysis vectors", "tabulating")
