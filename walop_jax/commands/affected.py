@@ -6,8 +6,9 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from walop_jax.commands.apply import calibration_for
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import Effects, PathLike, calibration_for, table_of
+from walop_jax.commands.inputs import Effects, PathLike, table_of
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run

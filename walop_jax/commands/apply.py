@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
 from walop_jax.commands.inputs import (
@@ -14,11 +14,16 @@ from walop_jax.commands.inputs import (
     Posterior,
     Product,
     TableFile,
-    calibration_for,
+    calibration_of,
+    catalogue_of,
     table_of,
     table_outcome,
 )
 from walop_jax.io.errors import errors_naming
+
+if TYPE_CHECKING:
+    from walop_jax import Calibration
+    from walop_jax.data.user_tables import InputTable
 
 CATALOGUE = Argument(
     "Table with X, Y, N, N_ERR; in CSV N0, … N0_ERR, … or O1, … O1_ERR, …", "CATALOGUE", Path
@@ -122,6 +127,17 @@ def apply(
     if crossed:
         text += f"; {crossed} in zones of high cross-talk (FLAG 16)"
     return dataclasses.replace(outcome, text=text)
+
+
+def calibration_for(
+    given: Any, stars: InputTable, effects: Effects = None, *, force: bool = False
+) -> Calibration:
+    """A calibration as `calibration_of` has it; of a survey that of the time of `stars`, of one night."""
+    from walop_jax.nights.stacking import calibration_of_stars, is_survey, read_survey
+
+    if is_survey(given):
+        return calibration_of_stars(read_survey(given, catalogue_of(effects)), stars, force=force)
+    return calibration_of(given, effects)
 
 
 def _counted(alone: bool) -> dict[Any, str]:

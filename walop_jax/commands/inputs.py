@@ -240,17 +240,6 @@ def calibration_of(given: Product, effects: Effects = None) -> Calibration:
     return read_calibration(folder_of(given), catalogue_of(effects))
 
 
-def calibration_for(
-    given: Any, stars: InputTable, effects: Effects = None, *, force: bool = False
-) -> Calibration:
-    """A calibration as `calibration_of` has it; of a survey that of the time of `stars`, of one night."""
-    from walop_jax.nights.stacking import calibration_of_stars, is_survey, read_survey
-
-    if is_survey(given):
-        return calibration_of_stars(read_survey(given, catalogue_of(effects)), stars, force=force)
-    return calibration_of(given, effects)
-
-
 def save(
     result: FitResult | Calibration | Run, folder: str | os.PathLike[str], *, overwrite: bool = False
 ) -> None:

@@ -9,10 +9,11 @@ import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy.table import Column as AstropyColumn
-from astropy.table import Table
+from astropy.table import Table, vstack
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
@@ -53,6 +54,11 @@ def astropy_table(
         ],
         meta=dict(notes or {}),
     )
+
+
+def stacked(first: Any, second: Any) -> Any:
+    """The rows of two tables as one; what a row has no column for is masked."""
+    return vstack([first, second], metadata_conflicts="silent")
 
 
 def write_table(path: str | os.PathLike[str], table: Table, *, overwrite: bool = False) -> None:

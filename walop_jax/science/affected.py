@@ -29,7 +29,7 @@ LIMIT = 0.5
 MOST = 0.95  # share of the stars of a night that may shift by no more than the limit
 
 
-class Night(NamedTuple):
+class NightShift(NamedTuple):
     """Stars of a night in one catalogue: their shift (standard errors), and the mean shift of q and u themselves.
 
     `night` is the MJD of the evening, NaN where the catalogue has no times. `lost` stars have a result by the old
@@ -58,7 +58,7 @@ class Affected(Displayed):
     old: str
     new: str
     limit: float
-    nights: tuple[Night, ...]
+    nights: tuple[NightShift, ...]
     warnings: tuple[str, ...] = ()
 
     @property
@@ -98,7 +98,7 @@ class Affected(Displayed):
 
 def affected(
     old: Calibration, new: Calibration, catalogue: Catalogue, name: str, limit: float = LIMIT
-) -> Iterator[Night]:
+) -> Iterator[NightShift]:
     """The nights of a catalogue, called `name`, with the shift of its stars when `new` takes the place of `old`."""
     before, after = results_of(old, catalogue), results_of(new, catalogue)
     beyond = np.zeros(len(before.qu), bool)
@@ -118,14 +118,14 @@ def _night(
     beyond: Bool[np.ndarray, " s"],
     which: tuple[str, float],
     limit: float,
-) -> Night:
+) -> NightShift:
     there, then = (~np.isnan(one.qu).any(axis=1) & here for one in (before, after))
     both = there & then
     z = shift(before, after)[both]
     mean = (after.qu - before.qu)[both].mean(axis=0) if both.any() else np.zeros(2)
     median, most, largest = np.quantile(z, [0.5, MOST, 1.0]) if z.size else np.zeros(3)
     lost, gained = int((there & ~then).sum()), int((then & ~there).sum())
-    return Night(
+    return NightShift(
         *which,
         stars=int(here.sum()),
         median=float(median),

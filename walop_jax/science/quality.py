@@ -24,7 +24,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.table_files import read_table_file
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.folder import locked
-from walop_jax.io.plain_tables import astropy_table, table_format, write_table
+from walop_jax.io.plain_tables import astropy_table, stacked, table_format, write_table
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.io.toml import Reader
 from walop_jax.science.field_accuracy import field_accuracy
@@ -55,7 +55,7 @@ ERRORS = {"ANGLE": "ANGLE_ERR", "P_RATIO": "P_RATIO_ERR", "ZERO_Q": "ZERO_ERR", 
 GAIN = "GAIN"
 OUTSIDE = "OUTSIDE"
 SAME = ("INSTRUME", "NIGHT", "FILTERS")
-"""What two rows of one night have in common: the later one takes the place of the other."""
+"""Columns that are alike in two rows of one night, of which the later one is kept."""
 Limits = Mapping[str, tuple[float, float]]
 
 
@@ -237,9 +237,7 @@ def read_nights(path: Path) -> Any:
 
 def joined(old: Any, new: Any) -> tuple[Any, list[str]]:
     """Both tables as one, in the order of the nights, and remarks; the later row of a night is kept."""
-    from astropy.table import vstack
-
-    rows = vstack([old, new], metadata_conflicts="silent")
+    rows = stacked(old, new)
     kept: dict[tuple[str, ...], int] = {}
     seen, remarks = set[str](), []
     for number, row in enumerate(rows):
