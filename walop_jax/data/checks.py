@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import KINDS, WAVELENGTHS, Exposures, FilterCurve, Points, Site, Sources
+from walop_jax.data.records import (
+    KINDS,
+    POLARISER,
+    WAVELENGTHS,
+    Exposures,
+    FilterCurve,
+    Points,
+    Site,
+    Sources,
+)
 from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, check
 from walop_jax.data.settings import BUILTIN_FILTERS
 from walop_jax.data.units import Place
@@ -152,6 +161,16 @@ def make_exposures(
         place.refuse(inside & ~np.isfinite(angle), what, f"{prefix}_ANGLE", advice)
         # Out of the beam an element has no angle, whatever the header remembers.
         table[f"{prefix}_ANGLE"] = np.where(inside, angle, np.nan)
+    turning = {p: np.abs(table[f"{p}_TURN"]) * table[f"{p}_IN"] > 0 for p in moving if f"{p}_TURN" in table}
+    if POLARISER in turning:
+        advice = "take it at several angles; only elements behind it may turn during an exposure"
+        place.refuse(turning[POLARISER], "is not 0", f"{POLARISER}_TURN", advice)
+    several = np.sum([*turning.values(), np.zeros(len(kind))], axis=0) > 1
+    what, advice = (
+        "another element turns as well",
+        "one at a time: their angles go together, which is not stated",
+    )
+    place.refuse(several, what, " and ".join(f"{p}_TURN" for p in turning), advice)
     angles = np.unique(table["CLP_ANGLE"][clp_in])
     if like_radians(angles):
         what = f"all {len(angles)} different angles lie between {angles[0]:g} and {angles[-1]:g}"
