@@ -83,7 +83,7 @@ def test_the_column_is_read_written_and_joined(handmade: Handmade, tmp_path):
 
 @pytest.mark.parametrize(
     ("prefix", "turn", "message"),
-    [("CLP", 30.0, r"CLP_TURN: is not 0 in row 0"), ("CHWP", np.nan, r"CHWP_TURN: is not finite")],
+    [("CLP", 30.0, r"CLP_TURN: is not 0 in rows 0, 1"), ("CHWP", np.nan, r"CHWP_TURN: is not finite")],
 )
 def test_what_cannot_be_stated_is_refused(handmade: Handmade, prefix, turn, message):
     handmade["EXPOSURES"][f"{prefix}_TURN"] = ["D", "deg", np.full(8, turn)]

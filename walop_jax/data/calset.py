@@ -163,7 +163,7 @@ def assembled(
     remarks += doubts_about(instrument, site, exposures, place)
     sources = empty_sources()
     if "SOURCES" in tables:
-        sources = make_sources(tables["SOURCES"], Place(path, "SOURCES"))
+        sources = make_sources(tables["SOURCES"], Place(path, "SOURCES"), filters)
     if images:
         intensities, points = _frames(images, exposures, instrument, path)
     else:
@@ -447,7 +447,11 @@ def _none_where_masked(source: Any) -> np.ndarray:
 
 
 def _sources(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The columns of SOURCES, numbered where they have no number."""
+    """The columns of SOURCES, numbered where they have no number: a star that has values in several bands once."""
     columns = {str(name).upper(): np.atleast_1d(values) for name, values in given.items()}
-    columns.setdefault("SOURCE", np.arange(max(map(len, columns.values()), default=0)))
+    numbers = np.arange(max(map(len, columns.values()), default=0))
+    if "FILTER" in columns and "NAME" in columns:
+        _, first, star = np.unique(columns["NAME"], return_index=True, return_inverse=True)
+        numbers = np.argsort(np.argsort(first))[star]
+    columns.setdefault("SOURCE", numbers)
     return columns

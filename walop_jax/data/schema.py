@@ -98,7 +98,7 @@ def _number(unit: str, *rules: Rule) -> Column:
 
 _TEFF = _number("K", _OF_A_SOURCE)
 _ANGLE = _number("deg", within(36000.0, "encoder readings are in degrees: are these steps?"))
-_TURN = Column("float", "deg", 0.0, rules=(finite("0 where the element stands still"),), remarked=False)
+TURN = Column("float", "deg", 0.0, rules=(finite("0 where the element stands still"),), remarked=False)
 EXPOSURES: Mapping[str, Column] = {
     "EXPOSURE": _IDENTIFIER,
     "KIND": Column("str"),
@@ -133,13 +133,14 @@ _SHARE = within(1.0, "fractions are wanted: are these per cent?", "exceeds 1")
 _FRACTION = Column("float", rules=(finite("remove the source"), _SHARE))
 _ERROR = Column("float", rules=(_POSITIVE,))
 SOURCES: Mapping[str, Column] = {
-    "SOURCE": Column("int", rules=(UNIQUE, _NUMBERED)),
+    "SOURCE": Column("int", rules=(_NUMBERED,)),
     "NAME": Column("str"),
     "Q": _FRACTION,
     "U": _FRACTION,
     "Q_ERR": _ERROR,
     "U_ERR": _ERROR,
     "TEFF": _TEFF,
+    "FILTER": Column("str", missing="", remarked=False),
 }
 _PADDED = "use one length, padded with NaN"
 FILTERS: Mapping[str, Column] = {
@@ -184,7 +185,7 @@ def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]
     for name in columns:
         prefix, _, last = name.rpartition("_")
         if last == "TURN" and f"{prefix}_ANGLE" in columns:
-            rules[name] = _TURN
+            rules[name] = TURN
         if last not in ("IN", "ANGLE") or name == last or name in rules:
             continue
         if not PREFIX.fullmatch(prefix):

@@ -246,7 +246,9 @@ class Columns:
             parts = list(KINDS[sentence.kind].slots(self.patched, sentence))
         except NoSuchPlaceError as error:
             raise NoSlotError(str(error)) from None
-        if not all(self._holds(part.slot) and "colour" not in part.factors for part in parts):
+        # Of the wavelengths in a band the light of an exposure has the mean.
+        inside = (part.slot[0] != "light" and "colour" in part.factors for part in parts)
+        if any(inside) or not all(self._holds(part.slot) for part in parts):
             raise NoSlotError(sentence.text)
         if sentence.kind != "thermal" or "temperature" in self.plan.conditions.planned:
             return parts
@@ -338,9 +340,10 @@ class ResponseBlock:
     def __init__(self, of: Columns, start: int, every: Sequence[Slot]) -> None:
         self.of = of
         data, self.found = of.responses(start)
-        self.x, self.y, weight, self.band, self.source = (
+        self.x, self.y, weight, self.band, source = (
             np.asarray(getattr(data, name)) for name in ("x", "y", "weight", "band", "source")
         )
+        self.value = np.asarray(of.patched.standard.values(source, of.exposures.colour))
         self.used = weight[..., 0] > 0
         self.linear = light.is_linear(of.patched)
         self.whole = not self.linear or of.shared.exposures is not None
@@ -433,7 +436,7 @@ class ResponseBlock:
             )  # p m e k 4
             change = found.light.slopes[:, :, self.of.of_light[slot[:4]]]
             for star in slot[4:]:
-                change = change * (self.source == star)[:, None, :, None]
+                change = change * (self.value == star)[:, None, :, None]
             raw = np.einsum("pmeks,pmes->pmek", vectors, change) * found.light.factor
             return self._pairs(raw) * self.share * self.flux
         stage, cameras = slot
