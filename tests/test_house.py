@@ -198,7 +198,7 @@ MOST_LINES = {
     "plans": 2350,
     "paper": 860,
     "reports": 2950,
-    "commands": 4080,
+    "commands": 4200,
 }
 """Lines of each room: raising one is a decision of its own."""
 
