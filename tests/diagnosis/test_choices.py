@@ -9,7 +9,6 @@ from scenes import PLAN
 
 from walop_jax.diagnosis.descriptions import other_descriptions
 from walop_jax.diagnosis.findings import Choice, document
-from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import FitResult, fit

@@ -14,7 +14,6 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.findings import Unexplained
-from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood

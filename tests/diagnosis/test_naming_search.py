@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from linear_judge import Linear
 
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.hypotheses import Probe
-from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import Projector, ScoreSpace
 from walop_jax.diagnosis.search import search
 from walop_jax.model.effects import Context, effect_by_name
@@ -78,7 +78,7 @@ def test_a_fit_that_disagrees_with_its_linear_step_lets_the_next_rival_be_fitted
     """The leader turns out worse than thought by as much as the rival turns out better."""
     judge = Counting({"clp_zero": -surprise, "rotator_zero": surprise})
     assert names(evidence([14.0]), judge)[0] == expected
-    assert ("rotator_zero" in judge.fits) == (surprise > POLICY.linear_good)
+    assert ("rotator_zero" in judge.fits) == (surprise > thresholds.LINEAR_GOOD)
 
 
 def test_two_effects_are_found_one_after_the_other():

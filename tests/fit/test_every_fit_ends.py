@@ -10,7 +10,6 @@ from small_run import SEED, SMALL
 
 from walop_jax.data.records import Position
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
