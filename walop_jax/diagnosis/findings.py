@@ -15,6 +15,7 @@ from walop_jax.data.records import Exposures
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_product import ClassOf, averaged
 from walop_jax.diagnosis.design import Design, positions_of
+from walop_jax.diagnosis.reasons import why
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
@@ -252,7 +253,9 @@ class Diagnosis(Drawn):
     `noise_scale` is the scatter of what no candidate explains over what N_ERR says, `noise_p` the chance that noise of
     the stated size scatters as much. `classes` are significant effects of the first examination with those that
     these data cannot tell from them, `limits` what effects that were not found stay below: rows of `diagnosis.json`.
-    `members` are the classes of what was added, with what their members do to stars.
+    `members` are the classes of what was added, with what their members do to stars, `rounds` all that was tried or
+    ranked, with the reason for which it was not added, `not_scored` what was not, and why. `descriptions` counts those
+    that were scored.
     """
 
     first_figure = "ladder"
@@ -276,6 +279,15 @@ class Diagnosis(Drawn):
     ended: str = ""
     members: tuple[ClassOf, ...] = ()
     rounds: tuple[Any, ...] = ()
+    not_scored: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    descriptions: int = 0
+
+    def why(self, name: str) -> str:
+        """Why an effect, a description or a change of the instrument was not named, with the numbers.
+
+        ValueError, with the nearest names, for what is none of them.
+        """
+        return why(document(self), name)
 
     def calibration(self) -> Calibration:
         """The calibration of the extended model: its mean over what these data cannot tell apart, with its spread."""
@@ -532,6 +544,12 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "cannot_be_tested": diagnosis.untestable,
         "chi2_per_dof_before": diagnosis.before.chi2 / max(diagnosis.before.dof, 1),
         "chi2_per_dof_after": diagnosis.after.chi2 / max(diagnosis.after.dof, 1),
+        "rounds": [
+            {"p_value": turn.p_value, "added": turn.added, "asked": [one._asdict() for one in turn.asked]}
+            for turn in diagnosis.rounds
+        ],
+        "not_scored": dict(diagnosis.not_scored),
+        "descriptions": diagnosis.descriptions,
         "caution": diagnosis.caution,
         "policy": thresholds.in_use(),
         "seconds": diagnosis.seconds,

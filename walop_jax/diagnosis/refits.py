@@ -23,7 +23,7 @@ from walop_jax.diagnosis.examination import Examination, examine, shortest
 from walop_jax.diagnosis.findings import Choice
 from walop_jax.diagnosis.hypotheses import Probe, Ranked, said_by
 from walop_jax.diagnosis.predictions import before_and_after, gains_by_kind, predicts_unseen
-from walop_jax.diagnosis.search import State
+from walop_jax.diagnosis.search import State, names_first
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.columns import columns
@@ -133,6 +133,23 @@ class Refits:
             if against:
                 self.tell(f"{trial.name}: exposures of {against} speak against it")
         return dataclasses.replace(trial, compared=compared, against=against)
+
+    def decided(self, trials: list[Trial]) -> list[Trial]:
+        """Trials in order of evidence; what scaled errors leave even at the top is decided with errors as stated."""
+        even = [one for one in trials if trials[0].evidence - one.evidence < thresholds.EVEN_ODDS]
+        scaled = len(even) > 1 and all(one.fit is not None and one.fit.noise_scale > 1.0 for one in even)
+        if not scaled:
+            return trials
+        exact = [fit(one.fit.likelihood, start=one.fit.values, noise_scale=1.0) for one in even if one.fit]
+        best = min(one.posterior.objective for one in exact)
+        clearly = [
+            dataclasses.replace(
+                one, fit=again, evidence=one.evidence - 0.5 * (again.posterior.objective - best)
+            )
+            for one, again in zip(even, exact, strict=True)
+        ]
+        rest = [one for one in trials if all(one is not other for other in even)]
+        return [*sorted(clearly, key=names_first), *rest]
 
     def adopted(self, state: State, trial: Trial) -> State:
         """The state with the model of a trial, fitted again where priors or errors were in its way."""

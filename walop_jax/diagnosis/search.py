@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -70,28 +70,16 @@ class State:
     ended: str = ""
 
 
-class Judge(Protocol):
-    """What an addition is worth, by linear steps or by exact fits."""
+Judge = Any
+"""What an addition is worth, by exact fits (`refits.Refits`) or by linear steps alone (the blind study):
 
-    def over(self, fits: int) -> str:
-        """Amount of work after which nothing further is tried, in words; empty: there is more to spend."""
-        ...
-
-    def fitted(self, evidence: Any, trial: Trial) -> Trial:
-        """A linear trial as the judge finds it."""
-        ...
-
-    def others(self, state: State) -> tuple[Sequence[Trial], Mapping[str, Choice]]:
-        """Trials of what has no linear step, and other descriptions of the instrument that were compared."""
-        ...
-
-    def confronted(self, evidence: Any, trial: Trial) -> Trial:
-        """A trial with what data that took no part in its fit say of it."""
-        ...
-
-    def adopted(self, state: State, trial: Trial) -> State:
-        """The state once a trial has joined the model."""
-        ...
+over        amount of work after which nothing further is tried, in words; empty: there is more to spend
+fitted      a linear trial as the judge finds it
+others      trials of what has no linear step, and other descriptions of the instrument that were compared
+decided     trials in order of evidence, with those that are even decided
+confronted  a trial with what data that took no part in its fit say of it
+adopted     the state once a trial has joined the model
+"""
 
 
 def search(state: State, judge: Judge) -> State:
@@ -236,7 +224,7 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
             fits += len(others)
             others = log.passed(others)
             new, tried = [*new, *others], [*tried, *others]
-        for trial in sorted(new, key=names_first):
+        for trial in judge.decided(sorted(new, key=names_first)):
             if accepted := next(iter(log.passed([judge.confronted(evidence, trial)])), None):
                 break
         if not waiting or (ended := judge.over(fits)):

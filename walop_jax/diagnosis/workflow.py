@@ -29,7 +29,7 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
 from walop_jax.diagnosis.examination import Examination, most_points
 from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained, describe, told
-from walop_jax.diagnosis.hypotheses import applicable
+from walop_jax.diagnosis.hypotheses import Probe, applicable
 from walop_jax.diagnosis.hypotheses import probes as all_probes
 from walop_jax.diagnosis.leftover import back_to, concluded
 from walop_jax.diagnosis.readings import mixups_of, refusal
@@ -137,6 +137,8 @@ def diagnose(
         ended=state.ended or (judge.over(state.fits) if remainder else ""),
         members=classes_of(evidence, context, set(added), groups, alike),
         rounds=state.rounds,
+        not_scored=_not_scored(catalogue, fitting, every, judge),
+        descriptions=len(alone) + len(parts),
     )
     del first, state, evidence  # the columns of all candidates, gigabytes of a large set
     return _examined(found, seed)
@@ -157,6 +159,27 @@ def _examined(found: Diagnosis, seed: int) -> Diagnosis:
     if explained:
         before = examined(found.before, seed, as_written=True)
     return dataclasses.replace(found, before=before, after=after)
+
+
+def _not_scored(
+    catalogue: Sequence[EffectKind], fitting: Sequence[EffectKind], every: Sequence[Probe], judge: Refits
+) -> dict[str, str]:
+    """What was not scored, by name, each with the reason."""
+    probed = {probe.effect for probe in judge.wanted}
+    scored = {probe.name for probe in (*judge.sentences, *(probe for probe, _ in judge.parts))}
+    reasons = {
+        one.name: "the instrument has nothing that it acts on" for one in catalogue if one not in fitting
+    }
+    for effect in fitting:
+        if effect.is_structural():
+            reasons[effect.name] = (
+                f"it has no amplitude and no score: it is tried where χ²/dof is above {thresholds.POOR_FIT:g} and no "
+                f"name explains {thresholds.GOOD_SHARE:g} of what is missing"
+            )
+        elif effect not in probed:
+            reasons[effect.name] = "the exposures have nothing that it acts on"
+    name = "it is an effect of the catalogue by another name"
+    return reasons | {probe.name: name for probe in every if probe.name not in scored}
 
 
 def _promise(choice: Choice) -> tuple[float, float]:
