@@ -88,7 +88,7 @@ def _refitted(first: State, state: State, result: FitResult, steps: Sequence[Tri
 
 
 def _leftover(first: State, state: State, judge: Refits) -> Remainder:
-    """What remains of a state, with a free-form term for it where that is of use."""
+    """Remainder of a state, with a free-form term for it where that is of use."""
     parts: tuple[str, ...] = ()
     while True:
         result = state.evidence.result
@@ -138,7 +138,7 @@ def _parts(first: State, state: State) -> dict[str, str]:
 
 
 def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult | None]:
-    """What remains, and a fit with a free-form term for it (None: it would be of no use)."""
+    """Remainder, and a fit with a free-form term for it (None: it would be of no use)."""
     evidence = state.evidence
     result, measured = evidence.result, evidence.design.measured
     patterns = tuple(evidence.patterns_needed())
@@ -221,7 +221,7 @@ def back_to(first: State, state: State) -> State:
 
 
 def _contradicted(state: State) -> dict[str, str]:
-    """What exposures of another KIND speak against, in words."""
+    """Everything that exposures of another KIND speak against, in words."""
     return {
         one.name: f"{one.name} ({one.reason})" for turn in state.rounds for one in turn.asked if one.against
     }

@@ -27,7 +27,7 @@ def why(found: Document, name: str) -> str:
 
 
 def _of_the_result(found: Document, name: str) -> Iterator[str]:
-    """What became of it in the final model."""
+    """Its fate in the final model."""
     for step in found["steps"]:
         texts = [one["sentence"] for one in step.get("sentences", ())]
         if name == step["effect"] or set(name.split("; ")) & set(texts):
@@ -64,7 +64,7 @@ def _of_the_first_look(found: Document, name: str) -> Iterator[str]:
 
 
 def _of_the_rounds(found: Document, name: str) -> Iterator[str]:
-    """What was said of it, round by round."""
+    """The reasons of every round."""
     known = {one["effect"] for one in found["candidates"]}
     rounds = found.get("rounds", ())
     for number, turn in enumerate(rounds, start=1):
@@ -116,7 +116,7 @@ def _of_a_description(found: Document, name: str) -> Iterator[str]:
 
 
 def _beside(found: Document, name: str) -> Iterator[str]:
-    """What these data cannot tell from it, and its limit."""
+    """Its rivals, and its limit."""
     for step in found["steps"]:
         if name in (*step.get("equivalent", ()), *step.get("nameless", ())):
             away = step.get("separation_sigma", {}).get(name)

@@ -33,7 +33,7 @@ from walop_jax.model.effects import Context, Described, EffectKind
 
 @dataclasses.dataclass(frozen=True)
 class Refits:
-    """What every fit of a search has in common; `adopt` is the only function that gives a state another fit.
+    """All that the fits of a search have in common; `adopt` is the only function that gives a state another fit.
 
     `wanted` are the probes of `catalogue`, `sentences` and `parts` what else can be said (`grammar.beside_names`).
     Nothing further is tried after `most` fits, nor after the time `until` (infinite: no matter how long it takes).

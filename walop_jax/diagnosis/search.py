@@ -31,7 +31,7 @@ MOST_LISTED = 40
 """Candidates of a kind that a round lists without having tried them."""
 
 
-class Asked(NamedTuple):
+class Reason(NamedTuple):
     """One candidate in a round: its evidence (ln B), corrected p, whether it was fitted, and why it was not added.
 
     `against` are KINDs of exposures that speak against it.
@@ -51,7 +51,7 @@ class Round:
 
     p_value: float
     added: str
-    asked: tuple[Asked, ...]
+    asked: tuple[Reason, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +71,7 @@ class State:
 
 
 Judge = Any
-"""What an addition is worth, by exact fits (`refits.Refits`) or by linear steps alone (the blind study):
+"""Worth of an addition, by exact fits (`refits.Refits`) or by linear steps alone (the blind study):
 
 over        amount of work after which nothing further is tried, in words; empty: there is more to spend
 fitted      a linear trial as the judge finds it
@@ -270,18 +270,18 @@ def _with_rivals(evidence: Evidence, trial: Trial, tried: Sequence[Trial]) -> Tr
     )
 
 
-def _asked(evidence: Evidence, trials: Mapping[str, Trial], added: str) -> Iterable[Asked]:
+def _asked(evidence: Evidence, trials: Mapping[str, Trial], added: str) -> Iterable[Reason]:
     """Everything that was tried in a round, and the leading candidates that were only ranked, with the reasons."""
     table = evidence.table
     for name, trial in trials.items():
         reason = trial.refused or ("" if name == added else _came_first(added))
         p = table.p_global if trial.item is None else table.corrected(trial.item.score)
-        yield Asked(name, trial.evidence, p, trial.fit is not None, reason, trial.against)
+        yield Reason(name, trial.evidence, p, trial.fit is not None, reason, trial.against)
     for ranked in (evidence.significant, evidence.significant_sentences):
         for item in ranked[:MOST_LISTED]:
             if item.name not in trials:
                 reason = _too_far(evidence, item)
-                yield Asked(item.name, item.log_bayes, table.corrected(item.score), False, reason)
+                yield Reason(item.name, item.log_bayes, table.corrected(item.score), False, reason)
 
 
 def _came_first(added: str) -> str:

@@ -164,7 +164,7 @@ def _examined(found: Diagnosis, seed: int) -> Diagnosis:
 def _not_scored(
     catalogue: Sequence[EffectKind], fitting: Sequence[EffectKind], every: Sequence[Probe], judge: Refits
 ) -> dict[str, str]:
-    """What was not scored, by name, each with the reason."""
+    """Everything that was not scored, by name, each with the reason."""
     probed = {probe.effect for probe in judge.wanted}
     scored = {probe.name for probe in (*judge.sentences, *(probe for probe, _ in judge.parts))}
     reasons = {
@@ -188,7 +188,7 @@ def _promise(choice: Choice) -> tuple[float, float]:
 
 
 def _finished(trial: Trial, evidence: Examination, context: Context, added: Sequence[str]) -> Step:
-    """What was adopted with its final parameters, what cannot be told from it, and where it sits."""
+    """An addition with its final parameters, what cannot be told from it, and where it sits."""
     result, name = evidence.result, trial.effect.name
     change = signature(result, name, context)
     separation = evidence.separation(name, change)
