@@ -193,7 +193,7 @@ MOST_LINES = {
     "calibration": 2850,
     "posterior": 2400,
     "science": 4750,
-    "diagnosis": 7500,
+    "diagnosis": 7820,
     "nights": 2800,
     "plans": 2350,
     "paper": 860,
