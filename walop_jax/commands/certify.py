@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Job, Option, Outcome, command
-from walop_jax.commands.inputs import IN_MEMORY, Effects, PathLike, Product, catalogue_of, folder_of
+from walop_jax.commands.inputs import IN_MEMORY, Effects, PathLike, Product, catalogue_of, fit_of, folder_of
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, errors_naming
 
@@ -110,6 +110,7 @@ def certify(
     from walop_jax.calibration.product import product_path, read_product
 
     job.tell("checking")
+    calibration = fit_of(calibration)
     if isinstance(calibration, Calibration | FitResult):
         there = Calibration.from_fit(calibration) if isinstance(calibration, FitResult) else calibration
         path, product, catalogue = Path(IN_MEMORY), there.product, there.model.catalogue

@@ -12,6 +12,7 @@ from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run
+    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.model.references import Reference
 
 RUN = Argument("Run, or its calibration.fits; default: the base model.", "[RUN]", Path)
@@ -20,7 +21,7 @@ RUN = Argument("Run, or its calibration.fits; default: the base model.", "[RUN]"
 @command()
 def cite(
     job: Job,
-    run: Annotated[Calibration | FitResult | Run | PathLike | None, RUN] = None,
+    run: Annotated[Calibration | FitResult | Diagnosis | Run | PathLike | None, RUN] = None,
     *,
     bibtex: Annotated[bool, Option("As BibTeX entries.")] = False,
     effects: Effects = None,

@@ -11,6 +11,7 @@ from walop_jax.commands.inputs import (
     Folder,
     InstrumentLike,
     ModelLike,
+    PathLike,
     Sets,
     set_and_model,
 )
@@ -56,29 +57,33 @@ def diagnose(
 
     >>> walop.diagnose("night.fits", progress=print).verdict  # doctest: +SKIP
     """
-    from walop_jax.calibration.product import write_calibration
-    from walop_jax.calibration.summary import summary
-    from walop_jax.diagnosis.figure_data import figure_data, write_figure_data
-    from walop_jax.diagnosis.findings import document
     from walop_jax.diagnosis.workflow import diagnose as diagnosis_of
-    from walop_jax.fit.misfit import describe
-    from walop_jax.fit.model_file import render
-    from walop_jax.science.field_accuracy import answered
 
     job.begin("reading")
     calset, chosen = set_and_model(data, model, instrument, effects, output=output)
     with job.repeated() as say:
         found = diagnosis_of(calset, chosen, seed=job.seed, minutes=minutes, progress=say)
+    return outcome_of(job, found, output)
 
-    product = found.calibration()
-    after = answered(found.after, product)
+
+def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[Diagnosis]:
+    """What is printed and written of a diagnosis."""
+    from walop_jax.calibration.product import write_calibration
+    from walop_jax.calibration.summary import summary
+    from walop_jax.diagnosis.figure_data import figure_data, write_figure_data
+    from walop_jax.diagnosis.findings import document
+    from walop_jax.fit.misfit import describe
+    from walop_jax.fit.model_file import render
+    from walop_jax.science.field_accuracy import answered
+
+    product, after = found.calibration(), answered(found.after)
     usable = after.trusted and found.verdict != "unexplained"
 
     def files() -> Writers:
         job.tell("mapping the field", "mapping")
         drawn_from = figure_data(found)
         misfit = None if after.explains_data else describe(after)
-        fitted = summary(after, seconds=job.seconds, misfit=misfit) | {"seed": job.seed}
+        fitted = summary(after, seconds=found.seconds, misfit=misfit) | {"seed": job.seed}
         return {
             PRODUCT: lambda path: write_calibration(path, product),
             SUMMARY: text_file(json_text(fitted | {"shown": after.display().document()})),

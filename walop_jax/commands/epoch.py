@@ -13,6 +13,7 @@ from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, CalibrationSet, FitResult, Run
+    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.science.epoch import Epoch
 
 OLD = Argument("Old calibration product, or folder of a run.", "OLD", Path)
@@ -23,7 +24,7 @@ OUTPUTS = ("calibration.fits", "epoch.json")
 @command(stages=("reading", "fitting", "lacking"), writes=OUTPUTS, random=True)
 def epoch(
     job: Job,
-    old: Annotated[Calibration | FitResult | Run | PathLike, OLD],
+    old: Annotated[Calibration | FitResult | Diagnosis | Run | PathLike, OLD],
     new: Annotated[CalibrationSet | PathLike | Sequence[PathLike], SETS],
     *,
     output: Annotated[PathLike | None, FOLDER] = None,

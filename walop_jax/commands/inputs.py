@@ -20,6 +20,7 @@ from walop_jax.io.text import in_ascii, read_text
 if TYPE_CHECKING:
     from walop_jax import Calibration, CalibrationSet, FitResult, Instrument, Model, Run
     from walop_jax.data.user_tables import InputTable
+    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.fit.verdict import Quality
     from walop_jax.model.effects import EffectKind
 
@@ -55,7 +56,7 @@ InstrumentLike = Annotated[
 ]
 Effects = Annotated["PathLike | Sequence[EffectKind] | None", EFFECTS]
 Product = Annotated[
-    "Calibration | FitResult | Run | PathLike",
+    "Calibration | FitResult | Diagnosis | Run | PathLike",
     Argument("Calibration product, or the folder of a run.", "RUN/calibration.fits", Path),
 ]
 DataOf = Annotated[
@@ -226,14 +227,23 @@ def set_and_model(
         return calset, model_for(calset, text, design, catalogue_of(effects))
 
 
+def fit_of(given: Any) -> Any:
+    """The last fit of a diagnosis, whose calibration is that of the diagnosis; anything else as it is."""
+    from walop_jax import FitResult
+
+    after = getattr(given, "after", None)
+    return after if isinstance(after, FitResult) else given
+
+
 def calibration_of(given: Product, effects: Effects = None) -> Calibration:
-    """A calibration: as given, that of a fit, or that of a product or run, with what its file says.
+    """A calibration: as given, that of a fit or a diagnosis, or that of a product or run, with what its file says.
 
     Raises `DataError` for a file that cannot be read.
     """
     from walop_jax import Calibration, FitResult
     from walop_jax.calibration.product import read_calibration
 
+    given = fit_of(given)
     if isinstance(given, Calibration | FitResult):
         there = given if isinstance(given, Calibration) else Calibration.from_fit(given)
         return there if there.path is not None else dataclasses.replace(there, path=Path(IN_MEMORY))
@@ -241,20 +251,31 @@ def calibration_of(given: Product, effects: Effects = None) -> Calibration:
 
 
 def save(
-    result: FitResult | Calibration | Run, folder: str | os.PathLike[str], *, overwrite: bool = False
+    result: FitResult | Diagnosis | Calibration | Run,
+    folder: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
 ) -> None:
     """Write a fit as the folder of a run: calibration.fits and summary.json; of a calibration the first alone.
+
+    Of a diagnosis all that the command writes.
 
     Raises `DataError` where they exist already and `overwrite` is False.
     """
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.summary import summary
+    from walop_jax.commands.diagnose import OUTPUTS, outcome_of
     from walop_jax.io.errors import fail
     from walop_jax.io.folder import output_folder
     from walop_jax.io.names import PRODUCT, SUMMARY
     from walop_jax.io.text import json_text
 
+    if fit_of(result) is not result:
+        diagnosis: Any = result
+        with output_folder(folder, OUTPUTS, overwrite=overwrite) as out:
+            outcome_of(Job(), diagnosis, folder).save(out)
+        return
     held = result.calibration if isinstance(result, Run) else result
     if held is None:
         raise fail("holds no calibration", file=getattr(result, "folder", ""), advice="give a fit")

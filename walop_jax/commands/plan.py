@@ -92,7 +92,6 @@ def plan(
     from walop_jax import ObservingPlan
     from walop_jax.data.records import CALIBRATION_PLATE
     from walop_jax.data.user_tables import read_input_table
-    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.io.names import PLANNED
     from walop_jax.plans.could import Could
     from walop_jax.plans.plan import plan_exposures
@@ -102,8 +101,7 @@ def plan(
     check_wishes(minutes, goal, draws)
     if not isinstance(could, str | Path | ObservingPlan) or (could != "" and Path(str(could)).is_dir()):
         after, could = could, ""
-    held = after.after if isinstance(after, Diagnosis) else after
-    known = None if held is None else calibration_of(held, effects)
+    known = None if after is None else calibration_of(after, effects)
     catalogue = catalogue_of(effects) if effects is not None or known is None else known.model.catalogue
     alike = (apart,) if isinstance(apart, str) else tuple(apart or ())
     if criterion == "apart" and not alike:

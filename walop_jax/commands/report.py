@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, command_of
-from walop_jax.commands.inputs import DataOf, Effects, PathLike, catalogue_of, folder_of, save
+from walop_jax.commands.inputs import DataOf, Effects, PathLike, catalogue_of, fit_of, folder_of, save
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:
     from walop_jax import FitResult, Run
+    from walop_jax.diagnosis.findings import Diagnosis
 
 PAGE = "report.html"
 GENERATOR = '<meta name="generator" content="walop-jax'
@@ -40,7 +41,7 @@ class Page(Displayed):
 @command(stages=("reading", "drawing"), writes=())
 def report(
     job: Job,
-    run: Annotated[FitResult | Run | PathLike, RUN],
+    run: Annotated[FitResult | Diagnosis | Run | PathLike, RUN],
     output: Annotated[PathLike | None, FILE] = None,
     *,
     data: DataOf = None,
@@ -55,7 +56,7 @@ def report(
     epoch, limits, plan, stack, watch and certify have pages of their own. A page that exists is made anew; another file
     of that name is left alone unless --overwrite is given.
 
-    In Python: a `Page`; of a fit in memory, which needs an `output`.
+    In Python: a `Page`; of a fit or a diagnosis in memory, which needs an `output`.
 
     >>> walop.report(result, "page.html")  # doctest: +SKIP
     """
@@ -65,7 +66,7 @@ def report(
     from walop_jax.reports.page import kind_of_run, render, render_other
     from walop_jax.reports.run import read_run
 
-    if isinstance(run, FitResult):
+    if isinstance(fit_of(run), FitResult):
         if output is None:
             raise UsageError("say where the page of a fit in memory is to be written", "output")
         with tempfile.TemporaryDirectory() as temporary:

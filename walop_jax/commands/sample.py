@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command, text_file
-from walop_jax.commands.inputs import DataOf, Effects, ModelLike, PathLike, catalogue_of, folder_of
+from walop_jax.commands.inputs import DataOf, Effects, ModelLike, PathLike, catalogue_of, fit_of, folder_of
 from walop_jax.io.errors import fail
 from walop_jax.io.text import read_text
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Options, Run
+    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.posterior.result import PosteriorSample, Progress
 
 RUN = Argument("Folder of a `walop-jax refit`.", "RUN", Path)
@@ -30,7 +31,7 @@ OUTPUTS = (
 @command(writes=(), random=True)
 def sample(
     job: Job,
-    fit: Annotated[FitResult | Run | PathLike, RUN],
+    fit: Annotated[FitResult | Diagnosis | Run | PathLike, RUN],
     *,
     resume: Annotated[bool, Option("Go on from the chain in RUN/sampling (emcee).")] = False,
     model: ModelLike = None,
@@ -82,6 +83,7 @@ def sample(
     anew = () if not resume or options.make_sampler().resumes else (
         f"the chain of {name} is not kept: it started anew, resume was of no use",
     )  # fmt: skip
+    fit = fit_of(fit)
     if isinstance(fit, FitResult):
         if resume or model is not None:
             raise ValueError("a fit in memory has its model and keeps no chain: leave model and resume out")

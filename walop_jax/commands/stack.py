@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import Effects, PathLike, calibration_of, catalogue_of
+from walop_jax.commands.inputs import Effects, PathLike, calibration_of, catalogue_of, fit_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from walop_jax import Calibration, FitResult, Run
+    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.nights.survey import Survey
 
 NIGHTS = Argument("Calibration sets, folders of refit, or a SURVEY.", "NIGHT...", list[Path])
@@ -30,7 +31,7 @@ def stack(
     nights: Annotated[Any, NIGHTS],
     laws: Annotated[Any, LAWS] = None,
     *,
-    like: Annotated[Calibration | FitResult | Run | PathLike | None, LIKE] = None,
+    like: Annotated[Calibration | FitResult | Diagnosis | Run | PathLike | None, LIKE] = None,
     events: Annotated[Any, EVENTS] = None,
     no_breaks: Annotated[bool, KNOWN] = False,
     workers: Annotated[int | None, WORKERS] = None,
@@ -68,6 +69,7 @@ def stack(
             "workers and scheduler exclude each other: a cluster has its own workers", "scheduler"
         )
     given: list[Any] = list(nights) if isinstance(nights, list | tuple) else [nights]
+    given = [fit_of(one) for one in given]
     with job.reserved(output, FILES) as job, executor_of(workers, scheduler) as executor:
         job.begin("reading")
         survey = stacked(

@@ -23,6 +23,7 @@ from walop_jax.commands.inputs import (
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Instrument, Run
+    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.model.trace import Traced
 
 PRODUCT = Argument("An instrument as fitted; without it, as designed.", "[RUN/calibration.fits]", Path)
@@ -32,7 +33,9 @@ ANGLE = Option("Polariser in, with its axis here (deg).", kind=float)
 @command()
 def trace(
     job: Job,
-    calibration: Annotated[Calibration | FitResult | Run | Instrument | PathLike | None, PRODUCT] = None,
+    calibration: Annotated[
+        Calibration | FitResult | Diagnosis | Run | Instrument | PathLike | None, PRODUCT
+    ] = None,
     *,
     instrument: InstrumentLike = None,
     effects: Effects = None,

@@ -11,6 +11,7 @@ Limits       to first order; what was added to one and the other is taken as ind
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -21,10 +22,11 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.thresholds import GOAL
 from walop_jax.diagnosis.class_average import known_apart_from, mixture
 from walop_jax.diagnosis.policy import POLICY
+from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import some, two_digits
 from walop_jax.model.effects import Context, Described
 from walop_jax.model.effects.change import Change as Sentence
-from walop_jax.model.specification import Model, model_without, with_effects
+from walop_jax.model.specification import Model, effect_context, model_without, with_effects
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
@@ -73,6 +75,15 @@ class ClassOf(NamedTuple):
     def names(self) -> tuple[str, ...]:
         """Members beside what was added."""
         return tuple(member.name for member in self.members[1:])
+
+
+def with_average(result: FitResult, classes: Sequence[ClassOf]) -> FitResult:
+    """The fit whose calibration is the mean over the classes of what was added to its model."""
+    if not classes:
+        return result
+    context = effect_context(result.model.template, result.calset.exposures)
+    mean = functools.partial(averaged, classes=tuple(classes), context=context)
+    return dataclasses.replace(result, averaged=mean)
 
 
 def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Context) -> Calibration:

@@ -38,6 +38,8 @@ from walop_jax.posterior.target import ExactPosterior, Target, choose_sampled
 Monitored = Callable[[Chains], Chains]
 Covariance = Float[np.ndarray, "n n"]
 
+A_MEAN = "is the mean over what its data cannot tell apart, and no fit of one model"
+"""Of a calibration that cannot be sampled."""
 SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy")
 
 
@@ -204,6 +206,8 @@ def sample(
     Around a fit whose errors come from its residuals (`errors_from`), chains are those of the stated errors, and draws
     and covariance are `sandwich_adjusted`.
     """
+    if result.averaged is not None:
+        raise fail(A_MEAN, file="the fit", advice="fit one, refit(calset, result.model), and sample that")
     options, trusted = options or Options(), result.trusted
     report = report or (lambda progress: None)
     if result.errors_from != STATED:
