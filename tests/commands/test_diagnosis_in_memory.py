@@ -10,6 +10,7 @@ from class_scene import TOLD, diagnosed, told
 
 import walop_jax as walop
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.commands.diagnose import write
 from walop_jax.diagnosis.class_product import averaged
 from walop_jax.fit.verdict import Quality
 from walop_jax.simulation.observing_plan import ObservingPlan
@@ -84,8 +85,9 @@ def test_its_figures_are_of_the_product(given, product):
     assert walop.plot(given, "matrix") is not None
 
 
-def test_it_is_saved_as_the_product(given, product, tmp_path):
-    given.save(tmp_path / "RUN") if hasattr(given, "save") else walop._save(given, tmp_path / "RUN")
+@pytest.mark.parametrize("saved", [lambda to: write(diagnosed(), to), lambda to: diagnosed().after.save(to)])
+def test_it_is_saved_as_the_product(saved, product, tmp_path):
+    saved(tmp_path / "RUN")
     again = walop.read(tmp_path / "RUN").calibration
     for ours, theirs in zip(again.matrix(X, Y), product.matrix(X, Y), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-15)

@@ -67,7 +67,7 @@ def diagnose(
 
 
 def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[Diagnosis]:
-    """What is printed and written of a diagnosis."""
+    """Outcome of a diagnosis: all that is printed and written of it."""
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.summary import summary
     from walop_jax.diagnosis.figure_data import figure_data, write_figure_data
@@ -102,6 +102,14 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
         trusted=usable,
         next=(f"walop-jax report {output}", *[f"walop-jax apply {output} STARS.fits -o OUT.fits"] * usable),
     )
+
+
+def write(found: Diagnosis, folder: PathLike, *, overwrite: bool = False) -> None:
+    """Write a diagnosis as the folder that the command makes."""
+    from walop_jax.io.folder import output_folder
+
+    with output_folder(folder, OUTPUTS, overwrite=overwrite) as out:
+        outcome_of(Job(), found, folder).save(out)
 
 
 def _with_answer(found: Diagnosis, after: FitResult) -> Display:

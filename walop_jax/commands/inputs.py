@@ -243,39 +243,28 @@ def calibration_of(given: Product, effects: Effects = None) -> Calibration:
     from walop_jax import Calibration, FitResult
     from walop_jax.calibration.product import read_calibration
 
-    given = fit_of(given)
-    if isinstance(given, Calibration | FitResult):
-        there = given if isinstance(given, Calibration) else Calibration.from_fit(given)
+    held: Any = fit_of(given)
+    if isinstance(held, Calibration | FitResult):
+        there = held if isinstance(held, Calibration) else Calibration.from_fit(held)
         return there if there.path is not None else dataclasses.replace(there, path=Path(IN_MEMORY))
-    return read_calibration(folder_of(given), catalogue_of(effects))
+    return read_calibration(folder_of(held), catalogue_of(effects))
 
 
 def save(
-    result: FitResult | Diagnosis | Calibration | Run,
-    folder: str | os.PathLike[str],
-    *,
-    overwrite: bool = False,
+    result: FitResult | Calibration | Run, folder: str | os.PathLike[str], *, overwrite: bool = False
 ) -> None:
     """Write a fit as the folder of a run: calibration.fits and summary.json; of a calibration the first alone.
-
-    Of a diagnosis all that the command writes.
 
     Raises `DataError` where they exist already and `overwrite` is False.
     """
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.summary import summary
-    from walop_jax.commands.diagnose import OUTPUTS, outcome_of
     from walop_jax.io.errors import fail
     from walop_jax.io.folder import output_folder
     from walop_jax.io.names import PRODUCT, SUMMARY
     from walop_jax.io.text import json_text
 
-    if fit_of(result) is not result:
-        diagnosis: Any = result
-        with output_folder(folder, OUTPUTS, overwrite=overwrite) as out:
-            outcome_of(Job(), diagnosis, folder).save(out)
-        return
     held = result.calibration if isinstance(result, Run) else result
     if held is None:
         raise fail("holds no calibration", file=getattr(result, "folder", ""), advice="give a fit")

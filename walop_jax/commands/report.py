@@ -61,6 +61,7 @@ def report(
     >>> walop.report(result, "page.html")  # doctest: +SKIP
     """
     from walop_jax import FitResult, Run
+    from walop_jax.commands.diagnose import write
     from walop_jax.io.atomic import atomic_path, check_output
     from walop_jax.io.text import encodable
     from walop_jax.reports.page import kind_of_run, render, render_other
@@ -70,7 +71,10 @@ def report(
         if output is None:
             raise UsageError("say where the page of a fit in memory is to be written", "output")
         with tempfile.TemporaryDirectory() as temporary:
-            save(run, Path(temporary) / "fit")
+            if isinstance(run, FitResult):
+                save(run, Path(temporary) / "fit")
+            else:
+                write(run, Path(temporary) / "fit")  # pyright: ignore[reportArgumentType]
             return command_of(report).body(job, Path(temporary) / "fit", output, effects=effects)
     folder = folder_of(run)
     target = folder / PAGE if output is None else Path(output)
