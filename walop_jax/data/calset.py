@@ -160,7 +160,7 @@ def assembled(
     remarks += doubts_about(instrument, site, exposures, place)
     sources = empty_sources()
     if "SOURCES" in tables:
-        sources = make_sources(tables["SOURCES"], Place(path, "SOURCES"))
+        sources = make_sources(tables["SOURCES"], Place(path, "SOURCES"), filters)
     if images:
         intensities, points = _frames(images, exposures, instrument, path)
     else:
@@ -332,9 +332,8 @@ def from_arrays(
     >>> made.exposures.clp_angle
     array([ 0., 30., 60., 90.])
     """
-    units = {"counts": unit_of(counts), "errors": unit_of(errors)}
+    check_units({"counts": unit_of(counts), "errors": unit_of(errors)}, "electron", Place(NAME, ""))
     counts, errors = in_unit(counts, "electron", "counts"), in_unit(errors, "electron", "errors")
-    check_units(units, "electron", Place(NAME, ""))
     x, y, angles = (np.atleast_1d(in_unit(v, "deg", n)) for v, n in ((x, "x"), (y, "y"), (angles, "angles")))
     if counts.ndim != 3 or counts.shape[:2] != (len(x), len(angles)) or len(x) != len(y):
         raise fail(
@@ -445,7 +444,11 @@ def _none_where_masked(source: Any) -> np.ndarray:
 
 
 def _sources(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The columns of SOURCES, numbered where they have no number."""
+    """The columns of SOURCES, numbered where they have no number: a star that has values in several bands once."""
     columns = {str(name).upper(): np.atleast_1d(values) for name, values in given.items()}
-    columns.setdefault("SOURCE", np.arange(max(map(len, columns.values()), default=0)))
+    numbers = np.arange(max(map(len, columns.values()), default=0))
+    if "FILTER" in columns and "NAME" in columns:
+        _, first, star = np.unique(columns["NAME"], return_index=True, return_inverse=True)
+        numbers = np.argsort(np.argsort(first))[star]
+    columns.setdefault("SOURCE", numbers)
     return columns

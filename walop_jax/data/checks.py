@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from walop_jax.data.records import KINDS, WAVELENGTHS, Exposures, FilterCurve, Points, Site, Sources
 from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, check
-from walop_jax.data.settings import BUILTIN_FILTERS
+from walop_jax.data.settings import BUILTIN_FILTERS, PHOTOMETRIC_BANDS, single_wavelength
 from walop_jax.data.units import Place
 from walop_jax.instruments.description import described, shipped
 from walop_jax.io.errors import nearest, rows_text
@@ -115,10 +115,31 @@ def checked_curve(
     return FilterCurve(name, wavelength, throughput)
 
 
-def make_sources(table: dict[str, Any], place: Place) -> Sources:
-    """Check the SOURCES table (fractions; kelvin)."""
+def make_sources(
+    table: dict[str, Any], place: Place, filters: Mapping[str, FilterCurve] | None = None
+) -> Sources:
+    """Check the SOURCES table (fractions; kelvin): one row for a star, or one for each of its bands (FILTER).
+
+    A band is one of `filters`, built in, or photometric.
+    """
     check(table, SOURCES, place)
-    return Sources(**{name.lower(): table[name] for name in SOURCES})
+    sources = Sources(**{name.lower(): table[name] for name in SOURCES})
+    known = {*(filters or ()), *BUILTIN_FILTERS, *PHOTOMETRIC_BANDS}
+    for name in set(sources.filter.tolist()) - known - {""}:
+        if single_wavelength(name) is None:
+            what = f"{name!r} is neither a row of FILTERS nor a band that is known,"
+            place.refuse(sources.filter == name, what, "FILTER", nearest(name, known))
+    several = np.bincount(sources.stars, minlength=len(sources))[sources.stars] > 1
+    advice = "number the stars; rows of one star need FILTER, each another one"
+    place.refuse(several & (sources.filter == ""), "the identifier is not unique", "SOURCE", advice)
+    rows = list(zip(sources.source.tolist(), sources.filter.tolist(), strict=True))
+    twice = np.array([rows.index(row) != i for i, row in enumerate(rows)], bool)
+    place.refuse(twice, "the star has a value in this FILTER already", "FILTER", "remove one of them")
+    for column, values in (("NAME", sources.name), ("TEFF", sources.teff)):
+        first = values[sources.stars]
+        odd = (values != first) & ~((values != values) & (first != first))  # NaN is like NaN
+        place.refuse(odd, "differs from that of the first row of the star", column, "give it another SOURCE")
+    return sources
 
 
 def make_exposures(

@@ -252,7 +252,11 @@ class Points:
 
 @dataclasses.dataclass(frozen=True)
 class Sources:
-    """Standard stars: catalogue `q`, `u` and their errors in the equatorial frame, `teff` in K (or NaN)."""
+    """Standard stars: catalogue `q`, `u` and their errors in the equatorial frame, `teff` in K (or NaN).
+
+    `filter` is the band of a value, "" where the catalogue does not state it (None: nowhere). A star with values in
+    several bands has a row for each, with one number `source`; its first row stands for it wherever a star is meant.
+    """
 
     source: Int[np.ndarray, " s"]
     name: Shaped[np.ndarray, " s"]
@@ -261,9 +265,27 @@ class Sources:
     q_err: Float[np.ndarray, " s"]
     u_err: Float[np.ndarray, " s"]
     teff: Float[np.ndarray, " s"]
+    filter: Shaped[np.ndarray, " s"] = None  # pyright: ignore[reportAssignmentType]
+
+    def __post_init__(self) -> None:
+        if self.filter is None:
+            object.__setattr__(self, "filter", np.full(len(self.source), "", dtype="U1"))
 
     def __len__(self) -> int:
         return len(self.source)
+
+    @property
+    def stars(self) -> Int[np.ndarray, " s"]:
+        """For each row the first row of its star."""
+        _, first, number = np.unique(self.source, return_index=True, return_inverse=True)
+        return first[number]
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The columns of SOURCES; FILTER only where a band is stated."""
+        columns = {field.name.upper(): getattr(self, field.name) for field in dataclasses.fields(self)}
+        if not (self.filter != "").any():
+            del columns["FILTER"]
+        return columns
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,6 +22,14 @@ _TABLES = {"SDSS-r": "sdss_r.csv"}
 BUILTIN_FILTERS = tuple(_TABLES)
 """Names that `builtin_filter` knows, single wavelengths (`single_wavelength`) apart."""
 
+PHOTOMETRIC_BANDS: Mapping[str, tuple[float, float]] = {
+    "U": (0.3663, 0.0650), "B": (0.4361, 0.0890), "V": (0.5448, 0.0840), "R": (0.6407, 0.1580), "I": (0.7980, 0.1540),
+}  # fmt: skip
+"""Bands of catalogues: effective wavelength and full width at half maximum (µm) of the Johnson–Cousins system.
+
+Source: Bessell 2005, ARA&A 43, 293, Table 1.
+"""
+
 _SINGLE = re.compile(r"MONO-(\d{3,6}(?:\.\d+)?)")
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool
 
 from walop_jax.data.schema import MISSING, Column, distinct, plain_column, values_of
 from walop_jax.data.table_files import read_table_file, table_of_hdu
-from walop_jax.data.units import Place, check_units, unit_of
+from walop_jax.data.units import Place, check_units, partner_of, unit_of
 from walop_jax.io.errors import fail
 from walop_jax.io.fits_reading import one_line
 from walop_jax.io.text import in_ascii, some
@@ -152,6 +152,9 @@ def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
     """
     place, column = Place(source.path, ""), source.column(name)
     if column is not None:
+        if (other := partner_of(name)) in source.names and rule.kind == "float":
+            beside = unit_of(source.table.columns[source.names.index(other)])
+            check_units({other: beside, name: unit_of(column)}, rule.unit, place)
         return values_of(column, name, rule, place, lenient=True)
     if rule.missing is None:
         raise place.fail("the column is missing", name, f"add it, or name it so; {_what_is_there(source)}")

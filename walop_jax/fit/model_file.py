@@ -16,7 +16,7 @@ from typing import Any
 import tomlkit
 
 from walop_jax.data.merge import parts_of
-from walop_jax.data.records import POLARISER, CalibrationSet, Sources
+from walop_jax.data.records import POLARISER, CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
@@ -29,6 +29,7 @@ from walop_jax.model.laws import laws_of
 from walop_jax.model.parameters import Parameter, check_names, unknown_name
 from walop_jax.model.sources import MoonSky, Standards
 from walop_jax.model.specification import THROUGHPUT, Model, effect_context, make_model, with_effects
+from walop_jax.model.standards import half_range, standards_of
 
 LEVEL_POINTS = 256
 """Field points from which the start value of a throughput is taken: a start need not be exact."""
@@ -189,9 +190,8 @@ def base_model(
     >>> walop.base_model(calset)["pupil.magnification"].prior
     (15.63, 0.05)
     """
-    names = standard_names(calset.sources)
-    sources = calset.sources
-    level = _level(calset)
+    sources, level = calset.sources, _level(calset)
+    standards = standards_of(sources, calset.exposures, calset.filters)
     instrument = as_designed(instrument or instrument_of(calset))
     if instrument.name != calset.instrument:
         raise ValueError(
@@ -205,15 +205,19 @@ def base_model(
     present.check_moving(instrument.patched().moving())
     instrument = adapted(
         instrument,
-        standards=list(zip(names, sources.q, sources.u, strict=True)),
+        standards=standards,
         plates=plates,
         throughput_degree=throughput_degree,
         throughput=level,
     )
     priors = {}
-    for i, name in enumerate(names):
+    for i, name in enumerate(standards.names):
         priors[f"standard.{name}.q"] = (float(sources.q[i]), float(sources.q_err[i]))
         priors[f"standard.{name}.u"] = (float(sources.u[i]), float(sources.u_err[i]))
+    for i in standards.unknown:
+        wavelength, _ = standards.bands[i]
+        width = half_range(sources, i, calset.exposures, calset.filters)
+        priors[f"standard.{standards.names[i]}.wavelength"] = (wavelength, width)
     model = make_model(calset.instrument, instrument, priors=priors)
     for i in model.positions(THROUGHPUT):
         p = model.parameters[i]
@@ -257,22 +261,6 @@ def instrument_of(calset: CalibrationSet) -> Instrument:
             "its description, --instrument FILE or instrument=Instrument.read(FILE)"
         )
     return nominal_instrument(calset.instrument)
-
-
-def standard_names(sources: Sources) -> tuple[str, ...]:
-    """Unique names of the standards, usable in parameter names."""
-    plain = [
-        "".join(c if c.isalnum() else "_" for c in str(name).strip()) or f"source{number}"
-        for number, name in zip(sources.source, sources.name, strict=True)
-    ]
-    names: list[str] = []
-    for number, name in zip(sources.source, plain, strict=True):
-        # A name that another star bears by right is not given to a namesake.
-        unique = name
-        while unique in names or (unique != name and unique in plain):
-            unique = f"{unique}_{number}"
-        names.append(unique)
-    return tuple(names)
 
 
 def has_known_flux(calset: CalibrationSet) -> bool:
@@ -327,15 +315,15 @@ def model_without_data(
     instrument: str | Instrument,
     text: str = "",
     *,
-    standards: Sequence[tuple[str, float, float]] = (),
+    standards: Standards | Sequence[tuple[str, float, float]] = (),
     context: Context | None = None,
     catalogue: Catalogue = EFFECTS,
 ) -> Model:
     """The model of an instrument as designed, for no data in particular.
 
-    `instrument` is one that comes with the package, by name, or any other; `standards` are (name, q, u); `context`
-    says what effects that grow with the data need to know of them; `catalogue` are those the text may name. Raises
-    `DataError` for an unknown instrument and ValueError as `model_for` does.
+    `instrument` is one that comes with the package, by name, or any other; `standards` are (name, q, u), or the source
+    itself; `context` says what effects that grow with the data need to know of them; `catalogue` are those the text may
+    name. Raises `DataError` for an unknown instrument and ValueError as `model_for` does.
     """
     design = nominal_instrument(instrument) if isinstance(instrument, str) else as_designed(instrument)
 

@@ -46,8 +46,8 @@ def value_and_error(value: float | str | None, sigma: float | None) -> tuple[str
     # Rounded first: 0.0996 has its second digit where 0.10 has it.
     places = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))
     if places > _MOST_PLACES:
-        more = max(0, places + math.floor(math.log10(abs(value) or sigma)))
-        return with_minus_sign(f"{value:.{more}e}"), with_minus_sign(f"{sigma:.1e}")
+        digits = max(0, places + math.floor(math.log10(abs(value) or sigma)))
+        return with_minus_sign(f"{value:.{digits}e}"), with_minus_sign(f"{sigma:.1e}")
     shown = max(0, places)
     return with_minus_sign(f"{round(value, places) + 0.0:.{shown}f}"), f"{round(sigma, places):.{shown}f}"
 
@@ -145,8 +145,8 @@ def json_text(value: Any) -> str:
 
 def some(items: Sequence[str], most: int, between: str = ", ") -> str:
     """The first of some texts, and how many more there are."""
-    more = f" and {len(items) - most} more" if len(items) > most else ""
-    return f"{between.join(items[:most])}{more}"
+    suffix = f" and {len(items) - most} more" if len(items) > most else ""
+    return f"{between.join(items[:most])}{suffix}"
 
 
 def plain(value: Any) -> Any:

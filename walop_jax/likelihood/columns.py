@@ -338,9 +338,10 @@ class ResponseBlock:
     def __init__(self, of: Columns, start: int, every: Sequence[Slot]) -> None:
         self.of = of
         data, self.found = of.responses(start)
-        self.x, self.y, weight, self.band, self.source = (
+        self.x, self.y, weight, self.band, source = (
             np.asarray(getattr(data, name)) for name in ("x", "y", "weight", "band", "source")
         )
+        self.value = np.asarray(of.patched.standard.values(source, of.exposures.colour))
         self.used = weight[..., 0] > 0
         self.linear = light.is_linear(of.patched)
         self.whole = not self.linear or of.shared.exposures is not None
@@ -433,7 +434,7 @@ class ResponseBlock:
             )  # p m e k 4
             change = found.light.slopes[:, :, self.of.of_light[slot[:4]]]
             for star in slot[4:]:
-                change = change * (self.source == star)[:, None, :, None]
+                change = change * (self.value == star)[:, None, :, None]
             raw = np.einsum("pmeks,pmes->pmek", vectors, change) * found.light.factor
             return self._pairs(raw) * self.share * self.flux
         stage, cameras = slot

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 
 import jax
 import numpy as np
@@ -18,7 +18,7 @@ from walop_jax.model.dependence import needs
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import EXTRAPOLATED, MATERIALS
 from walop_jax.model.plan import Plan, blank_exposures, exposure_arrays, hours_of
-from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, rounded_up, waves_over
+from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, moments, rounded_up, waves_over
 from walop_jax.model.ray import CONDITIONS, Conditions
 from walop_jax.model.sources import ExposureArrays
 
@@ -34,22 +34,26 @@ def plan_for(
 ) -> Plan:
     """Lay out the nodes and bands of `exposures`, as detailed as the instrument and its effects need it.
 
-    Raises KeyError for a filter that `filters` does not hold and ValueError for a KIND without a source.
+    Standards that have a colour have the slopes of the bands as well. Raises KeyError for a filter that `filters` does
+    not hold and ValueError for a KIND without a source.
     """
     own = Settings.of(exposures, instrument.patched().moving())
     each, stars = np.arange(len(exposures)), 0 if sources is None else len(sources)
     # A row for every exposure, for light of no star; then those of the stars, which may have a colour of their own.
     of_stars = np.flatnonzero(exposures.direct("standard")) if stars else each[:0]
     row = np.concatenate([each, np.repeat(of_stars, stars)])
-    settings = own[row]
+    teff = own.teff[row]
     if sources is not None and of_stars.size:
         colour = np.tile(sources.teff, of_stars.size)
-        teff = np.concatenate([own.teff, np.where(np.isfinite(colour), colour, own.teff[row[len(each) :]])])
-        settings = dataclasses.replace(settings, teff=teff)
+        teff[len(each) :] = np.where(np.isfinite(colour), colour, teff[len(each) :])
+    sloping = of_stars if instrument.standard.bands else each[:0]
+    last = len(row)
+    row, teff = np.append(row, sloping), np.append(teff, np.full(len(sloping), _typical(sources)))
+    settings = dataclasses.replace(own[row], teff=teff)
 
     def band_of(band: Int[np.ndarray, " n"]) -> Int[np.ndarray, "e s"]:
         table = np.repeat(band[: len(each), None], 1 + stars, axis=1)
-        table[of_stars, 1:] = band[len(each) :].reshape(of_stars.size, stars)
+        table[of_stars, 1:] = band[len(each) : last].reshape(of_stars.size, stars)
         return table
 
     known = [source.kind for source in instrument.sources if source.facts.flux_known]
@@ -59,7 +63,33 @@ def plan_for(
     )
     if instrument.cameras.split or steady.any():
         arrays = _sharing(arrays, own, steady, split=instrument.cameras.split)
-    return _plan(instrument, settings, hours_of(exposures)[row], filters, arrays, band_of)
+    slope = np.arange(len(row)) >= last
+    plan, band = _plan(instrument, settings, hours_of(exposures)[row], filters, arrays, slope)
+    plan = dataclasses.replace(plan, band_of=band_of(band))
+    if sources is None or not sloping.size:
+        return plan
+    curves = {name: filters[name] for name in np.unique(exposures.filter).tolist()}
+    slope_band = np.zeros(len(each), int)
+    slope_band[sloping] = band[last:]
+    seen = dataclasses.replace(
+        plan.exposures, colour=array(colours(exposures, curves, sources)), slope_band=array(slope_band, int)
+    )
+    return dataclasses.replace(plan, exposures=seen)
+
+
+def _typical(sources: Sources | None) -> float:
+    """Colour temperature that stands for those of all stars where a slope of second order is meant."""
+    known = np.zeros(0) if sources is None else sources.teff[np.isfinite(sources.teff)]
+    return float(np.median(known)) if known.size else np.nan
+
+
+def colours(
+    exposures: Exposures, curves: Mapping[str, FilterCurve], sources: Sources
+) -> Float[np.ndarray, "e s 2"]:
+    """Mean wavelength and rms width (µm) of the photons of every star in every exposure."""
+    names, number = np.unique(exposures.filter, return_inverse=True)
+    each = [[moments(curves[n].wavelength, curves[n].throughput, t) for t in sources.teff] for n in names]
+    return np.array(each)[number]
 
 
 def _sharing(
@@ -94,7 +124,8 @@ def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mappi
     """
     settings.check_moving(instrument.patched().moving())
     blank = blank_exposures(instrument, len(settings))
-    return _plan(instrument, settings, np.zeros(len(settings)), filters, blank, lambda band: band[:, None])
+    plan, band = _plan(instrument, settings, np.zeros(len(settings)), filters, blank)
+    return dataclasses.replace(plan, band_of=band[:, None])
 
 
 @functools.lru_cache(maxsize=256)
@@ -165,25 +196,28 @@ def _plan(
     hours: Float[np.ndarray, " n"],
     filters: Mapping[str, FilterCurve],
     exposures: ExposureArrays,
-    band_of: Callable[[Int[np.ndarray, " n"]], Int[np.ndarray, "e s"]],
-) -> Plan:
+    slope: Bool[np.ndarray, " n"] | None = None,
+) -> tuple[Plan, Int[np.ndarray, " n"]]:
+    """A plan, but for `Plan.band_of`, and the band of every setting; `slope` is true for those of slopes."""
     asked, patched = needs(instrument), instrument.patched()
     moving = patched.moving()
     names = sorted(asked.conditions)
     values = {"temperature": settings.temperature, "hour_angle": settings.hour_angle, "hours": hours}
     assert set(values) == set(CONDITIONS)
-    # A band is (positions, filter, conditions, colour temperature); sorting puts equal positions together.
+    # A band is (positions, filter, conditions, colour temperature, slope); sorting puts equal positions together.
     # NaN (out, flat spectrum) becomes a sortable stand-in.
     states = _rows(
         [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving], len(settings)
     )
-    moments = _rows([values[name] for name in names], len(settings))
+    planned = _rows([values[name] for name in names], len(settings))
     teff = np.nan_to_num(settings.teff).tolist()
-    keys = list(zip(states, settings.filter.astype(str).tolist(), moments, teff, strict=True))
+    sloping = np.zeros(len(settings), bool) if slope is None else slope
+    each = (states, settings.filter.astype(str).tolist(), planned, teff, sloping.tolist())
+    keys = list(zip(*each, strict=True))
     bands = sorted(set(keys))
     index = {key: i for i, key in enumerate(bands)}
 
-    groups = sorted({(name, moment) for _, name, moment, _ in bands})
+    groups = sorted({(name, moment) for _, name, moment, *_ in bands})
     curves = {name: filters[name] for name, _ in groups}
     extrapolations(patched, curves.values())
     rules = {
@@ -204,7 +238,7 @@ def _plan(
         offset[group] = start
         start += len(rules[group[0]][0])
     weight = np.zeros((len(bands), start))
-    for i, (_, name, moment, _) in enumerate(bands):
+    for i, (_, name, moment, *_) in enumerate(bands):
         first = offset[name, moment]
         weight[i, first : first + len(rules[name][1])] = rules[name][1]
 
@@ -217,7 +251,7 @@ def _plan(
     for value in sorted(set(found)):
         state = tuple(None if np.isinf(angle) else float(angle) for angle in value)
         laid.append((state, found.index(value), len(found) - found[::-1].index(value)))
-    return Plan(
+    plan = Plan(
         wavelength=array(np.concatenate([rules[name][0] for name, _ in groups])),
         conditions=Conditions(
             band_width=per_node([width[name] for name, _ in groups]),
@@ -226,10 +260,12 @@ def _plan(
         node_weight=array(weight),
         teff=array([key[3] for key in bands], float),
         exposures=exposures,
-        band_of=band_of(np.array([index[key] for key in keys], int)),
+        band_of=np.zeros((0, 1), int),
         settings=tuple(laid),
         moving=moving,
+        slope=array([key[4] for key in bands], float) if sloping.any() else None,
     )
+    return plan, np.array([index[key] for key in keys], int)
 
 
 def _rows(columns: list[Float[np.ndarray, " n"]], count: int) -> list[tuple[float, ...]]:

@@ -21,6 +21,7 @@ from walop_jax.reports.style import (
 from walop_jax.science.watch_found import Watch
 
 MOST = 8  # parameters in a figure
+SHORTEST = 1.0  # d, of an axis of dates
 
 
 @styled
@@ -90,17 +91,27 @@ def watch_figure(found: Watch) -> Figure:
             axis.axvline(change.time, color=BEFORE, lw=0.8, ls="--")
         axis.set_ylabel(f"{found.cameras[k]} (%)", fontsize=FONT)
     axes[0, 0].set_title("gain since the calibration; grey: steps that would not be seen", fontsize=FONT)
+    _a_day_at_least(axes[-1, 0])
     axes[-1, 0].set_xlabel("MJD, or number of the exposure group", fontsize=FONT)
     return figure
 
 
 def _dates(axis: Any) -> None:
-    """MJD along X, written in full."""
+    """MJD along X, written in full, over a day at least."""
+    _a_day_at_least(axis)
     axis.set_xlabel("MJD", fontsize=FONT)
     axis.xaxis.set_major_locator(MaxNLocator(6))
     axis.xaxis.set_major_formatter(ScalarFormatter(useOffset=False))
 
 
+def _a_day_at_least(axis: Any) -> None:
+    """Limits of X: of a single date matplotlib would draw a tenth of all days since 1858."""
+    low, high = axis.dataLim.intervalx
+    margin = max(0.05 * (high - low), (SHORTEST - (high - low)) / 2.0)
+    axis.set_xlim(low - margin, high + margin)
+
+
 def _events(axis: Any, events: Sequence[Mapping[str, Any]]) -> None:
     for event in events:
         axis.axvline(event["mjd"], color="0.4", lw=0.8, ls=":")
+        axis.update_datalim([(event["mjd"], 0.0)], updatey=False)

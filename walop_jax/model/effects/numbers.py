@@ -76,13 +76,15 @@ def _polarised(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
         return _of_star(instrument, terms)
     if change.kind == "polarisation":
         return instrument.changed("sky", missing=lambda p: -size if p is None else p - size)
-    positions = tuple(dict.fromkeys(one.number for one, _ in terms))
-    own = {axis: [jnp.zeros(())] * len(positions) for axis in "qu"}
-    for one, value in terms:
-        at = positions.index(one.number)
-        own[one.kind[-1]][at] = own[one.kind[-1]][at] + value
-    here = MoonPatches(jnp.stack(own["q"]), jnp.stack(own["u"]), positions)
-    return instrument.changed("sky", patches=lambda there: here if there is None else there.joined(here))
+    positions = tuple(dict.fromkeys(item.number for item, _ in terms))
+    components = {axis: [jnp.zeros(())] * len(positions) for axis in "qu"}
+    for item, value in terms:
+        at = positions.index(item.number)
+        components[item.kind[-1]][at] = components[item.kind[-1]][at] + value
+    patches = MoonPatches(jnp.stack(components["q"]), jnp.stack(components["u"]), positions)
+    return instrument.changed(
+        "sky", patches=lambda there: patches if there is None else there.joined(patches)
+    )
 
 
 def _of_patch(instrument: Instrument, change: Change) -> Grows:
@@ -95,8 +97,8 @@ def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     for change, size in terms:
         axis = change.kind.removeprefix("polarisation").strip()
         if change.place not in names or not axis:
-            known = [f"polarisation q of {name}" for name in names]
-            what = unknown_name("description", f"{change.kind} of {change.place}", known)
+            names_of_stars = [f"polarisation q of {name}" for name in names]
+            what = unknown_name("description", f"{change.kind} of {change.place}", names_of_stars)
             raise NoSuchPlaceError(str(what))
         at = names.index(change.place)
         instrument = instrument.changed(
