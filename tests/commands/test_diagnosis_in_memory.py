@@ -123,4 +123,4 @@ def test_every_function_that_takes_a_fit_takes_a_diagnosis():
         one = getattr(walop, name)
         for parameter in inspect.signature(one).parameters.values() if hasattr(one, "command") else ():
             if "FitResult" in str(parameter.annotation):
-                assert "Diagnosis" in str(parameter.annotation), f"{name}: {parameter}"
+                assert "Diagnos" in str(parameter.annotation), f"{name}: {parameter}"

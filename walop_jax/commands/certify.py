@@ -110,17 +110,17 @@ def certify(
     from walop_jax.calibration.product import product_path, read_product
 
     job.tell("checking")
-    calibration = fit_of(calibration)
-    if isinstance(calibration, Calibration | FitResult):
-        there = Calibration.from_fit(calibration) if isinstance(calibration, FitResult) else calibration
+    given: Any = fit_of(calibration)
+    if isinstance(given, Calibration | FitResult):
+        there = Calibration.from_fit(given) if isinstance(given, FitResult) else given
         path, product, catalogue = Path(IN_MEMORY), there.product, there.model.catalogue
     else:
-        path = product_path(folder_of(calibration))
+        path = product_path(folder_of(given))
         product, catalogue = read_product(path), catalogue_of(effects)
     with errors_naming(path):
         checks = tuple(checks_of(product, catalogue))
     rebuilt = any(check.name == "model" and check.passed for check in checks)
-    asked = _requirements(job, calibration, path, catalogue) if rebuilt else ()
+    asked = _requirements(job, given, path, catalogue) if rebuilt else ()
     parents = tuple(entry.sha256 for entry in product.inputs)
     made = Certificate(path, checks, asked, validity(product), product.content_hash(), parents)
     why = "; ".join(f"{check.name} ({check.found})" for check in made.failed)

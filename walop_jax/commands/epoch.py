@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import SETS, Effects, PathLike, calibration_of, catalogue_of, set_of
+from walop_jax.commands.inputs import SETS, Diagnosed, Effects, PathLike, calibration_of, catalogue_of, set_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, CalibrationSet, FitResult, Run
-    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.science.epoch import Epoch
 
 OLD = Argument("Old calibration product, or folder of a run.", "OLD", Path)
@@ -24,7 +23,7 @@ OUTPUTS = ("calibration.fits", "epoch.json")
 @command(stages=("reading", "fitting", "lacking"), writes=OUTPUTS, random=True)
 def epoch(
     job: Job,
-    old: Annotated[Calibration | FitResult | Diagnosis | Run | PathLike, OLD],
+    old: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike, OLD],
     new: Annotated[CalibrationSet | PathLike | Sequence[PathLike], SETS],
     *,
     output: Annotated[PathLike | None, FOLDER] = None,

@@ -11,7 +11,7 @@ import os
 import reprlib
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError
 from walop_jax.io.errors import DataError, errors_naming, fail
@@ -20,9 +20,18 @@ from walop_jax.io.text import in_ascii, read_text
 if TYPE_CHECKING:
     from walop_jax import Calibration, CalibrationSet, FitResult, Instrument, Model, Run
     from walop_jax.data.user_tables import InputTable
-    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.fit.verdict import Quality
     from walop_jax.model.effects import EffectKind
+
+
+class Diagnosed(Protocol):
+    """A result with a last fit: a diagnosis."""
+
+    @property
+    def after(self) -> FitResult:
+        """That fit, of which the calibration is that of the diagnosis."""
+        ...
+
 
 GIGABYTE = 1e9
 IN_MEMORY = "in memory"
@@ -56,7 +65,7 @@ InstrumentLike = Annotated[
 ]
 Effects = Annotated["PathLike | Sequence[EffectKind] | None", EFFECTS]
 Product = Annotated[
-    "Calibration | FitResult | Diagnosis | Run | PathLike",
+    "Calibration | FitResult | Diagnosed | Run | PathLike",
     Argument("Calibration product, or the folder of a run.", "RUN/calibration.fits", Path),
 ]
 DataOf = Annotated[

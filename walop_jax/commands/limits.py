@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command, figure_file
 from walop_jax.commands.inputs import (
+    Diagnosed,
     Effects,
     InstrumentLike,
     ModelLike,
@@ -21,7 +22,6 @@ from walop_jax.commands.inputs import (
 
 if TYPE_CHECKING:
     from walop_jax import CalibrationSet, FitResult, ObservingPlan
-    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.diagnosis.limits_found import DetectionLimits
 
 DATA = Argument(
@@ -41,7 +41,7 @@ OUTPUTS = ("limits.json", "limits_protection.png", "limits_separation.png")
 def limits(
     job: Job,
     data: Annotated[
-        FitResult | Diagnosis | ObservingPlan | CalibrationSet | PathLike | Sequence[PathLike], DATA
+        FitResult | Diagnosed | ObservingPlan | CalibrationSet | PathLike | Sequence[PathLike], DATA
     ],
     model: ModelLike = None,
     *,

@@ -8,12 +8,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, command_of
-from walop_jax.commands.inputs import DataOf, Effects, PathLike, catalogue_of, fit_of, folder_of, save
+from walop_jax.commands.inputs import (
+    DataOf,
+    Diagnosed,
+    Effects,
+    PathLike,
+    catalogue_of,
+    fit_of,
+    folder_of,
+    save,
+)
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:
     from walop_jax import FitResult, Run
-    from walop_jax.diagnosis.findings import Diagnosis
 
 PAGE = "report.html"
 GENERATOR = '<meta name="generator" content="walop-jax'
@@ -41,7 +49,7 @@ class Page(Displayed):
 @command(stages=("reading", "drawing"), writes=())
 def report(
     job: Job,
-    run: Annotated[FitResult | Diagnosis | Run | PathLike, RUN],
+    run: Annotated[FitResult | Diagnosed | Run | PathLike, RUN],
     output: Annotated[PathLike | None, FILE] = None,
     *,
     data: DataOf = None,
@@ -76,7 +84,7 @@ def report(
             else:
                 write(run, Path(temporary) / "fit")  # pyright: ignore[reportArgumentType]
             return command_of(report).body(job, Path(temporary) / "fit", output, effects=effects)
-    folder = folder_of(run)
+    folder = folder_of(run)  # pyright: ignore[reportArgumentType]
     target = folder / PAGE if output is None else Path(output)
     job.begin("reading")
     kind = kind_of_run(folder)

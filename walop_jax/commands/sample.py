@@ -9,13 +9,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command, text_file
-from walop_jax.commands.inputs import DataOf, Effects, ModelLike, PathLike, catalogue_of, fit_of, folder_of
+from walop_jax.commands.inputs import (
+    DataOf,
+    Diagnosed,
+    Effects,
+    ModelLike,
+    PathLike,
+    catalogue_of,
+    fit_of,
+    folder_of,
+)
 from walop_jax.io.errors import fail
 from walop_jax.io.text import read_text
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Options, Run
-    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.posterior.result import PosteriorSample, Progress
 
 RUN = Argument("Folder of a `walop-jax refit`.", "RUN", Path)
@@ -31,7 +39,7 @@ OUTPUTS = (
 @command(writes=(), random=True)
 def sample(
     job: Job,
-    fit: Annotated[FitResult | Diagnosis | Run | PathLike, RUN],
+    fit: Annotated[FitResult | Diagnosed | Run | PathLike, RUN],
     *,
     resume: Annotated[bool, Option("Go on from the chain in RUN/sampling (emcee).")] = False,
     model: ModelLike = None,
@@ -90,7 +98,7 @@ def sample(
         posterior = sample_fit(fit, options, report=tell)
         where = "the fit"
     else:
-        where = folder_of(fit)
+        where = folder_of(fit)  # pyright: ignore[reportArgumentType]
         run = Run(where, catalogue_of(effects), tuple(data or ()))
         posterior = _sampled_run(job, run, options, tell, model, resume)
     return Outcome(

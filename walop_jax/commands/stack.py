@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import Effects, PathLike, calibration_of, catalogue_of, fit_of
+from walop_jax.commands.inputs import Diagnosed, Effects, PathLike, calibration_of, catalogue_of, fit_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from walop_jax import Calibration, FitResult, Run
-    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.nights.survey import Survey
 
 NIGHTS = Argument("Calibration sets, folders of refit, or a SURVEY.", "NIGHT...", list[Path])
@@ -31,7 +30,7 @@ def stack(
     nights: Annotated[Any, NIGHTS],
     laws: Annotated[Any, LAWS] = None,
     *,
-    like: Annotated[Calibration | FitResult | Diagnosis | Run | PathLike | None, LIKE] = None,
+    like: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike | None, LIKE] = None,
     events: Annotated[Any, EVENTS] = None,
     no_breaks: Annotated[bool, KNOWN] = False,
     workers: Annotated[int | None, WORKERS] = None,

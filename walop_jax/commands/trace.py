@@ -12,6 +12,7 @@ from walop_jax.commands.inputs import (
     NOT_CARRIED_OVER,
     TEFF,
     Angles,
+    Diagnosed,
     Effects,
     InstrumentLike,
     PathLike,
@@ -23,7 +24,6 @@ from walop_jax.commands.inputs import (
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Instrument, Run
-    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.model.trace import Traced
 
 PRODUCT = Argument("An instrument as fitted; without it, as designed.", "[RUN/calibration.fits]", Path)
@@ -34,7 +34,7 @@ ANGLE = Option("Polariser in, with its axis here (deg).", kind=float)
 def trace(
     job: Job,
     calibration: Annotated[
-        Calibration | FitResult | Diagnosis | Run | Instrument | PathLike | None, PRODUCT
+        Calibration | FitResult | Diagnosed | Run | Instrument | PathLike | None, PRODUCT
     ] = None,
     *,
     instrument: InstrumentLike = None,

@@ -27,8 +27,7 @@ from walop_jax.io.text import two_digits
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, EffectKind
-from walop_jax.posterior.draws import read_groups
-from walop_jax.posterior.sampling import A_MEAN
+from walop_jax.posterior.draws import A_MEAN, read_groups
 
 VERDICTS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "diagnosis": lambda d: str(d["verdict"]),

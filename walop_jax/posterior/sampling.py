@@ -19,7 +19,7 @@ from walop_jax.fit.verdict import STATED
 from walop_jax.io.code import versions_of
 from walop_jax.io.errors import fail
 from walop_jax.model.specification import Model
-from walop_jax.posterior.draws import digest, digest_of_fit
+from walop_jax.posterior.draws import A_MEAN, digest, digest_of_fit
 from walop_jax.posterior.files import Chain
 from walop_jax.posterior.result import (
     BURN_IN,
@@ -38,8 +38,6 @@ from walop_jax.posterior.target import ExactPosterior, Target, choose_sampled
 Monitored = Callable[[Chains], Chains]
 Covariance = Float[np.ndarray, "n n"]
 
-A_MEAN = "is the mean over what its data cannot tell apart, and no fit of one model"
-"""Of a calibration that cannot be sampled."""
 SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy")
 
 
