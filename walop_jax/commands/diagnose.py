@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import (
     Job,
@@ -62,7 +62,7 @@ def diagnose(
     effects: Effects = None,
     minutes: Annotated[float | None, MINUTES] = None,
     why: Annotated[str | None, WHY] = None,
-) -> Outcome[Diagnosis | str]:
+) -> Outcome[Diagnosis]:
     """Say what is missing from the model, add it, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
 
     The verdict is consistent, effect_found or unexplained. Effects that the data cannot tell apart are listed
@@ -129,7 +129,7 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
     )
 
 
-def _why(name: str, data: Sets) -> Outcome[Diagnosis | str]:
+def _why(name: str, data: Sets) -> Outcome[Any]:
     """The answer of a run to why something was not named."""
     from walop_jax.diagnosis.reasons import why
     from walop_jax.io.run_folder import RunFolder
