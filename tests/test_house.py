@@ -184,7 +184,7 @@ def test_the_core_is_reached_without_the_rest(entry):
 MOST_LINES = {
     "io": 1600,
     "instruments": 250,
-    "data": 4550,
+    "data": 4640,
     "sky": 250,
     "model": 9400,
     "likelihood": 3300,
@@ -198,7 +198,7 @@ MOST_LINES = {
     "plans": 2350,
     "paper": 860,
     "reports": 2800,
-    "commands": 3900,
+    "commands": 4000,
 }
 """Lines of each room: raising one is a decision of its own."""
 

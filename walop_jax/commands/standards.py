@@ -27,34 +27,27 @@ def standards(
     In Python: an astropy QTable.
 
     >>> table = walop.standards(near=(308.0, 41.0))
-    >>> table["NAME"][0], table["FILTER"][0]
+    >>> str(table["NAME"][0]), str(table["FILTER"][0])
     ('VI Cyg 12', 'R')
     """
     import numpy as np
 
     from walop_jax.data.records import Site
-    from walop_jax.data.standards import shipped_standards
+    from walop_jax.data.standards import distances, in_degrees, shipped_standards
     from walop_jax.instruments.description import default_name, read_description
     from walop_jax.sky.moon import altitude
 
     table = shipped_standards()
-    ra, dec = (np.asarray(table[name].to_value("deg"), float) for name in ("RA", "DEC"))
     if near is not None:
-        from astropy.coordinates import SkyCoord
-
-        centre = SkyCoord(*_direction(near), unit="deg")
-        table["DISTANCE"] = centre.separation(SkyCoord(ra, dec, unit="deg")).to("deg")
-        order = np.argsort(table["DISTANCE"], kind="stable")
-        table, ra, dec = table[order], ra[order], dec[order]
+        away = distances(table, *_direction(near))
+        table = in_degrees(table, "DISTANCE", away)[np.argsort(away, kind="stable")]
     if up is not None:
         given: Any = default_name() if instrument is None else instrument
         place: Any = given.site if hasattr(given, "site") else read_description(given).place
+        ra, dec = (np.asarray(table[name].to_value("deg"), float) for name in ("RA", "DEC"))
         height = altitude(np.full(len(ra), up), ra, dec, Site(*place[:4]))
-        from astropy import units
-
-        table["ALTITUDE"] = height * units.deg
-        order = np.flatnonzero(height >= LOWEST) if near is not None else np.argsort(-height, kind="stable")
-        table = table[order[height[order] >= LOWEST]]
+        order = np.arange(len(ra)) if near is not None else np.argsort(-height, kind="stable")
+        table = in_degrees(table, "ALTITUDE", height)[order[height[order] >= LOWEST]]
     rows = [{name: _plain(row[name]) for name in table.colnames} for row in table]
     return Outcome(table, {**table.meta, "standards": rows}, _lines(table))
 
