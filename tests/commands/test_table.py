@@ -157,6 +157,9 @@ CASES = {
         lambda g: (g.exports,), lambda g, **k: walop.import_zemax(g.exports, **k), "set.fits"
     ),
     "trace": Case(lambda g: (g.run, "--x", 0.1), lambda g, **k: walop.trace(g.run, x=0.1, **k)),
+    "standards": Case(
+        lambda g: ("--near", "308,41"), lambda g, **k: walop.standards(near=(308.0, 41.0), **k)
+    ),
     "cite": Case(lambda g: (g.run,), lambda g, **k: walop.cite(g.run, **k)),
     "conformance": Case(lambda g: ("--make", g.pack), lambda g, **k: walop.conformance(make=g.pack, **k)),
     "docs": Case(lambda g: ("files",), lambda g, **k: walop.docs("files", **k)),
@@ -219,7 +222,7 @@ def test_files_and_document_are_those_of_the_program(name: str, call, given: Giv
     assert_same_files(command, caller)
     if case.output.startswith("RUN"):
         assert_same_files(command / case.output, caller / case.output)
-    if name not in ("instrument", "docs", "trace", "cite", "model", "conformance"):
+    if name not in ("instrument", "docs", "trace", "cite", "standards", "model", "conformance"):
         assert told
     if isinstance(document, dict) and "seed" in document:
         assert isinstance(document["seed"], int)
