@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from astropy.table import Table
+from camera_files import four, some_stars
 from zemax_exports import write_folder
 
 import walop_jax as walop
@@ -139,6 +140,7 @@ CASES = {
         lambda g, **k: walop.matrix(g.run, points=g.points, **k),
         "m.ecsv",
     ),
+    "gather": Case(lambda g: g.cameras, lambda g, **k: walop.gather(g.cameras, **k), "s.ecsv"),
     "apply": Case(lambda g: (g.run, g.stars), lambda g, **k: walop.apply(g.run, g.stars, **k), "s.ecsv"),
     "certify": Case(lambda g: (g.run,), lambda g, **k: walop.certify(g.run, **k), "RUN"),
     "epoch": Case(lambda g: (g.run, g.calset), lambda g, **k: walop.epoch(g.run, g.calset, **k), "RUN", True),
@@ -183,6 +185,7 @@ class Given(NamedTuple):
     stars: Path
     exports: Path
     pack: Path
+    cameras: tuple[Path, ...]
 
 
 @pytest.fixture
@@ -201,6 +204,7 @@ def given(fitted: FittedSet, tmp_path: Path) -> Given:
         tmp_path / "stars.fits",
         exports,
         tmp_path / "pack",
+        tuple(four(some_stars(), tmp_path)),
     )
 
 
