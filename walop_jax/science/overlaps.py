@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from scipy import special
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.science.apply import apply
+from walop_jax.science.apply import STAR_SAMPLE, apply
 from walop_jax.science.catalogue import Catalogue
 
 APART = 0.02  # deg: rows of a star that lie farther apart than that are at two places
@@ -62,8 +62,12 @@ def at_several_places(catalogue: Catalogue) -> Bool[np.ndarray, " n"]:
 
 
 def overlap(calibration: Calibration, catalogue: Catalogue, *, force: bool = False) -> Overlap | None:
-    """Comparison of q and u of stars at several places, each row by itself; None where no star is seen so."""
+    """Comparison of q and u of stars at several places, each row by itself; None where no star is seen so.
+
+    Of more than `STAR_SAMPLE` rows the first are compared. Raises `DataError` as `apply` does.
+    """
     chosen = at_several_places(catalogue)
+    chosen &= catalogue.star < np.sort(catalogue.star[chosen])[:STAR_SAMPLE].max(initial=-1) + 1
     if not chosen.any() or not np.isfinite(catalogue.rotator[chosen]).any():
         return None
     some = catalogue.of_rows(chosen)
