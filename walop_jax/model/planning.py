@@ -37,19 +37,22 @@ def plan_for(
     Raises KeyError for a filter that `filters` does not hold and ValueError for a KIND without a source.
     """
     own = Settings.of(exposures, instrument.patched().moving())
-    each, stars = np.arange(len(exposures)), 0 if sources is None else len(sources)
-    # A row for every exposure, for light of no star; then those of the stars, which may have a colour of their own.
-    of_stars = np.flatnonzero(exposures.direct("standard")) if stars else each[:0]
-    row = np.concatenate([each, np.repeat(of_stars, stars)])
-    settings = own[row]
-    if sources is not None and of_stars.size:
-        colour = np.tile(sources.teff, of_stars.size)
-        teff = np.concatenate([own.teff, np.where(np.isfinite(colour), colour, own.teff[row[len(each) :]])])
+    stars = 0 if sources is None else len(sources)
+    # A row for every exposure; of standards one for every star, as each may have a colour of its own.
+    of_stars = exposures.direct("standard") & (stars > 0)
+    row = np.repeat(np.arange(len(exposures)), np.where(of_stars, stars, 1))
+    settings, seen = own[row], of_stars[row]
+    if sources is not None and seen.any():
+        colour = np.tile(sources.teff, of_stars.sum())
+        teff = settings.teff.copy()
+        teff[seen] = np.where(np.isfinite(colour), colour, teff[seen])
         settings = dataclasses.replace(settings, teff=teff)
 
     def band_of(band: Int[np.ndarray, " n"]) -> Int[np.ndarray, "e s"]:
-        table = np.repeat(band[: len(each), None], 1 + stars, axis=1)
-        table[of_stars, 1:] = band[len(each) :].reshape(of_stars.size, stars)
+        table = np.empty((len(exposures), 1 + stars), int)
+        table[~of_stars] = band[~seen, None]
+        table[of_stars, 1:] = band[seen].reshape(of_stars.sum(), stars)
+        table[of_stars, 0] = table[of_stars, -1]  # nothing is used of a standard without its star
         return table
 
     known = [source.kind for source in instrument.sources if source.facts.flux_known]
@@ -59,7 +62,9 @@ def plan_for(
     )
     if instrument.cameras.split or steady.any():
         arrays = _sharing(arrays, own, steady, split=instrument.cameras.split)
-    return _plan(instrument, settings, hours_of(exposures)[row], filters, arrays, band_of)
+    return _plan(
+        instrument, settings, exposures.kind[row], hours_of(exposures)[row], filters, arrays, band_of
+    )
 
 
 def _sharing(
@@ -94,7 +99,8 @@ def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mappi
     """
     settings.check_moving(instrument.patched().moving())
     blank = blank_exposures(instrument, len(settings))
-    return _plan(instrument, settings, np.zeros(len(settings)), filters, blank, lambda band: band[:, None])
+    kinds, hours = np.full(len(settings), ""), np.zeros(len(settings))
+    return _plan(instrument, settings, kinds, hours, filters, blank, lambda band: band[:, None])
 
 
 @functools.lru_cache(maxsize=256)
@@ -162,6 +168,7 @@ def _fringes(instrument: Instrument, curve: FilterCurve, room: float = ROOM) -> 
 def _plan(
     instrument: Instrument,
     settings: Settings,
+    kinds: np.ndarray,
     hours: Float[np.ndarray, " n"],
     filters: Mapping[str, FilterCurve],
     exposures: ExposureArrays,
@@ -172,18 +179,19 @@ def _plan(
     names = sorted(asked.conditions)
     values = {"temperature": settings.temperature, "hour_angle": settings.hour_angle, "hours": hours}
     assert set(values) == set(CONDITIONS)
-    # A band is (positions, filter, conditions, colour temperature); sorting puts equal positions together.
-    # NaN (out, flat spectrum) becomes a sortable stand-in.
+    # A band is (positions, filter, conditions, colour temperature, KIND); sorting puts equal positions together.
+    # NaN (out, flat spectrum) becomes a sortable stand-in. KINDs are apart, so that a set in which the colour of one
+    # is another has a plan of the same shape.
     states = _rows(
         [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving], len(settings)
     )
     moments = _rows([values[name] for name in names], len(settings))
     teff = np.nan_to_num(settings.teff).tolist()
-    keys = list(zip(states, settings.filter.astype(str).tolist(), moments, teff, strict=True))
+    keys = list(zip(states, settings.filter.astype(str).tolist(), moments, teff, kinds.tolist(), strict=True))
     bands = sorted(set(keys))
     index = {key: i for i, key in enumerate(bands)}
 
-    groups = sorted({(name, moment) for _, name, moment, _ in bands})
+    groups = sorted({(name, moment) for _, name, moment, *_ in bands})
     curves = {name: filters[name] for name, _ in groups}
     extrapolations(patched, curves.values())
     rules = {
@@ -204,7 +212,7 @@ def _plan(
         offset[group] = start
         start += len(rules[group[0]][0])
     weight = np.zeros((len(bands), start))
-    for i, (_, name, moment, _) in enumerate(bands):
+    for i, (_, name, moment, *_) in enumerate(bands):
         first = offset[name, moment]
         weight[i, first : first + len(rules[name][1])] = rules[name][1]
 
