@@ -249,4 +249,4 @@ def test_what_a_fit_in_memory_left_undecided(tmp_path):
     """It has no diagnosis; asking it for one ended in a TypeError."""
     result = refit(simulate(ObservingPlan(grid=3, moon_patches=2, standards=3), seed=1).calset).judged()
     with pytest.raises(DataError, match="no diagnosis; run diagnose first, or name the effects with --apart"):
-        plan_command(after=result, could="", criterion="apart")
+        plan_command(after=result, available="", criterion="apart")

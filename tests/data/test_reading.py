@@ -52,7 +52,7 @@ def test_units_are_converted(handmade):
         ("EXPOSURES", "EXPTIME", "min", 1 / 60),
         ("EXPOSURES", "HA", "deg", 15.0),
         ("FILTERS", "WAVELENGTH", "nm", 1000.0),
-        ("SOURCES", "Q", "%", 100.0),
+        *(("SOURCES", name, "%", 100.0) for name in ("Q", "U", "Q_ERR", "U_ERR")),
     ]:
         entry = handmade[table][column]
         entry[1], entry[2] = unit, entry[2] * factor
@@ -63,7 +63,31 @@ def test_units_are_converted(handmade):
         one, two = getattr(plain.exposures, name), getattr(other.exposures, name)
         np.testing.assert_allclose(two, one, rtol=1e-5 if name == "temp" else 1e-7)  # float32 columns
     np.testing.assert_allclose(other.filters["NARROW"].wavelength, [0.57, 0.58, 0.59], rtol=1e-14)
-    np.testing.assert_allclose(other.sources.q, plain.sources.q, rtol=1e-14)
+    for name in ("q", "u", "q_err", "u_err"):
+        np.testing.assert_allclose(getattr(other.sources, name), getattr(plain.sources, name), rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "unit", "other"),
+    [
+        ("SOURCES", "Q", "%", "Q_ERR"),
+        ("SOURCES", "U_ERR", "%", "U"),
+        ("SOURCES", "U", "%", "Q"),
+        ("POINTS", "Y", "arcmin", "X"),
+        ("INTENSITIES", "N", "1000 electron", "N_ERR"),
+    ],
+)
+def test_columns_that_belong_together_have_units_together(handmade, table, column, unit, other):
+    """A value in per cent beside an error without a unit: the error could be a fraction, or per cent as well."""
+    for name, entry in handmade[table].items():
+        if name[0] in "QUXYN" and name != "NAME":
+            entry[1] = None if name == other else unit
+    with pytest.raises(
+        DataError, match=rf"\[{table}\] {other}: has no unit, .* is in .*; give all in one unit"
+    ):
+        read_calibration_set(handmade.write())
+    handmade[table][other][1] = unit
+    read_calibration_set(handmade.write("all.fits"))
 
 
 def test_a_missing_unit_is_the_usual_one(handmade):

@@ -26,6 +26,7 @@ from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
+from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Effect
 from walop_jax.model.parameters import leaves, values_of
@@ -68,7 +69,7 @@ class Hiding:
             tuple(_jittered(member, rng) for member in probe.group) if len(probe.group) == 1 else probe.group
         )
         probe = Probe(probe.name, probe.effect, group)
-        candidate = all_candidates(self.fit.likelihood, self.fit.values, [probe], ())[0][probe.name]
+        candidate = all_candidates(Columns(self.fit.likelihood, self.fit.values), [probe], ())[0][probe.name]
         columns = self.design.stacked([candidate.columns])
         step = rng.standard_normal(len(probe.widths)) * probe.widths
         step = np.where(probe.one_sided, np.abs(step), step)

@@ -12,6 +12,7 @@ from walop_jax.diagnosis.hypotheses import all_candidates, applicable, probes
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.instruments.description import parsed
+from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS
 from walop_jax.model.effects.change import Change
@@ -56,7 +57,7 @@ def said(laid, request):
     if not request.config.getoption("--long"):
         found = [probe for probe in found if probe.name in QUICK]
         assert len(found) == len(QUICK)
-    made = all_candidates(laid.likelihood, laid.values, (), found)[1]
+    made = all_candidates(Columns(laid.likelihood, laid.values), (), found)[1]
     return {name: candidate.columns for name, candidate in made.items()}
 
 
@@ -70,7 +71,7 @@ def test_names_are_sentences(laid, said):
     single = {}
     for name, columns in said.items():
         single |= dict(zip(name.split("; "), columns.T, strict=True))
-    theirs = all_candidates(laid.likelihood, laid.values, wanted, ())[0]
+    theirs = all_candidates(Columns(laid.likelihood, laid.values), wanted, ())[0]
     assert {p.effect.name for p in wanted if p.name not in theirs} == {"etalon"}, (
         "wide gaps, blurred by the bands"
     )

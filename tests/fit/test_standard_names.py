@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from walop_jax.data.records import Sources
-from walop_jax.fit.model_file import standard_names
+from walop_jax.model.standards import standard_names
 
 
 @pytest.mark.parametrize(

@@ -39,9 +39,9 @@ SOUTH = {
 }
 QUARTZ = 582.484539824296  # µm: with 474 µm of MgF2 half a wave at 0.62 µm
 LAB = SOUTH | {
-    "collimator.diattenuation": (0.0, 0.003, "deg-2"),
+    "collimator.diattenuation": (0.0, 6.75e-7, "deg-2"),
     "pupil.magnification": (1.0, 0.05, ""),
-    "pupil.distortion": (0.0, 0.01, "deg-2"),
+    "pupil.distortion": (0.0, 2.25e-6, "deg-2"),
     **{f"half{h}.wedge": (0.0, 0.001, "rad") for h in (1, 2)},
     **{f"{p}.quartz": (QUARTZ, 1.0, "um") for p in ("chwp", "half1.plate", "half2.plate")},
     **{f"{p}.mgf2": (474.0, 1.0, "um") for p in ("chwp", "half1.plate", "half2.plate")},

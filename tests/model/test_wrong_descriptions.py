@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from own_instrument import OWN
 
-from walop_jax.instruments.description import read_description
+from walop_jax.instruments.description import parsed, read_description
 from walop_jax.io.errors import DataError
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.instrument import Instrument, build
 
 WINDOW = OWN[OWN.index('kind = "retarder"') : OWN.index("\n[arms.main]\n")]
 # What is changed in OWN, and what the message says beside the name of the file: table, key, what to do.
@@ -213,6 +213,29 @@ def test_a_wrong_file_is_refused_with_its_place(tmp_path: Path, case):
     assert text.startswith(f"{path}: ")
     assert text.count(str(path)) == 1
     assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("edge", "what"),
+    [
+        (
+            "edge = 5.0",
+            r"\[elements\.collimator\] diattenuation may be 1\.05 at the edge of the field \(7\.07 deg",
+        ),
+        (
+            "edge = 2.0",
+            r"\[elements\.pupil\] distortion may be 0\.4 .* below 0\.042 deg-2, or a smaller field",
+        ),
+        (
+            "edge = 1.8\nraster = 'line'\n[elements.pupil]\nmagnification = 50.0",
+            "magnification = 50 turns .* by 105",
+        ),
+    ],
+)
+def test_numbers_that_the_field_is_too_wide_for(edge: str, what: str):
+    """Of an instrument like another: 0.012 ± 0.003 of light, 0.02 ± 0.01 of the angle, for each deg²."""
+    with pytest.raises(DataError, match=what):
+        build(parsed(f'name = "WIDE"\nlike = "WALOP-SOUTH"\n[field]\n{edge}\n', "a text"))
 
 
 def test_a_file_that_cannot_be_read(tmp_path: Path):

@@ -20,10 +20,10 @@ from walop_jax.io.names import PLANNED
 from walop_jax.io.text import json_text
 from walop_jax.likelihood.flux import Sharing
 from walop_jax.model.specification import effect_context, with_effects
-from walop_jax.plans.could import Costs, Could
+from walop_jax.plans.available import Available, Costs
+from walop_jax.plans.criteria import FieldErrors, criterion_by_name, field_errors
 from walop_jax.plans.exposures import Illumination, candidates
 from walop_jax.plans.plan import plan_from
-from walop_jax.plans.wanted import FieldErrors, field_errors, wanted
 from walop_jax.reports.page import kind_of_run, render_other
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, plan_text, read_plan
 from walop_jax.simulation.simulate import PhotonNoise, effect_from_text, simulate
@@ -36,7 +36,7 @@ SMALL = ObservingPlan(
 
 @pytest.fixture(scope="module")
 def small():
-    return candidates(Could(SMALL), draws=1, angles=ANGLES)
+    return candidates(Available(SMALL), draws=1, angles=ANGLES)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def field(small) -> FieldErrors:
 
 @pytest.fixture(scope="module")
 def planned(small, field):
-    return plan_from(small, 15.0, wanted(small, field, "worst"), field)
+    return plan_from(small, 15.0, criterion_by_name(small, field, "worst"), field)
 
 
 def test_the_promise_is_the_error_of_a_fit(small, field):
@@ -116,12 +116,12 @@ def test_exposures_that_say_nothing_of_what_is_wanted(small):
     """The polariser is indoors: what it sees says nothing of the sky."""
     indoors = dataclasses.replace(small, choices=small.choices[:1], families=small.families[:1])
     with pytest.raises(ValueError, match=r"sky.depolarisation: nothing that could .* no moon or standard"):
-        plan_from(indoors, 15.0, wanted(indoors, None, "sky.depolarisation"))
+        plan_from(indoors, 15.0, criterion_by_name(indoors, None, "sky.depolarisation"))
 
 
 def test_a_time_that_pays_for_nothing(small, field):
     with pytest.raises(ValueError, match=r"single exposure: the shortest takes 0\.83"):
-        plan_from(small, 0.5, wanted(small, field, "worst"), field)
+        plan_from(small, 0.5, criterion_by_name(small, field, "worst"), field)
 
 
 @pytest.mark.parametrize(
@@ -136,37 +136,37 @@ def test_a_time_that_pays_for_nothing(small, field):
 )
 def test_costs_and_times_that_contradict_themselves(entries, message):
     with pytest.raises(ValueError, match=message):
-        Could.read({"grid": 4, **entries}, Path())
+        Available.read({"grid": 4, **entries}, Path())
 
 
 def test_what_is_down_is_left_out_and_said():
     """Half a day later the Moon of the night is below the horizon and the Sun is up."""
     day = dataclasses.replace(SMALL, mjd=SMALL.start + 0.5)
-    choices, notes = Could(day).choices()
+    choices, notes = Available(day).choices()
     assert {choice.kind for choice in choices} == {"clp"}
     assert len(notes) == 2
     better = float(notes[0].split("mjd = ")[1].split(" ")[0])
-    choices, notes = Could(dataclasses.replace(SMALL, mjd=better)).choices()
+    choices, notes = Available(dataclasses.replace(SMALL, mjd=better)).choices()
     assert {choice.kind for choice in choices} == {"clp", "moon", "standard"}
     assert notes == ()
 
 
 def test_other_criteria_by_name(small, field, planned):
     """Rms over the field is no more than the largest; a parameter has the error of its own covariance."""
-    mean = plan_from(small, 15.0, wanted(small, field, "mean"), field)
+    mean = plan_from(small, 15.0, criterion_by_name(small, field, "mean"), field)
     assert mean.value < planned.value
     name = "collimator.curvature" if "collimator.curvature" in small.names else small.names[0]
-    one = plan_from(small, 15.0, wanted(small, field, name), field)
+    one = plan_from(small, 15.0, criterion_by_name(small, field, name), field)
     assert one.bound <= one.value
     with pytest.raises(ValueError, match="criterion"):
-        wanted(small, field, "best")
+        criterion_by_name(small, field, "best")
 
 
 def test_changes_take_time_from_the_plan(small, field):
     """With slews a hundred times as long fewer exposures fit; the bound, which knows of no changes, is the same."""
-    slow = dataclasses.replace(small, could=dataclasses.replace(small.could, costs=Costs(slew=10.0)))
-    want = wanted(small, field, "worst")
-    first, second = plan_from(small, 15.0, want, field), plan_from(slow, 15.0, want, field)
+    slow = dataclasses.replace(small, available=dataclasses.replace(small.available, costs=Costs(slew=10.0)))
+    criterion = criterion_by_name(small, field, "worst")
+    first, second = plan_from(small, 15.0, criterion, field), plan_from(slow, 15.0, criterion, field)
     assert second.seconds <= 15 * 60
     assert second.bound == pytest.approx(first.bound, rel=1e-6)
     assert second.value >= first.bound
@@ -176,7 +176,8 @@ def test_changes_take_time_from_the_plan(small, field):
 def turning():
     """The calibration plate may stand at any angle, the Moon and standards are left out."""
     return candidates(
-        Could(dataclasses.replace(SMALL, moon_patches=0, standards=0, unpolarised=0), any_plate=True), draws=1
+        Available(dataclasses.replace(SMALL, moon_patches=0, standards=0, unpolarised=0), any_plate=True),
+        draws=1,
     )
 
 
@@ -197,7 +198,7 @@ def test_no_angle_of_polariser_and_plate_gains_more_than_the_bound(turning):
 
 def test_the_plate_at_an_angle_is_that_plate(turning):
     """The information with the plate free is that of exposures with it at 33° from the start."""
-    listed = candidates(Could(dataclasses.replace(turning.could.plan, plate=(33.0,))), draws=1)
+    listed = candidates(Available(dataclasses.replace(turning.available.plan, plate=(33.0,))), draws=1)
     choice, angles = turning.choices[1], (0.0, 20.0, 77.0)
     places = np.array([choice.place(angle, 33.0) for angle in angles])
     assert choice.stop(places[1]).polariser_angle == pytest.approx(20.0)
@@ -215,7 +216,7 @@ def test_stars_of_a_table_have_the_errors_of_their_own_p(small):
     """A changed calibration changes p of each star by what its target says: |M₁⁻¹ (m₀ − m₁ + M₀ s)| − |s|."""
     at, star = (np.array([0.1, -0.2]), np.array([0.05, 0.15])), np.array([[0.02, 0.01], [-0.003, 0.03]])
     table = in_memory({"X": at[0], "Y": at[1], "Q": star[:, 0], "U": star[:, 1]})
-    want = wanted(small, None, table)
+    criterion = criterion_by_name(small, None, table)
     size = np.array([small.model.parameters[i].scale for i in small.model.free])
     change = 1e-6 * size * np.random.default_rng(1).normal(size=len(size))
     select, values = small.model.selection(), small.values[0]
@@ -228,12 +229,12 @@ def test_stars_of_a_table_have_the_errors_of_their_own_p(small):
     seen = before[..., :1] + before[..., 1:] @ light
     found = np.linalg.solve(after[..., 1:], seen - after[..., :1])[..., 0]
     moved = 100 * (np.linalg.norm(found, axis=1) - np.linalg.norm(star, axis=1))
-    told = np.sqrt(((want.targets[0].swapaxes(1, 2) @ change) ** 2).sum(axis=1))
+    told = np.sqrt(((criterion.targets[0].swapaxes(1, 2) @ change) ** 2).sum(axis=1))
     np.testing.assert_allclose(told, np.abs(moved), rtol=2e-3)
-    plan = plan_from(small, 15.0, want)
+    plan = plan_from(small, 15.0, criterion)
     assert plan.bound <= plan.value
     with pytest.raises(ValueError, match="no p"):
-        wanted(small, None, in_memory({"X": [0.1], "Y": [0.1], "Q": [0.0], "U": [0.0]}))
+        criterion_by_name(small, None, in_memory({"X": [0.1], "Y": [0.1], "Q": [0.0], "U": [0.0]}))
 
 
 def test_the_page_of_a_plan(planned, tmp_path):
@@ -248,15 +249,17 @@ def test_the_page_of_a_plan(planned, tmp_path):
 
 def test_effects_to_tell_apart_need_the_size_of_one(small):
     with pytest.raises(ValueError, match="size of one"):
-        wanted(dataclasses.replace(small, effects={"clp_zero": False, "hwp1_axis": False}), None, "apart")
+        criterion_by_name(
+            dataclasses.replace(small, effects={"clp_zero": False, "hwp1_axis": False}), None, "apart"
+        )
 
 
 @pytest.mark.long
 def test_the_distance_of_two_effects_is_that_of_a_fit():
     """Noiseless data with one effect, fitted with the other: the least χ² is the square of the distance promised."""
     pair = ("hwp2_axis=0.005", "hwp2_crossing")
-    found = candidates(Could(SMALL), draws=1, effects=pair)
-    plan = plan_from(found, 15.0, wanted(found, None, "apart"))
+    found = candidates(Available(SMALL), draws=1, effects=pair)
+    plan = plan_from(found, 15.0, criterion_by_name(found, None, "apart"))
     truth = dataclasses.replace(found.model.instrument(found.values[0]), effects=())
     context = effect_context(truth, plan.observing_plan.exposures())
     effect = effect_from_text(pair[0], context)

@@ -16,6 +16,7 @@ from walop_jax.io.display import Display
 from walop_jax.io.errors import DataError
 from walop_jax.reports.page import OTHERS, kind_of_run, render, render_other
 from walop_jax.reports.run import read_limits, read_run
+from walop_jax.reports.survey_figures import nights_figure
 
 SHOWN = Display(
     "The instrument HAS CHANGED",
@@ -115,6 +116,19 @@ def test_the_tracks_of_a_survey(tmp_path: Path):
     }
     Table(columns).write(tmp_path / "tracks.fits")
     assert len(Page(written(tmp_path, "survey", **document)[0]).images) == 2
+
+
+@pytest.mark.parametrize(
+    ("days", "events", "width"),
+    [([0.85], [], 1.0), ([0.85, 0.87], [], 1.0), ([0.85], [3.85], 3.3), ([0.85, 10.85], [], 11.0)],
+)
+def test_dates_are_drawn_over_their_own_days(days, events, width):
+    """A single date has no extent: matplotlib would draw a tenth of all days since 1858."""
+    nights = [{"mjd": 61220.0 + day, "excess": 1.0} for day in days]
+    figure = nights_figure({"by_night": nights, "events": [{"mjd": 61220.0 + day} for day in events]})
+    low, high = figure.axes[0].get_xlim()
+    assert low < 61220.85 < high
+    assert high - low == pytest.approx(width, abs=0.05)
 
 
 def test_limits_come_back_from_their_file(tmp_path: Path):

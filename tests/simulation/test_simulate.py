@@ -20,6 +20,8 @@ from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.model_file import base_model
+from walop_jax.fit.refit import refit
+from walop_jax.instruments.description import shipped
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.effects import effect_by_name
@@ -296,13 +298,35 @@ def test_other_instruments(plan: ObservingPlan, tmp_path: Path):
     again = read_calibration_set(tmp_path / "set.fits")
     assert again.instrument == plan.instrument
     instrument = nominal_instrument(plan.instrument)
-    cameras = dataclasses.replace(instrument.cameras, floor=0.0)  # its noise is that of photons
-    instrument = dataclasses.replace(instrument, cameras=cameras)
     model = base_model(again, instrument, throughput_degree=plan.throughput_degree)
-    data = (4 - cameras.fluxes) * calset.intensities.rows
+    data = (4 - instrument.cameras.fluxes) * calset.intensities.rows
     assert chi2(Likelihood.of(again, model), np.asarray(values_of(truth))) == pytest.approx(
         data, abs=4 * np.sqrt(2 * data)
     )
+
+
+@pytest.mark.parametrize(("name", "grid"), [("WALOP-SOUTH", 3), ("WALOP-NORTH", 3), ("WALOP-LAB", 12)])
+def test_the_usual_set_of_a_shipped_instrument_can_be_fitted(name: str, grid: int):
+    """χ² is within 4 of its standard deviations of its expectation."""
+    instrument = nominal_instrument(name)
+    plan = dataclasses.replace(ObservingPlan.usual(instrument), grid=grid, standard_grid=2)
+    found = refit(simulate(plan, 0).calset)
+    assert abs(found.chi2 - found.dof) < 4.0 * np.sqrt(2.0 * found.dof)
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_instruments_drawn_from_the_priors_are_possible(name: str):
+    """Of 200: places stay in their order and ahead of 90 deg, and no light is more than fully polarised."""
+    design = nominal_instrument(name)
+    model = make_model(name, design)
+    r = np.linspace(0.0, design.raster[1] * (1.0 if design.raster[0] == "line" else np.sqrt(2.0)), 50)
+    for seed in range(200):
+        drawn = draw_instrument(model, np.random.default_rng(seed))
+        pupil, collimator = drawn.element("pupil"), drawn.element("collimator")
+        turn = float(pupil.magnification) * r * (1.0 + float(pupil.distortion) * r**2)
+        assert np.all(np.diff(turn) > 0.0)
+        assert turn[-1] < 90.0
+        assert abs(float(collimator.diattenuation)) * r[-1] ** 2 < 1.0
 
 
 def test_two_nights_can_be_merged():

@@ -42,18 +42,18 @@ from walop_jax.fit.refit import refit  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
 from walop_jax.model.cameras import with_floor  # noqa: E402
 from walop_jax.model.specification import effect_context  # noqa: E402
-from walop_jax.plans.could import Could  # noqa: E402
+from walop_jax.plans.available import Available  # noqa: E402
+from walop_jax.plans.criteria import NAMED, criterion_by_name, field_errors  # noqa: E402
 from walop_jax.plans.exposures import Candidates, Polarised, candidates  # noqa: E402
 from walop_jax.plans.optimal import Experiment, least_budget, optimise  # noqa: E402
 from walop_jax.plans.plan import (  # noqa: E402
     covariance,
-    criterion,
     experiment_of,
     information_of_weights,
+    largest_variance,
     plan_from,
     usual_plans,
 )
-from walop_jax.plans.wanted import NAMED, field_errors, wanted  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop  # noqa: E402
 from walop_jax.simulation.simulate import effect_from_text, simulate, truth_values  # noqa: E402
 
@@ -135,17 +135,19 @@ def errors() -> None:
         errors_of(described(instrument))
 
 
-def errors_of(could: Could) -> None:
+def errors_of(available: Available) -> None:
     """The same for one instrument."""
-    found = candidates(could, draws=INSTRUMENTS)
+    found = candidates(available, draws=INSTRUMENTS)
     field = field_errors(found)
-    want = wanted(found, field, "worst")
-    best = plan_from(found, MINUTES, want, field)
-    experiment = experiment_of(found, MINUTES, want)
+    criterion = criterion_by_name(found, field, "worst")
+    best = plan_from(found, MINUTES, criterion, field)
+    experiment = experiment_of(found, MINUTES, criterion)
     plans = {"best plan": (best.observing_plan, best.after)}
     for name, weights in usual_plans(found):
         whole, _ = information_of_weights(experiment, {key: max(round(w), 1) for key, w in weights.items()})
-        taken = dataclasses.replace(found.could.plan, stops=stops_of(found, weights), patches=(), stars=())
+        taken = dataclasses.replace(
+            found.available.plan, stops=stops_of(found, weights), patches=(), stars=()
+        )
         plans[name] = (taken, field.error(covariance(experiment.known + whole)))
     seen = field.seen
     for name, (plan, promised) in plans.items():
@@ -158,7 +160,7 @@ def errors_of(could: Could) -> None:
         of_each = (square / promised[:, seen] ** 2).mean(axis=2).ravel()
         ratio, scatter = np.sqrt(of_each.mean()), of_each.std() / np.sqrt(of_each.size)
         print(
-            f"{found.could.plan.name}, {name}: error of p over that promised, {of_each.size} runs: {ratio:.3f} "
+            f"{found.available.plan.name}, {name}: error of p over that promised, {of_each.size} runs: {ratio:.3f} "
             f"± {0.5 * scatter / ratio:.3f}; "
             f"full fit and linear step differ by {apart:.3f} σ at most",
             flush=True,
@@ -167,20 +169,20 @@ def errors_of(could: Could) -> None:
 
 def built() -> None:
     """Efficiency of one plan in instruments as built."""
-    found = candidates(Could(SOUTH), angles=181)
+    found = candidates(Available(SOUTH), angles=181)
     field = field_errors(found)
-    best = plan_from(found, MINUTES, wanted(found, field, "worst"), field)
+    best = plan_from(found, MINUTES, criterion_by_name(found, field, "worst"), field)
     taken = [(line, choice_of(found, line)) for line in best.lines]
     efficiency: list[float] = []
     for seed in range(1, 1 + BUILT // len(found.values)):
-        other = candidates(Could(SOUTH), seed=seed, angles=181)
-        want = wanted(other, field_errors(other), "worst")
-        whole = experiment_of(other, MINUTES, want)
+        other = candidates(Available(SOUTH), seed=seed, angles=181)
+        criterion = criterion_by_name(other, field_errors(other), "worst")
+        whole = experiment_of(other, MINUTES, criterion)
         total, _ = information_of_weights(whole, {key: float(line.times) for line, key in taken})
         for draw in range(len(other.values)):
             alone = one_draw(whole, draw)
             least = optimise(alone).bound
-            efficiency.append(least / criterion(alone, alone.known + total[draw : draw + 1]))
+            efficiency.append(least / largest_variance(alone, alone.known + total[draw : draw + 1]))
         print(f"{len(efficiency)} instruments: {quantiles(np.array(efficiency))}", flush=True)
 
 
@@ -367,36 +369,36 @@ def beside() -> None:
     for instrument in ("WALOP-SOUTH", "WALOP-NORTH", own()):
         found = candidates(described(instrument), draws=1, angles=181)
         field = field_errors(found)
-        alone = experiment_of(found, MINUTES, wanted(found, field, "worst"))
+        alone = experiment_of(found, MINUTES, criterion_by_name(found, field, "worst"))
         best, least = Most(alone.reduced(), GOAL**2).solve(NODES, ENOUGH)
         rows = {"best plan found": best / 60, "no plan below": least / 60}
         for name, weights in usual_plans(found):
             rows[name] = minutes_to_goal(alone, *information_of_weights(alone, weights))
         for name, minutes in rows.items():
             print(
-                f"{found.could.plan.name}, {name}: {minutes:.3g} min, {60 * minutes / best:.2f} times the best found, "
+                f"{found.available.plan.name}, {name}: {minutes:.3g} min, {60 * minutes / best:.2f} times the best, "
                 f"at most {60 * minutes / least:.2f} times any",
                 flush=True,
             )
 
 
-def described(instrument: str) -> Could:
+def described(instrument: str) -> Available:
     """An instrument by name or file, its plate out or at any angle."""
     plan = (
         Path(tempfile.mkdtemp() if not Path(instrument).exists() else Path(instrument).parent) / "plan.toml"
     )
     name = Path(instrument).name
     plan.write_text(f'instrument = "{name}"\ngrid = 6\nstandard_grid = 3\nplate = ["out", "any"]\n')
-    return Could.of(plan)
+    return Available.of(plan)
 
 
 def naming() -> None:
     """How often the exposures proposed name an effect at the time promised."""
-    could = Could(dataclasses.replace(SOUTH, plate=(None, 22.5)))
+    available = Available(dataclasses.replace(SOUTH, plate=(None, 22.5)))
     for pair in PAIRS:
-        found = candidates(could, draws=1, effects=(pair[0], pair[1].split("=")[0]))
-        want = wanted(found, None, "apart")
-        experiment = experiment_of(found, MINUTES, want)
+        found = candidates(available, draws=1, effects=(pair[0], pair[1].split("=")[0]))
+        criterion = criterion_by_name(found, None, "apart")
+        experiment = experiment_of(found, MINUTES, criterion)
         standard = dict(usual_plans(found))["even angles"]
         standard |= {
             (i, (float(place),)): 1.0
@@ -406,14 +408,14 @@ def naming() -> None:
         }
         before, _ = information_of_weights(experiment, standard)
         start = dataclasses.replace(experiment, known=experiment.known + before)
-        at_first = want.told(criterion(start, start.known))
-        cheapest, _ = least_budget(start, want.variance(NAMED))
+        at_first = criterion.reported(largest_variance(start, start.known))
+        cheapest, _ = least_budget(start, criterion.variance(NAMED))
         needed = cost_of(start, cheapest) / 60
         minutes, plan = needed, None
         while plan is None or plan.value < NAMED:
             minutes = 1.25 * minutes + 0.2
             with contextlib.suppress(ValueError):  # too little for a single exposure
-                plan = plan_from(found, minutes, want, known=before_of(found, standard))
+                plan = plan_from(found, minutes, criterion, known=before_of(found, standard))
         names = [named(found, standard, plan.observing_plan, pair, seed) for seed in range(2 * INSTRUMENTS)]
         print(
             f"{pair[0]} against {pair[1]}: standard plan {at_first:.2f} σ apart; {NAMED:.2g} σ after {needed:.2f} min, "

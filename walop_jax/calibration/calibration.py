@@ -38,7 +38,7 @@ from walop_jax.data.settings import (
     builtin_filter,
     single_wavelength,
 )
-from walop_jax.fit.model_file import model_without_data, render, standard_names
+from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
 from walop_jax.fit.verdict import NOT_MEASURED, Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
@@ -53,6 +53,7 @@ from walop_jax.model.instrument import Instrument, adapted, build, nominal_instr
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model, Vector, effect_context
+from walop_jax.model.standards import standards_of
 
 if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult
@@ -168,8 +169,8 @@ class Product(Contents):
         `catalogue` are the effects that the model may have. Raises ValueError if it cannot be rebuilt, or has other
         parameters than the file lists.
         """
-        sources, names = self.sources, self.names
-        standards = list(zip(standard_names(sources), sources.q.tolist(), sources.u.tolist(), strict=True))
+        names = self.names
+        standards = standards_of(self.sources, self.exposures, self.filters)
         context = effect_context(adapted(self.design, standards=standards), self.exposures)
         text = "\n".join(self.model_lines)
         model = model_without_data(

@@ -148,7 +148,7 @@ def hdus_of(c: Product, path: object) -> list[Any]:
         "FILTERS": filter_columns(c.filters),
         "MODEL": {"LINE": _strings(c.model_lines)},
         "INSTRUMENT": {"LINE": _strings(c.description)},
-        "SOURCES": {name: getattr(c.sources, name.lower()) for name in schema.SOURCES},
+        "SOURCES": c.sources.columns(),
         "INPUTS": {
             "PATH": _strings(in_ascii(str(entry.path)) for entry in c.inputs),
             "SHA256": _strings(entry.sha256 for entry in c.inputs),
@@ -354,7 +354,7 @@ class _Reader:
             self.text("TELESCOP"), *(self.number(f"SITE{n}", np.nan) for n in ("LAT", "LONG", "ELEV"))
         )
         filters = make_filters(self.table("FILTERS"), Place(self.path, "FILTERS"))
-        sources, inputs = self.table("SOURCES", optional=True), self.table("INPUTS", optional=True)
+        stars, inputs = self.table("SOURCES", optional=True), self.table("INPUTS", optional=True)
         warnings, description = self.table("WARNINGS", optional=True), self.table("INSTRUMENT", optional=True)
         exposures, place = self.table("EXPOSURES"), Place(self.path, "EXPOSURES")
         low_x, high_x, low_y, high_y = map(self.number, _FIELD)
@@ -384,7 +384,7 @@ class _Reader:
             ),
             filters=filters,
             exposures=make_exposures(exposures, filters, site, place, kinds=None),
-            sources=make_sources(sources, Place(self.path, "SOURCES")) if sources else empty_sources(),
+            sources=make_sources(stars, Place(self.path, "SOURCES"), filters) if stars else empty_sources(),
             site=site,
             origin=self.text("ORIGIN"),
             field=(low_x, high_x, low_y, high_y),

@@ -65,7 +65,7 @@ Draws = Annotated[
 @command(stages=("information", "searching"), writes=(PLAN, INSTRUMENT, "plan.json"), random=True)
 def plan(
     job: Job,
-    could: What,
+    available: What,
     *,
     minutes: Minutes = 30.0,
     candidates: More = None,
@@ -94,14 +94,16 @@ def plan(
     from walop_jax.data.user_tables import read_input_table
     from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.io.names import PLANNED
-    from walop_jax.plans.could import Could
+    from walop_jax.plans.available import Available
+    from walop_jax.plans.criteria import check_wishes
     from walop_jax.plans.plan import plan_exposures
-    from walop_jax.plans.wanted import check_wishes
     from walop_jax.simulation.observing_plan import plan_text
 
     check_wishes(minutes, goal, draws)
-    if not isinstance(could, str | Path | ObservingPlan) or (could != "" and Path(str(could)).is_dir()):
-        after, could = could, ""
+    if not isinstance(available, str | Path | ObservingPlan) or (
+        available != "" and Path(str(available)).is_dir()
+    ):
+        after, available = available, ""
     held = after.after if isinstance(after, Diagnosis) else after
     known = None if held is None else calibration_of(held, effects)
     catalogue = catalogue_of(effects) if effects is not None or known is None else known.model.catalogue
@@ -111,15 +113,17 @@ def plan(
             raise UsageError("give the effects that are to be told apart, or a RUN of diagnose", "apart")
         alike = _alike(after, known)
     if candidates is not None:
-        could = candidates
-    elif could == "" and known is not None:
+        available = candidates
+    elif available == "" and known is not None:
         moving = {
             prefix: _stood_at(known.exposures, prefix)
             for prefix in known.design.moving()
             if prefix != CALIBRATION_PLATE
         }
-        could = ObservingPlan(known.design if known.design.description else known.instrument, moving=moving)
-    wanted = (
+        available = ObservingPlan(
+            known.design if known.design.description else known.instrument, moving=moving
+        )
+    chosen = (
         read_input_table(criterion)
         if Path(str(criterion)).suffix and Path(str(criterion)).exists()
         else criterion
@@ -127,9 +131,9 @@ def plan(
     job.tell("information of exposures", "information")
     with job.repeated() as say:
         found = plan_exposures(
-            Could.of(could),  # pyright: ignore[reportArgumentType]
+            Available.of(available),  # pyright: ignore[reportArgumentType]
             minutes,
-            criterion=wanted,
+            criterion=chosen,
             known=known,
             goal=goal,
             draws=draws,

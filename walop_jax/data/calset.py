@@ -24,7 +24,9 @@ from walop_jax.data.checks import (
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import (
+    CALIBRATION_PLATE,
     KINDS,
+    POLARISER,
     CalibrationSet,
     Compression,
     Exposures,
@@ -114,7 +116,8 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         if name in hdus:
             columns = column_names(hdus[name], place)
             if primary["CALVERS"] == 1:  # CLP and CHWP alone move there, whatever other columns are called
-                columns = [column for column in columns if column in schema.TABLES[name]]
+                own = {*schema.TABLES[name], *(f"{prefix}_TURN" for prefix in (POLARISER, CALIBRATION_PLATE))}
+                columns = [column for column in columns if column in own]
             rules = table_rules(name, columns, place)
             tables[name], more = read_table(hdus[name], rules, place)
             remarks += more
@@ -160,7 +163,7 @@ def assembled(
     remarks += doubts_about(instrument, site, exposures, place)
     sources = empty_sources()
     if "SOURCES" in tables:
-        sources = make_sources(tables["SOURCES"], Place(path, "SOURCES"))
+        sources = make_sources(tables["SOURCES"], Place(path, "SOURCES"), filters)
     if images:
         intensities, points = _frames(images, exposures, instrument, path)
     else:
@@ -332,9 +335,8 @@ def from_arrays(
     >>> made.exposures.clp_angle
     array([ 0., 30., 60., 90.])
     """
-    units = {"counts": unit_of(counts), "errors": unit_of(errors)}
+    check_units({"counts": unit_of(counts), "errors": unit_of(errors)}, "electron", Place(NAME, ""))
     counts, errors = in_unit(counts, "electron", "counts"), in_unit(errors, "electron", "errors")
-    check_units(units, "electron", Place(NAME, ""))
     x, y, angles = (np.atleast_1d(in_unit(v, "deg", n)) for v, n in ((x, "x"), (y, "y"), (angles, "angles")))
     if counts.ndim != 3 or counts.shape[:2] != (len(x), len(angles)) or len(x) != len(y):
         raise fail(
@@ -445,7 +447,11 @@ def _none_where_masked(source: Any) -> np.ndarray:
 
 
 def _sources(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The columns of SOURCES, numbered where they have no number."""
+    """The columns of SOURCES, numbered where they have no number: a star that has values in several bands once."""
     columns = {str(name).upper(): np.atleast_1d(values) for name, values in given.items()}
-    columns.setdefault("SOURCE", np.arange(max(map(len, columns.values()), default=0)))
+    numbers = np.arange(max(map(len, columns.values()), default=0))
+    if "FILTER" in columns and "NAME" in columns:
+        _, first, star = np.unique(columns["NAME"], return_index=True, return_inverse=True)
+        numbers = np.argsort(np.argsort(first))[star]
+    columns.setdefault("SOURCE", numbers)
     return columns

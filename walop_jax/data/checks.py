@@ -9,9 +9,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import KINDS, WAVELENGTHS, Exposures, FilterCurve, Points, Site, Sources
-from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, check
-from walop_jax.data.settings import BUILTIN_FILTERS
+from walop_jax.data.records import (
+    KINDS,
+    POLARISER,
+    WAVELENGTHS,
+    Exposures,
+    FilterCurve,
+    Points,
+    Site,
+    Sources,
+)
+from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, TURN, check
+from walop_jax.data.settings import BUILTIN_FILTERS, PHOTOMETRIC_BANDS, single_wavelength
 from walop_jax.data.units import Place
 from walop_jax.instruments.description import described, shipped
 from walop_jax.io.errors import nearest, rows_text
@@ -115,10 +124,31 @@ def checked_curve(
     return FilterCurve(name, wavelength, throughput)
 
 
-def make_sources(table: dict[str, Any], place: Place) -> Sources:
-    """Check the SOURCES table (fractions; kelvin)."""
+def make_sources(
+    table: dict[str, Any], place: Place, filters: Mapping[str, FilterCurve] | None = None
+) -> Sources:
+    """Check the SOURCES table (fractions; kelvin): one row for a star, or one for each of its bands (FILTER).
+
+    A band is one of `filters`, built in, or photometric.
+    """
     check(table, SOURCES, place)
-    return Sources(**{name.lower(): table[name] for name in SOURCES})
+    sources = Sources(**{name.lower(): table[name] for name in SOURCES})
+    known = {*(filters or ()), *BUILTIN_FILTERS, *PHOTOMETRIC_BANDS}
+    for name in set(sources.filter.tolist()) - known - {""}:
+        if single_wavelength(name) is None:
+            what = f"{name!r} is neither a row of FILTERS nor a band that is known,"
+            place.refuse(sources.filter == name, what, "FILTER", nearest(name, known))
+    several = np.bincount(sources.stars, minlength=len(sources))[sources.stars] > 1
+    advice = "number the stars; rows of one star need FILTER, each another one"
+    place.refuse(several & (sources.filter == ""), "the identifier is not unique", "SOURCE", advice)
+    rows = list(zip(sources.source.tolist(), sources.filter.tolist(), strict=True))
+    twice = np.array([rows.index(row) != i for i, row in enumerate(rows)], bool)
+    place.refuse(twice, "the star has a value in this FILTER already", "FILTER", "remove one of them")
+    for column, values in (("NAME", sources.name), ("TEFF", sources.teff)):
+        first = values[sources.stars]
+        odd = (values != first) & ~((values != values) & (first != first))  # NaN is like NaN
+        place.refuse(odd, "differs from that of the first row of the star", column, "give it another SOURCE")
+    return sources
 
 
 def make_exposures(
@@ -152,11 +182,22 @@ def make_exposures(
         place.refuse(inside & ~np.isfinite(angle), what, f"{prefix}_ANGLE", advice)
         # Out of the beam an element has no angle, whatever the header remembers.
         table[f"{prefix}_ANGLE"] = np.where(inside, angle, np.nan)
+    turning = {p: np.abs(table[f"{p}_TURN"]) * table[f"{p}_IN"] > 0 for p in moving if f"{p}_TURN" in table}
+    if POLARISER in turning:
+        advice = "take it at several angles; only elements behind it may turn during an exposure"
+        place.refuse(turning[POLARISER], "is not 0", f"{POLARISER}_TURN", advice)
+    several = np.sum([*turning.values(), np.zeros(len(kind))], axis=0) > 1
+    what, advice = (
+        "another element turns as well",
+        "one at a time: their angles go together, which is not stated",
+    )
+    place.refuse(several, what, " and ".join(f"{p}_TURN" for p in turning), advice)
     angles = np.unique(table["CLP_ANGLE"][clp_in])
     if like_radians(angles):
         what = f"all {len(angles)} different angles lie between {angles[0]:g} and {angles[-1]:g}"
         raise place.fail(what, "CLP_ANGLE", "angles are in degrees: are these radians?")
-    check(table, {**EXPOSURES, **{f"{prefix}_ANGLE": EXPOSURES["CLP_ANGLE"] for prefix in moving}}, place)
+    angles_of = {f"{prefix}_ANGLE": EXPOSURES["CLP_ANGLE"] for prefix in moving}
+    check(table, {**EXPOSURES, **angles_of, **{f"{prefix}_TURN": TURN for prefix in turning}}, place)
 
     moon, standard = (kind == "moon") & ~clp_in, (kind == "standard") & ~clp_in
     for name in ("MJD", "RA", "DEC", "ROTATOR"):

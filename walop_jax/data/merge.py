@@ -94,7 +94,7 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
     """Join calibration sets of one instrument at one site.
 
     Exposure and point identifiers that collide are renumbered (and this is remarked on); points of tables
-    with identical coordinates become one, sources with the same name and values likewise. Frames on the same
+    with identical coordinates become one, sources with the same name likewise. Frames on the same
     grid share their pixels; frames and tables keep field points of their own. A moving element that a set does
     not have is out there. The record of a set that stands for pixels goes with its exposures.
 
@@ -218,36 +218,70 @@ def _join_exposures(sets: tuple[CalibrationSet, ...]) -> tuple[Exposures, list[s
             names = ", ".join(f"{prefix}_ANGLE" for prefix in absent)
             remarks.append(f"{_name(entry)} [EXPOSURES] {names}: column missing; taken as out of the beam")
         parts.append(e.placed(**absent).columns())
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    names = dict.fromkeys(name for part in parts for name in part)
+    still = [np.zeros(len(part["EXPOSURE"])) for part in parts]  # of a column <P>_TURN that a part has not
+    columns = {
+        name: np.concatenate([part.get(name, zero) for part, zero in zip(parts, still, strict=True)])
+        for name in names
+    }
     return Exposures.from_columns(columns | {"EXPOSURE": ids}), remarks
 
 
 def _join_sources(sets: tuple[CalibrationSet, ...]) -> tuple[Sources, list[np.ndarray]]:
-    """Join the sources; return with them the row that each old row has become."""
+    """Join the sources, stars by their names; return with them the row that each old row has become.
+
+    Values of a star that differ are those of the bands that the files saw it in, if each saw it in one of its own.
+    """
     fields = [field.name for field in dataclasses.fields(Sources)]
-    columns = {name: np.concatenate([getattr(entry.sources, name) for entry in sets]) for name in fields}
-    values = [columns[name] for name in ("q", "u", "q_err", "u_err", "teff")]
-    row_of: dict[str, int] = {}
+    whole = {name: np.concatenate([getattr(entry.sources, name) for entry in sets]) for name in fields}
+    owner = np.repeat(np.arange(len(sets)), [len(entry.sources) for entry in sets])
+    first = np.cumsum([0, *(len(entry.sources) for entry in sets[:-1])])
+    star = np.concatenate([entry.sources.stars + n for entry, n in zip(sets, first, strict=True)]).astype(int)
+    earliest: dict[str, int] = {}
+    for i in np.flatnonzero(star == np.arange(len(star))).tolist():
+        name, here = str(whole["name"][i]), owner[i]
+        at = earliest.setdefault(name, i) if name else i
+        if owner[at] != here:
+            star[star == i] = at
+    values = np.stack([whole[name] for name in ("q", "u", "q_err", "u_err")], axis=1)
+    band = _bands_of(sets, star, owner, values, whole["filter"])
     kept: list[int] = []
-    maps: list[np.ndarray] = []
-    number = 0  # of the row among those of all sets
-    for entry in sets:
-        earlier, becomes = dict(row_of), []
-        for name in entry.sources.name.tolist():
-            row = earlier.get(name, len(kept))
-            if row == len(kept):
-                kept.append(number)
-                if name:
-                    row_of.setdefault(name, row)
-            elif not all(np.array_equal(v[kept[row]], v[number], equal_nan=True) for v in values):
-                what = f"{name!r} has other values than in an earlier file"
-                raise _conflict(what, entry, "SOURCES", "correct one of them, or give it another NAME")
-            becomes.append(row)
-            number += 1
-        maps.append(np.array(becomes, dtype=np.int64))
+    for row in range(len(star)):
+        same = [k for k in kept if star[k] == star[row] and band[k] == band[row]]
+        teff = whole["teff"][[star[row], row]]
+        if not (np.array_equal(teff[:1], teff[1:], equal_nan=True) and _equal(values[[*same, row]])):
+            what = f"{str(whole['name'][row])!r} has other values than in an earlier file"
+            advice = "correct one of them, give it another NAME, or FILTER to values of several bands"
+            raise _conflict(what, sets[owner[row]], "SOURCES", advice)
+        if not same:
+            kept.append(row)
+    place = {row: number for number, row in enumerate(kept)}
     rows = np.array(kept, dtype=np.int64)
-    joined = {name: column[rows] for name, column in columns.items()}
-    return Sources(**joined | {"source": _fresh(joined["source"])}), maps
+    numbers = _fresh(whole["source"][np.unique(star)])
+    source = numbers[np.searchsorted(np.unique(star), star[rows])]
+    joined = Sources(
+        **{name: column[rows] for name, column in whole.items()} | {"source": source, "filter": band[rows]}
+    )
+    becomes = np.array([place[i] for i in star.tolist()], dtype=np.int64)
+    return joined, np.split(becomes, first[1:])
+
+
+def _equal(rows: np.ndarray) -> bool:
+    return all(np.array_equal(rows[0], row, equal_nan=True) for row in rows)
+
+
+def _bands_of(
+    sets: tuple[CalibrationSet, ...],
+    star: np.ndarray,
+    owner: np.ndarray,
+    values: np.ndarray,
+    stated: np.ndarray,
+) -> np.ndarray:
+    """The bands of values: as stated, and of stars with different values that in which their file saw its stars."""
+    seen = [np.unique(entry.exposures.filter[entry.exposures.direct("standard")]) for entry in sets]
+    own = np.array([names[0] if len(names) == 1 else "" for names in seen])
+    differ = [not _equal(values[star == one]) for one in star]
+    return np.where((stated == "") & np.array(differ, bool), own[owner], stated)
 
 
 def _join_filters(sets: tuple[CalibrationSet, ...]) -> dict[str, FilterCurve]:

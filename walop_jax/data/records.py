@@ -105,17 +105,25 @@ class FilterCurve:
 class Position:
     """State of a moving element in every exposure: in the beam or not, and at what angle.
 
-    `angle` is the encoder reading in degrees, NaN where the element is out.
+    `angle` is the encoder reading in degrees at mid-exposure, NaN where the element is out; `turn` is the angle by
+    which it turns during the exposure, evenly in time (deg; 0, or None for all: it stands still).
     """
 
     inside: Bool[np.ndarray, " e"]
     angle: Float[np.ndarray, " e"]
+    turn: Any = None
+
+    def __post_init__(self) -> None:
+        turn = (
+            np.zeros(len(self.inside)) if self.turn is None else np.where(self.inside, np.abs(self.turn), 0.0)
+        )
+        object.__setattr__(self, "turn", turn)
 
     def __len__(self) -> int:
         return len(self.inside)
 
     def __getitem__(self, rows: slice | Int[np.ndarray, " r"] | Bool[np.ndarray, " e"]) -> Position:
-        return Position(self.inside[rows], self.angle[rows])
+        return Position(self.inside[rows], self.angle[rows], self.turn[rows])
 
     @classmethod
     def at(cls, angles: Iterable[float | None]) -> Position:
@@ -221,6 +229,8 @@ class Exposures:
         columns = {name.upper(): values for name, values in self._plain().items()}
         for prefix, entry in self.positions.items():
             columns |= {f"{prefix}_IN": entry.inside, f"{prefix}_ANGLE": entry.angle}
+            if entry.turn.any():
+                columns[f"{prefix}_TURN"] = entry.turn
         return columns
 
     @classmethod
@@ -230,7 +240,10 @@ class Exposures:
         prefixes = [name.removesuffix("_IN") for name in columns if name.endswith("_IN")]
         return cls(
             **{name.lower(): columns[name] for name in plain},
-            positions={p: Position(columns[f"{p}_IN"], columns[f"{p}_ANGLE"]) for p in prefixes},
+            positions={
+                p: Position(columns[f"{p}_IN"], columns[f"{p}_ANGLE"], columns.get(f"{p}_TURN"))
+                for p in prefixes
+            },
         )
 
     def _plain(self) -> dict[str, np.ndarray]:
@@ -252,7 +265,11 @@ class Points:
 
 @dataclasses.dataclass(frozen=True)
 class Sources:
-    """Standard stars: catalogue `q`, `u` and their errors in the equatorial frame, `teff` in K (or NaN)."""
+    """Standard stars: catalogue `q`, `u` and their errors in the equatorial frame, `teff` in K (or NaN).
+
+    `filter` is the band of a value, "" where the catalogue does not state it (None: nowhere). A star with values in
+    several bands has a row for each, with one number `source`; its first row stands for it wherever a star is meant.
+    """
 
     source: Int[np.ndarray, " s"]
     name: Shaped[np.ndarray, " s"]
@@ -261,9 +278,27 @@ class Sources:
     q_err: Float[np.ndarray, " s"]
     u_err: Float[np.ndarray, " s"]
     teff: Float[np.ndarray, " s"]
+    filter: Shaped[np.ndarray, " s"] = None  # pyright: ignore[reportAssignmentType]
+
+    def __post_init__(self) -> None:
+        if self.filter is None:
+            object.__setattr__(self, "filter", np.full(len(self.source), "", dtype="U1"))
 
     def __len__(self) -> int:
         return len(self.source)
+
+    @property
+    def stars(self) -> Int[np.ndarray, " s"]:
+        """For each row the first row of its star."""
+        _, first, number = np.unique(self.source, return_index=True, return_inverse=True)
+        return first[number]
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The columns of SOURCES; FILTER only where a band is stated."""
+        columns = {field.name.upper(): getattr(self, field.name) for field in dataclasses.fields(self)}
+        if not (self.filter != "").any():
+            del columns["FILTER"]
+        return columns
 
 
 @dataclasses.dataclass(frozen=True)

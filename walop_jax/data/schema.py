@@ -17,7 +17,7 @@ from astropy import units
 from jaxtyping import Bool, Float
 
 from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, PREFIX
-from walop_jax.data.units import Place, check_units, convert_unit, unit_of
+from walop_jax.data.units import Place, check_partners, convert_unit, unit_of
 from walop_jax.io.errors import nearest, rows_text
 
 Kind = Literal["int", "float", "bool", "str"]
@@ -98,6 +98,7 @@ def _number(unit: str, *rules: Rule) -> Column:
 
 _TEFF = _number("K", _OF_A_SOURCE)
 _ANGLE = _number("deg", within(36000.0, "encoder readings are in degrees: are these steps?"))
+TURN = Column("float", "deg", 0.0, rules=(finite("0 where the element stands still"),), remarked=False)
 EXPOSURES: Mapping[str, Column] = {
     "EXPOSURE": _IDENTIFIER,
     "KIND": Column("str"),
@@ -132,13 +133,14 @@ _SHARE = within(1.0, "fractions are wanted: are these per cent?", "exceeds 1")
 _FRACTION = Column("float", rules=(finite("remove the source"), _SHARE))
 _ERROR = Column("float", rules=(_POSITIVE,))
 SOURCES: Mapping[str, Column] = {
-    "SOURCE": Column("int", rules=(UNIQUE, _NUMBERED)),
+    "SOURCE": Column("int", rules=(_NUMBERED,)),
     "NAME": Column("str"),
     "Q": _FRACTION,
     "U": _FRACTION,
     "Q_ERR": _ERROR,
     "U_ERR": _ERROR,
     "TEFF": _TEFF,
+    "FILTER": Column("str", missing="", remarked=False),
 }
 _PADDED = "use one length, padded with NaN"
 FILTERS: Mapping[str, Column] = {
@@ -182,6 +184,8 @@ def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]
         rules[angle] = dataclasses.replace(_ANGLE, remarked=there)
     for name in columns:
         prefix, _, last = name.rpartition("_")
+        if last == "TURN" and f"{prefix}_ANGLE" in columns:
+            rules[name] = TURN
         if last not in ("IN", "ANGLE") or name == last or name in rules:
             continue
         if not PREFIX.fullmatch(prefix):
@@ -256,7 +260,7 @@ def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[d
             table[name] = np.full(rows, column.missing)
             if column.remarked:
                 absent.setdefault(str(column.missing), []).append(name)
-    check_units({name: units_of[name] for name in ("N", "N_ERR") if name in units_of}, "electron", place)
+    check_partners(units_of, _units(columns), place)
     for missing, left_out in absent.items():
         what = f"column{'s' if len(left_out) > 1 else ''} missing; using {missing}"
         remarks.append(place.remark(what, ", ".join(left_out)))
@@ -285,7 +289,13 @@ def table_of(given: Mapping[str, Any], columns: Mapping[str, Column], place: Pla
             raise place.fail("the column is missing", name, "add it")
         else:
             table[name] = np.full(rows, column.missing)
+    check_partners({name: unit_of(values) for name, values in given.items()}, _units(columns), place)
     return table
+
+
+def _units(columns: Mapping[str, Column]) -> dict[str, str]:
+    """Units of the columns that are numbers."""
+    return {name: column.unit for name, column in columns.items() if column.kind == "float"}
 
 
 # ---------------------------------------------------------------------------------------- values of a column

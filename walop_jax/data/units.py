@@ -39,13 +39,38 @@ def unit_of(column: Any) -> str:
     return str(getattr(column, "unit", None) or "")
 
 
+TOGETHER: Mapping[str, str] = {"Y": "X", "U": "Q"}
+"""Columns that have the unit of another one, beside errors, which have that of their value."""
+
+
+def partner_of(name: str) -> str:
+    """The column whose unit a column shares: of an error (N_ERR, N0_ERR) that of its value; else itself."""
+    value = name.replace("_ERR", "")
+    return TOGETHER.get(value, value) if value == name else value
+
+
 def check_units(given: Mapping[str, str], wanted: str, place: Place) -> None:
     """Raise `DataError` where some of columns that belong together have a unit to be converted and others have none."""
-    converted = [name for name, unit in given.items() if unit and units.Unit(unit) != units.Unit(wanted)]
+    converted = [name for name, unit in given.items() if unit and _differs(unit, wanted)]
     without = [name for name, unit in given.items() if not unit]
     if converted and without:
         what = f"has no unit, {converted[0]} is in {given[converted[0]]}"
-        raise place.fail(what, without[0], f"give all in one unit, or all in {wanted}")
+        raise place.fail(what, without[0], f"give all in one unit, or all in {wanted or 'fractions'}")
+
+
+def check_partners(given: Mapping[str, str], wanted: Mapping[str, str], place: Place) -> None:
+    """`check_units` of every column with its partner; `wanted` are the units of the columns that are numbers."""
+    for name, unit in given.items():
+        other = partner_of(name)
+        if other != name and other in given and name in wanted:
+            check_units({other: given[other], name: unit}, wanted[name], place)
+
+
+def _differs(unit: str, wanted: str) -> bool:
+    try:
+        return units.Unit(unit) != units.Unit(wanted)
+    except ValueError:
+        return True  # unknown: an error of its own where it is converted
 
 
 def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: Place) -> np.ndarray:
@@ -60,6 +85,8 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
     except (ValueError, TypeError) as error:
         raise place.fail(f"the unit {unit!r} is not known", name, f"use {wanted or 'no unit'}") from error
     target = units.Unit(wanted)
+    if given == target:
+        return values  # no arithmetic: what was written comes back bit for bit
     if _is_logarithmic(given):
         advice = f"give the column in {wanted or 'fractions'}"
         if wanted == "electron":
@@ -68,8 +95,6 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
                 "N_ERR = 0.921 N · error of m; 10^d of dex"
             )
         raise place.fail(f"is logarithmic ({unit.strip()})", name, advice)
-    if given == target:
-        return values  # no arithmetic: what was written comes back bit for bit
     if wanted == "h" and given.is_equivalent(units.deg):
         target = units.hourangle
     try:

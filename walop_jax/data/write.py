@@ -153,7 +153,7 @@ def set_tables(calset: CalibrationSet) -> dict[str, dict[str, np.ndarray]]:
         },
     }
     if len(sources):
-        tables["SOURCES"] = {name: getattr(sources, name.lower()) for name in schema.SOURCES}
+        tables["SOURCES"] = sources.columns()
     if calset.filters:
         tables["FILTERS"] = filter_columns(calset.filters)
     return tables
@@ -207,12 +207,14 @@ def filter_columns(filters: Mapping[str, FilterCurve]) -> dict[str, np.ndarray]:
 def table_hdu(
     name: str, columns: Mapping[str, np.ndarray], path: object, rules: Mapping[str, schema.Column]
 ) -> fits.BinTableHDU:
-    """A binary table by its rules.
+    """A binary table by its rules; columns that have a default may be left out.
 
     Raises `DataError`, naming `path`, for text that is not plain ASCII.
     """
     made = []
     for column, rule in rules.items():
+        if column not in columns and rule.missing is not None:
+            continue
         values = columns[column]
         if rule.kind == "str":
             for value in np.unique(values):

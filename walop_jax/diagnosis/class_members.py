@@ -31,7 +31,6 @@ from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.hidden_mistakes import of_matrix, usual_exposure
 from walop_jax.diagnosis.score import Projector, log_bayes
 from walop_jax.fit.refit import FitResult
-from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Context, Described
@@ -110,7 +109,7 @@ class _Laid:
         self.state, self.fit, self.design = state, state.result, state.design
         calset, model = self.fit.calset, self.fit.model
         self.template = model.template
-        self.columns = Columns(self.fit.likelihood, self.fit.values)
+        self.columns = self.design.columns
         self.usual = usual_exposure(calset, self.template)
         self._added: dict[Sum, Float[np.ndarray, "p k 3"]] = {}
         self._vectors: Float[np.ndarray, "p k 3"] | None = None

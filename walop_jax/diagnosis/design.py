@@ -48,6 +48,7 @@ from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTab
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import cut, states
 from walop_jax.likelihood import engine
+from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.inverses import unit_columns, whitening
 from walop_jax.likelihood.likelihood import Likelihood
@@ -293,6 +294,11 @@ class Design:
         prior = -likelihood.priors.residuals(fit.values)
         prior_slope = -likelihood.priors.jacobian(fit.model.selection())
         return cls(fit, measured, np.concatenate([data, prior]), np.vstack([slope, prior_slope]))
+
+    @cached_property
+    def columns(self) -> Columns:
+        """Columns of whatever the model has not."""
+        return Columns(self.fit.likelihood, self.fit.values)
 
     @property
     def rows(self) -> int:

@@ -489,7 +489,7 @@ def examine(
     named, said = (
         (earlier.named, earlier.said)
         if earlier is not None and earlier.is_like(design)
-        else all_candidates(result.likelihood, result.values, inactive, every)
+        else all_candidates(design.columns, inactive, every)
     )
     probes = [probe for probe in inactive if probe.name in named]
     sentences = tuple(probe for probe in sentences if probe.name in said)

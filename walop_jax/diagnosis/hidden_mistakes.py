@@ -31,7 +31,6 @@ from walop_jax.diagnosis.policy import POLICY, PROBABILITY, Policy
 from walop_jax.diagnosis.score import local_p, noncentrality
 from walop_jax.diagnosis.stated_conditions import Singles
 from walop_jax.fit.verdict import DATA, EFFECT, Hidden
-from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Effect
 from walop_jax.model.instrument import Instrument
@@ -146,7 +145,7 @@ class _Starlight:
         template, calset = self.fit.model.template, self.fit.calset
         self.instrument = self.fit.model.instrument(self.fit.values)
         self.setting = first_setting(calset, self.instrument, exposure)
-        columns = Columns(self.fit.likelihood, self.fit.values)
+        columns = design.columns
         changes = {p.name: [one for m in p.group for one in m.first_order(template)] for p in self.asked}
         known = [name for name, some in changes.items() if some and all(map(columns.has, some))]
         self.vectors, added = added_to_starlight(

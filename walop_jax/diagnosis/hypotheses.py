@@ -17,7 +17,6 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.dependences import FEWEST_POINTS
 from walop_jax.diagnosis.score import Candidate, Score
 from walop_jax.likelihood.columns import Change, Columns, own_columns
-from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.dependence import conditions_of_effect
 from walop_jax.model.effects import Context, Effect, EffectKind
 from walop_jax.model.effects.catalogue import applies
@@ -111,15 +110,15 @@ def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Pr
 
 
 def all_candidates(
-    likelihood: Likelihood, values: Vector, effects: Sequence[Probe], sentences: Sequence[Probe]
+    columns: Columns, effects: Sequence[Probe], sentences: Sequence[Probe]
 ) -> tuple[dict[str, Candidate], dict[str, Candidate]]:
-    """Columns of effects and, in single precision, of sentences at the fit `values` of a model, by name.
+    """Columns of effects and, in single precision, of sentences, by name.
 
     Without effects that the set cannot show, and without fringes that the bands blur away.
     """
-    calset, template = likelihood.calset, likelihood.model.template
-    shown = showable(calset, template, effects)
-    columns = Columns(likelihood, values)
+    likelihood, values = columns.likelihood, columns.values
+    template = likelihood.model.template
+    shown = showable(likelihood.calset, template, effects)
     changes: dict[int, list[Change]] = {}
     for number, probe in enumerate([*shown, *sentences]):
         each = [member.first_order(template) for member in probe.group]

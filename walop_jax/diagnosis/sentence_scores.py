@@ -19,7 +19,6 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates
 from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import ScoreSpace, ScoreTable
-from walop_jax.fit.refit import FitResult
 
 TOGETHER = 1e8  # numbers of columns that are there at a time
 _SHOWN = 3
@@ -36,7 +35,7 @@ def sentence_scores(design: Design) -> ScoreTable:
     sizes: list[int] = []
     parts: list[tuple[np.ndarray, ...]] = []
     for some in _batches(every, len(design.residual)):
-        for probe, columns in _columns(fit, some):
+        for probe, columns in _columns(design, some):
             own = columns.astype(float) / fit.noise_scale
             along = design.projector.basis[: len(own)].T @ own
             square = own.T @ own
@@ -65,8 +64,8 @@ def _batches(every: tuple[Probe, ...], rows: int) -> Iterator[list[Probe]]:
         yield some
 
 
-def _columns(fit: FitResult, some: list[Probe]) -> Iterator[tuple[Probe, np.ndarray]]:
-    said = all_candidates(fit.likelihood, fit.values, (), some)[1]
+def _columns(design: Design, some: list[Probe]) -> Iterator[tuple[Probe, np.ndarray]]:
+    said = all_candidates(design.columns, (), some)[1]
     yield from ((probe, said[probe.name].columns) for probe in some if probe.name in said)
 
 

@@ -335,7 +335,7 @@ def _of_catalogue(design: Design, asked: Sequence[Probe]) -> Iterator[_Single]:
     fit = design.fit
     template = fit.model.template
     wanted = showable(fit.calset, template, asked)
-    named, _ = all_candidates(fit.likelihood, fit.values, wanted, ())
+    named, _ = all_candidates(design.columns, wanted, ())
     for probe in (one for one in wanted if one.name in named):
         rows = design.stacked([named[probe.name].columns])
         yield _Single(

@@ -16,7 +16,7 @@ from typing import Any
 import tomlkit
 
 from walop_jax.data.merge import parts_of
-from walop_jax.data.records import POLARISER, CalibrationSet, Sources
+from walop_jax.data.records import POLARISER, CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
@@ -29,6 +29,7 @@ from walop_jax.model.laws import laws_of
 from walop_jax.model.parameters import Parameter, check_names, unknown_name
 from walop_jax.model.sources import MoonSky, Standards
 from walop_jax.model.specification import THROUGHPUT, Model, effect_context, make_model, with_effects
+from walop_jax.model.standards import half_range, standards_of
 
 LEVEL_POINTS = 256
 """Field points from which the start value of a throughput is taken: a start need not be exact."""
@@ -130,24 +131,24 @@ def parse(text: str, build: Callable[[ModelTable], Model]) -> Model:
         changes[name] = _changes(parameter, entry)
     changed = tuple(dataclasses.replace(p, **changes.get(p.name, {})) for p in model.parameters)
     laws = {name: law.document() for name, law in laws_of(content.get("law", {})).items()}
-    parts = [kind.name for kind in model.catalogue]
+    kinds = [kind.name for kind in model.catalogue]
     for name in laws:
-        if not fnmatch.filter(model.names, name) and re.split("[.#]", name)[0] not in parts:
+        if not fnmatch.filter(model.names, name) and re.split("[.#]", name)[0] not in kinds:
             raise unknown_name("parameter of [law]", name, model.names)
     return dataclasses.replace(model, parameters=changed, laws=laws)
 
 
 def _header(table: Mapping[str, Any], choices: Mapping[str, Any], entries: Mapping[str, Any]) -> ModelTable:
     hints = {"instrument": str, "plates": str, "throughput_degree": int, "effects": tuple[str, ...]}
-    given = Reader("").values(hints, table, "model")
-    effects = given.get("effects", ())
-    if not 0 <= (degree := given.get("throughput_degree", 0)) <= 12:
+    options = Reader("").values(hints, table, "model")
+    effects = options.get("effects", ())
+    if not 0 <= (degree := options.get("throughput_degree", 0)) <= 12:
         raise ValueError(f"[model] throughput_degree = {degree!r} must be a whole number from 0 to 12")
     check_names("effect (it has choices but is not in the list of [model])", choices, effects)
     for name, values in choices.items():
         if not isinstance(values, Mapping):
             raise ValueError(f"[effects] {name} = {values!r} must be a table, [effects.{name}]")
-    return ModelTable(**given, choices=choices, entries=entries)
+    return ModelTable(**options, choices=choices, entries=entries)
 
 
 def _changes(parameter: Parameter, entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -189,9 +190,8 @@ def base_model(
     >>> walop.base_model(calset)["pupil.magnification"].prior
     (15.63, 0.05)
     """
-    names = standard_names(calset.sources)
-    sources = calset.sources
-    level = _level(calset)
+    sources, level = calset.sources, _level(calset)
+    standards = standards_of(sources, calset.exposures, calset.filters)
     instrument = as_designed(instrument or instrument_of(calset))
     if instrument.name != calset.instrument:
         raise ValueError(
@@ -205,15 +205,19 @@ def base_model(
     present.check_moving(instrument.patched().moving())
     instrument = adapted(
         instrument,
-        standards=list(zip(names, sources.q, sources.u, strict=True)),
+        standards=standards,
         plates=plates,
         throughput_degree=throughput_degree,
         throughput=level,
     )
     priors = {}
-    for i, name in enumerate(names):
+    for i, name in enumerate(standards.names):
         priors[f"standard.{name}.q"] = (float(sources.q[i]), float(sources.q_err[i]))
         priors[f"standard.{name}.u"] = (float(sources.u[i]), float(sources.u_err[i]))
+    for i in standards.unknown:
+        wavelength, _ = standards.bands[i]
+        width = half_range(sources, i, calset.exposures, calset.filters)
+        priors[f"standard.{standards.names[i]}.wavelength"] = (wavelength, width)
     model = make_model(calset.instrument, instrument, priors=priors)
     for i in model.positions(THROUGHPUT):
         p = model.parameters[i]
@@ -230,11 +234,11 @@ def _level(calset: CalibrationSet) -> float:
 
     A camera gets half of the unpolarised light: N = T/2.
     """
-    for part, points, exposures in parts_of(calset):
-        known = calset.exposures.flux_known[exposures]
-        for start in range(0, len(points) if known.any() else 0, LEVEL_POINTS):
-            block = part.block(start, min(start + LEVEL_POINTS, len(points)))
-            counts = block.counts[block.used & known]
+    for subset, points, exposures in parts_of(calset):
+        stated = calset.exposures.flux_known[exposures]
+        for start in range(0, len(points) if stated.any() else 0, LEVEL_POINTS):
+            block = subset.block(start, min(start + LEVEL_POINTS, len(points)))
+            counts = block.counts[block.used & stated]
             if counts.size:
                 return float(2.0 * counts.mean())
     return LEVEL
@@ -257,22 +261,6 @@ def instrument_of(calset: CalibrationSet) -> Instrument:
             "its description, --instrument FILE or instrument=Instrument.read(FILE)"
         )
     return nominal_instrument(calset.instrument)
-
-
-def standard_names(sources: Sources) -> tuple[str, ...]:
-    """Unique names of the standards, usable in parameter names."""
-    plain = [
-        "".join(c if c.isalnum() else "_" for c in str(name).strip()) or f"source{number}"
-        for number, name in zip(sources.source, sources.name, strict=True)
-    ]
-    names: list[str] = []
-    for number, name in zip(sources.source, plain, strict=True):
-        # A name that another star bears by right is not given to a namesake.
-        unique = name
-        while unique in names or (unique != name and unique in plain):
-            unique = f"{unique}_{number}"
-        names.append(unique)
-    return tuple(names)
 
 
 def has_known_flux(calset: CalibrationSet) -> bool:
@@ -310,13 +298,15 @@ def model_like(calset: CalibrationSet, old: Model) -> Model:
     """
     header = header_of(old)
     model = base_model(calset, old.template, plates=header.plates, throughput_degree=header.throughput_degree)
-    own = dict.fromkeys((*(effect.kind for effect in old.template.effects), *old.catalogue))
-    model = dataclasses.replace(model, catalogue=tuple(own))
+    own_kinds = dict.fromkeys((*(effect.kind for effect in old.template.effects), *old.catalogue))
+    model = dataclasses.replace(model, catalogue=tuple(own_kinds))
     model = _with_effects(model, header, effect_context(model.template, calset.exposures))
-    kept = {p.name: p for p in old.parameters if p.name != GAUGE and p.part not in SKY_AND_STARS}
+    unchanged = {p.name: p for p in old.parameters if p.name != GAUGE and p.part not in SKY_AND_STARS}
     parameters = tuple(
-        dataclasses.replace(p, free=kept[p.name].free, prior=kept[p.name].prior, tie=kept[p.name].tie)
-        if p.name in kept
+        dataclasses.replace(
+            p, free=unchanged[p.name].free, prior=unchanged[p.name].prior, tie=unchanged[p.name].tie
+        )
+        if p.name in unchanged
         else p
         for p in model.parameters
     )
@@ -327,15 +317,15 @@ def model_without_data(
     instrument: str | Instrument,
     text: str = "",
     *,
-    standards: Sequence[tuple[str, float, float]] = (),
+    standards: Standards | Sequence[tuple[str, float, float]] = (),
     context: Context | None = None,
     catalogue: Catalogue = EFFECTS,
 ) -> Model:
     """The model of an instrument as designed, for no data in particular.
 
-    `instrument` is one that comes with the package, by name, or any other; `standards` are (name, q, u); `context`
-    says what effects that grow with the data need to know of them; `catalogue` are those the text may name. Raises
-    `DataError` for an unknown instrument and ValueError as `model_for` does.
+    `instrument` is one that comes with the package, by name, or any other; `standards` are (name, q, u), or the source
+    itself; `context` says what effects that grow with the data need to know of them; `catalogue` are those the text may
+    name. Raises `DataError` for an unknown instrument and ValueError as `model_for` does.
     """
     design = nominal_instrument(instrument) if isinstance(instrument, str) else as_designed(instrument)
 
@@ -345,10 +335,10 @@ def model_without_data(
         )
         model = make_model(nominal.name, nominal, frozen=(GAUGE,))
         model = dataclasses.replace(model, catalogue=known_to(header, catalogue))
-        known = context or Context(
+        conditions = context or Context(
             sources=nominal.standard.names, cameras=nominal.cameras.names, units=nominal.units
         )
-        return _with_effects(model, header, known)
+        return _with_effects(model, header, conditions)
 
     return parse(text, build)
 
@@ -356,8 +346,8 @@ def model_without_data(
 def known_to(header: ModelTable, catalogue: Catalogue) -> tuple[EffectKind, ...]:
     """A catalogue with the entries that a model file brings along; those of the catalogue stay."""
     names = {effect.name for effect in catalogue}
-    own = {name: table for name, table in header.entries.items() if name not in names}
-    return (*catalogue, *entries(own))
+    stated = {name: table for name, table in header.entries.items() if name not in names}
+    return (*catalogue, *entries(stated))
 
 
 def _with_effects(model: Model, header: ModelTable, context: Context) -> Model:

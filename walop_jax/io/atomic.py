@@ -114,11 +114,11 @@ def own_prefix(target: Path) -> str:
 
 def remove_leftovers(target: Path) -> None:
     """Remove what writers of `target` that were killed on this machine have left in its folder."""
-    here = f"{prefix_of(target)}{_short(socket.gethostname())}-"
+    prefix = f"{prefix_of(target)}{_short(socket.gethostname())}-"
     with contextlib.suppress(OSError):
         for name in os.listdir(target.parent):
-            process = name.removeprefix(here).partition("-")[0]
-            if name.startswith(here) and process.isdigit() and not _lives(int(process)):
+            process = name.removeprefix(prefix).partition("-")[0]
+            if name.startswith(prefix) and process.isdigit() and not _lives(int(process)):
                 remove(target.parent / name)
 
 

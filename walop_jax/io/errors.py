@@ -33,7 +33,7 @@ def fail(
 ) -> DataError:
     """Build a `DataError` whose message reads `file [EXTENSION] COLUMN: what; advice`."""
     place = " ".join(
-        part for part in (str(file) if file else "", f"[{extension}]" if extension else "", column) if part
+        item for item in (str(file) if file else "", f"[{extension}]" if extension else "", column) if item
     )
     return DataError(printable(f"{place + ': ' if place else ''}{what}{'; ' + advice if advice else ''}"))
 
@@ -74,8 +74,8 @@ def nearest(name: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, known, n=3, cutoff=_ALIKE if meanings else 0.4)
     if meanings and not close:
         words = [word for word in re.split(r"[\W_]+", name.lower()) if len(word) > _SHORT]
-        texts = {one: f"{one} {meaning}".lower() for one, meaning in meanings.items()}
-        close = [one for one, text in texts.items() if any(word in text for word in words)][:_SHOWN]
+        texts = {key: f"{key} {meaning}".lower() for key, meaning in meanings.items()}
+        close = [key for key, text in texts.items() if any(word in text for word in words)][:_SHOWN]
         close = close or difflib.get_close_matches(name, known, n=3, cutoff=0.4)
     if not close:
         lowered = {entry.lower(): entry for entry in known}

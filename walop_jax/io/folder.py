@@ -41,12 +41,12 @@ def check_folder(path: str | os.PathLike[str], names: Sequence[str] = (), *, ove
             return check_output(folder)
         if not folder.is_dir():
             raise fail("is a file, a folder is needed", file=path, advice="choose another name")
-        found = [name for name in names if (folder / name).exists()]
+        existing = [name for name in names if (folder / name).exists()]
     except OSError as error:
         raise fail(f"cannot be written: {error}", file=path, advice="choose another place") from error
-    if found and not overwrite:
+    if existing and not overwrite:
         raise fail(
-            f"holds {found[0]} already",
+            f"holds {existing[0]} already",
             file=path,
             advice="choose another folder, or give --overwrite (overwrite=True in Python)",
         )

@@ -39,23 +39,23 @@ def repeated(tell: Tell, every: float = EVERY) -> Generator[Tell, None, None]:
     What it repeats is told from another thread, never at the same time as anything else.
     """
     lock, over = threading.Lock(), threading.Event()
-    now = time.monotonic()
-    text, since, told = "starting", now, now
+    begin = time.monotonic()
+    text, since, shown = "starting", begin, begin
 
     def say(new: str) -> None:
-        nonlocal text, since, told
+        nonlocal text, since, shown
         with lock:
             text, since = new, time.monotonic()
-            told = since
+            shown = since
             tell(new)
 
     def again() -> None:
-        nonlocal told
+        nonlocal shown
         while not over.wait(every / 15.0):
             with lock:
                 moment = time.monotonic()
-                if moment - told >= every and not over.is_set():
-                    told = moment
+                if moment - shown >= every and not over.is_set():
+                    shown = moment
                     tell(f"{text}, {moment - since:.0f} s so far")
 
     thread = threading.Thread(target=again, daemon=True)
@@ -79,20 +79,20 @@ def interrupts_answered(end: Callable[[], int]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    hears, told = socket.socketpair()
-    told.setblocking(False)
+    hears, notifier = socket.socketpair()
+    notifier.setblocking(False)
 
     def listen() -> None:
         with hears:
             if signal.SIGINT in hears.recv(64):
                 time.sleep(PATIENCE)
-                if told.fileno() >= 0:  # the block has not ended
+                if notifier.fileno() >= 0:  # the block has not ended
                     os._exit(end())
 
-    before = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+    before = signal.set_wakeup_fd(notifier.fileno(), warn_on_full_buffer=False)
     threading.Thread(target=listen, daemon=True).start()
     try:
         yield
     finally:
         signal.set_wakeup_fd(before)
-        told.close()
+        notifier.close()

@@ -6,6 +6,7 @@ Files to be read are ordinary ones; text, TOML, plain data as JSON without NaN a
 from __future__ import annotations
 
 import bz2
+import datetime
 import gzip
 import io
 import json
@@ -46,10 +47,15 @@ def value_and_error(value: float | str | None, sigma: float | None) -> tuple[str
     # Rounded first: 0.0996 has its second digit where 0.10 has it.
     places = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))
     if places > _MOST_PLACES:
-        more = max(0, places + math.floor(math.log10(abs(value) or sigma)))
-        return with_minus_sign(f"{value:.{more}e}"), with_minus_sign(f"{sigma:.1e}")
+        digits = max(0, places + math.floor(math.log10(abs(value) or sigma)))
+        return with_minus_sign(f"{value:.{digits}e}"), with_minus_sign(f"{sigma:.1e}")
     shown = max(0, places)
     return with_minus_sign(f"{round(value, places) + 0.0:.{shown}f}"), f"{round(sigma, places):.{shown}f}"
+
+
+def date_of(mjd: float) -> str:
+    """The calendar date (UTC) of a Modified Julian Date: 2026-06-29."""
+    return (datetime.datetime(1858, 11, 17) + datetime.timedelta(days=float(mjd))).date().isoformat()
 
 
 def with_minus_sign(text: str) -> str:
@@ -145,8 +151,8 @@ def json_text(value: Any) -> str:
 
 def some(items: Sequence[str], most: int, between: str = ", ") -> str:
     """The first of some texts, and how many more there are."""
-    more = f" and {len(items) - most} more" if len(items) > most else ""
-    return f"{between.join(items[:most])}{more}"
+    suffix = f" and {len(items) - most} more" if len(items) > most else ""
+    return f"{between.join(items[:most])}{suffix}"
 
 
 def plain(value: Any) -> Any:

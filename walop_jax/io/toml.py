@@ -102,18 +102,18 @@ class Reader:
 
     def value(self, hint: Any, value: Any, key: str, place: str) -> Any:
         """A value as an annotation wants it: lists as tuples, `OUT` as None where a number may be that."""
-        kind, parts = typing.get_origin(hint), typing.get_args(hint)
+        kind, options = typing.get_origin(hint), typing.get_args(hint)
         if kind in (typing.Union, types.UnionType):
-            hint = next(part for part in parts if part is not types.NoneType)
+            hint = next(option for option in options if option is not types.NoneType)
             return None if hint is float and value == OUT else self.value(hint, value, key, place)
         if kind is tuple:
-            pair = parts[-1] is not ...
-            if not isinstance(value, list | tuple) or (pair and len(value) != len(parts)):
-                what = "names" if parts[0] is str else "two numbers" if pair else "numbers"
+            pair = options[-1] is not ...
+            if not isinstance(value, list | tuple) or (pair and len(value) != len(options)):
+                what = "names" if options[0] is str else "two numbers" if pair else "numbers"
                 raise self.fault(place, f"{key} = {value!r} must be a list of {what}")
-            return tuple(self.value(parts[0], entry, key, place) for entry in value)
+            return tuple(self.value(options[0], entry, key, place) for entry in value)
         if isinstance(kind, type) and issubclass(kind, Mapping):
             entries = self.table(value, place, f"{key} = ").items()
-            return {name: self.value(parts[1], entry, name, key) for name, entry in entries}
+            return {name: self.value(options[1], entry, name, key) for name, entry in entries}
         read = {float: self.number, int: self.whole, bool: self.flag, str: self.text}.get(hint)
         return value if read is None else read(value, key, place)

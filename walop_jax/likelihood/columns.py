@@ -222,6 +222,7 @@ class Columns:
         self.reader = PointReader(likelihood.calset, self.plan, mirrored=True, floor=floor)
         groups = self.plan.exposures.shared
         self.shared = Sharing(self.patched.cameras.together, None if groups is None else np.asarray(groups))
+        self._responses: dict[int, tuple[PointData, _AtPoint]] = {}
 
     def has(self, change: Change) -> bool:
         """True if a change is a sum of slots to first order."""
@@ -245,7 +246,9 @@ class Columns:
             parts = list(KINDS[sentence.kind].slots(self.patched, sentence))
         except NoSuchPlaceError as error:
             raise NoSlotError(str(error)) from None
-        if not all(self._holds(part.slot) and "colour" not in part.factors for part in parts):
+        # Of the wavelengths in a band the light of an exposure has the mean.
+        inside = (part.slot[0] != "light" and "colour" in part.factors for part in parts)
+        if any(inside) or not all(self._holds(part.slot) for part in parts):
             raise NoSlotError(sentence.text)
         if sentence.kind != "thermal" or "temperature" in self.plan.conditions.planned:
             return parts
@@ -290,6 +293,17 @@ class Columns:
         used = self.likelihood.used[..., None]
         return median_over_field(np.where(used, counts - residual / np.where(used, weight, 1.0), np.nan))
 
+    def responses(self, start: int) -> tuple[PointData, _AtPoint]:
+        """Data and responses of `limits.RESPONSES_TOGETHER` points from `start` on, kept if the set is small."""
+        if start in self._responses:
+            return self._responses[start]
+        size = limits.RESPONSES_TOGETHER
+        (data,) = self.reader.batches(start, start + size, size)
+        response = data, jax.tree.map(np.asarray, _at_points(self.instrument, self.plan, data))
+        if len(self.likelihood.used) <= limits.RESPONSES_KEPT:
+            self._responses[start] = response
+        return response
+
     def of(self, changes: Sequence[Change]) -> Float[np.ndarray, "d a"]:
         """The columns of changes: rows run over points, then exposures, then cameras, used ones only."""
         return self.rounded(changes, len(changes))[0]
@@ -324,13 +338,12 @@ class ResponseBlock:
     """
 
     def __init__(self, of: Columns, start: int, every: Sequence[Slot]) -> None:
-        self.of, size = of, limits.RESPONSES_TOGETHER
-        (data,) = of.reader.batches(start, start + size, size)
-        found = _at_points(of.instrument, of.plan, data)
-        self.found: _AtPoint = jax.tree.map(np.asarray, found)
-        self.x, self.y, weight, self.band, self.source = (
+        self.of = of
+        data, self.found = of.responses(start)
+        self.x, self.y, weight, self.band, source = (
             np.asarray(getattr(data, name)) for name in ("x", "y", "weight", "band", "source")
         )
+        self.value = np.asarray(of.patched.standard.values(source, of.exposures.colour))
         self.used = weight[..., 0] > 0
         self.linear = light.is_linear(of.patched)
         self.whole = not self.linear or of.shared.exposures is not None
@@ -423,7 +436,7 @@ class ResponseBlock:
             )  # p m e k 4
             change = found.light.slopes[:, :, self.of.of_light[slot[:4]]]
             for star in slot[4:]:
-                change = change * (self.source == star)[:, None, :, None]
+                change = change * (self.value == star)[:, None, :, None]
             raw = np.einsum("pmeks,pmes->pmek", vectors, change) * found.light.factor
             return self._pairs(raw) * self.share * self.flux
         stage, cameras = slot

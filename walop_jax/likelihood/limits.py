@@ -33,6 +33,8 @@ COLUMNS = 256
 """Columns of an image row that are worked on together: the sums of four cameras and 25 exposures take a megabyte."""
 RESPONSES_TOGETHER = 32
 """Field points whose responses are computed together: one program serves sets of any size."""
+RESPONSES_KEPT = 1024
+"""Largest number of field points whose responses are kept for further columns: 200 MB."""
 RESPONSE_NUMBERS = 4_000_000
 """Numbers of responses that meet the exposures of some points together: 32 MB."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from walop_jax.io.errors import nearest
 from walop_jax.model import legendre
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.compiled import array
-from walop_jax.model.elements import ELEMENTS, Analyser, Element, Layer, Polariser, WavePlate
+from walop_jax.model.elements import ELEMENTS, Analyser, Element, Layer, Polariser, PupilMapping, WavePlate
 from walop_jax.model.parameters import Component, Parameter, is_row, numbers_of, unknown_name
 
 OWN = ("name", "moves", "declared", "model")  # what a file says otherwise, or not at all
@@ -24,6 +25,8 @@ NUMBER_KEYS = ("value", "sigma", "unit", "source", "name", "scale", "loose", "ti
 SERIES = "Legendre coefficient P_i(x/h) P_j(y/h)"
 FREE = "smooth vignetting and coatings: free"
 SHARES = ("efficiency", "extinction", "linear", "circular")
+PER_FIELD = re.compile(r"deg-(\d)")  # unit of what grows with a power of the distance from the centre
+SURE = 3.0  # standard deviations within which an instrument is built
 LARGEST_ANGLE = 4.0 * np.pi  # rad, of a number without a unit: two waves
 NANOMETRES = 3000.0  # above, wavelengths are thought to be in Angstrom
 
@@ -56,7 +59,10 @@ def parts(
     `DataError`, naming table and key, for what is wrong.
     """
     kinds = {kind.kind: kind for kind in (*ELEMENTS, *elements)}
-    make = _Maker(description.read, description.source, kinds, description.text)
+    edge = (description.edge or description.field_scale) * (
+        1.0 if description.raster == "line" else np.sqrt(2.0)
+    )
+    make = _Maker(description.read, description.source, kinds, description.text, edge)
     common = tuple(make.elements(description.elements, description.path, "elements"))
     arms = tuple(make.arm(name, table) for name, table in description.arms.items())
     coefficients = np.zeros((len(description.cameras), len(legendre.terms(description.degree))))
@@ -92,6 +98,7 @@ class _Maker:
     source: str
     kinds: Mapping[str, type[Element]]
     text: str = ""
+    farthest: float = 0.0
 
     def origin(self, kind: str) -> str:
         """Advice on the class of a kind that is not there, which the description may name."""
@@ -144,6 +151,7 @@ class _Maker:
             moves = self.read.text(moves, "moves", place)
         made = self.made(kind, place, name=name, moves=moves, declared=declared, **fields)
         self.check_moves(made, place)
+        self.check_edge(made, place)
         return made
 
     def made(self, kind: type[Any], place: str, **fields: Any) -> Any:
@@ -169,6 +177,23 @@ class _Maker:
             raise self.read.fault(place, f"moves, but {what} has no axis that could turn")
         elif type(made).ray is not Element.ray:
             raise self.read.fault(place, f"{what} changes the ray and cannot move")
+
+    def check_edge(self, made: Element, place: str) -> None:
+        """Raise `DataError` for numbers that, as sure as they are, leave no possible light at the edge of the field."""
+        mapping = isinstance(made, PupilMapping)  # r (1 + κ r²) must grow with r, and stay ahead of 90 deg
+        r, share, most = self.farthest, 0.0, 1.0 / 3.0 if mapping else 1.0
+        for key, said in made.declarations().items():
+            if power := PER_FIELD.fullmatch(said.unit):
+                grown = r ** int(power[1])
+                share = (float(np.max(np.abs(getattr(made, key)))) + SURE * (said.width or 0.0)) * grown
+                if share >= most:
+                    what = f"{key} may be {share:.3g} at the edge of the field ({r:.3g} deg from its centre), where "
+                    what += f"less than {most:.2g} is possible: |value| + {SURE:g} sigma below {most / grown:.2g} "
+                    raise self.read.fault(place, f"{what}{said.unit}, or a smaller field")
+        if mapping and (turn := r * abs(float(made.magnification)) * (1.0 + share)) >= 90.0:
+            what = f"magnification = {float(made.magnification):g} turns rays from the edge of the field ({r:.3g} deg "
+            what += f"from its centre) by {turn:.0f} deg, 90 at most: correct it, or give a smaller field"
+            raise self.read.fault(place, what)
 
     def layers(self, tables: Any, place: str) -> Iterator[Layer]:
         if not is_named(tables):

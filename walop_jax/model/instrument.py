@@ -383,16 +383,16 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
 def adapted(
     instrument: Instrument,
     *,
-    standards: Sequence[STAR] = (),
+    standards: Standards | Sequence[STAR] = (),
     plates: str | None = None,
     throughput_degree: int | None = None,
     throughput: float | None = None,
 ) -> Instrument:
     """An instrument for the data at hand.
 
-    `standards` are (name, q, u) in the equatorial frame; `plates` is the model of the wave plates,
-    `throughput_degree` that of the series, `throughput` the level of all cameras; None leaves what the instrument
-    says. Raises ValueError for an unknown plate model.
+    `standards` are (name, q, u) in the equatorial frame, or the source itself; `plates` is the model of the wave
+    plates, `throughput_degree` that of the series, `throughput` the level of all cameras; None leaves what the
+    instrument says. Raises ValueError for an unknown plate model.
     """
     instrument = instrument.with_source(_standards(standards))
     if plates is not None:
@@ -426,7 +426,9 @@ def sources() -> tuple[Source, ...]:
     return tuple(_standards(()) if kind is Standards else kind() for kind in SOURCES)
 
 
-def _standards(stars: Sequence[STAR]) -> Standards:
+def _standards(stars: Standards | Sequence[STAR]) -> Standards:
+    if isinstance(stars, Standards):
+        return stars
     names, q, u = zip(*stars, strict=True) if stars else ((), (), ())
     return Standards(names=tuple(names), q=array(np.array(q, float)), u=array(np.array(u, float)))
 

@@ -110,21 +110,32 @@ def node_wavelengths(instrument: Instrument, plan: Plan) -> Float[Array, " n"]:
 
 
 def band_weights(instrument: Instrument, plan: Plan) -> Float[Array, "b n"]:
-    """Weights of the nodes in every band: filter × photon spectrum, each band summing to 1.
+    """Weights of the nodes in every band: filter × photon spectrum, each band summing to 1, its slope to 0.
 
     Photon spectrum λ⁻⁴ / (exp(14387.77/λT) − 1) (Planck; λ in µm, T in K), flat where T = 0 stands for
     "none".
     """
-    return weights_at(plan, node_wavelengths(instrument, plan), plan.teff)
+    wavelength = node_wavelengths(instrument, plan)
+    weight = weights_at(plan, wavelength, plan.teff)
+    if plan.slope is None:
+        return weight
+    distance = wavelength - (weight @ wavelength)[:, None]
+    return jnp.where(plan.slope[:, None] > 0, distance, 1.0) * weight
 
 
 def weights_at(plan: Plan, wavelength: Float[Array, " n"], teff: Float[Array, " b"]) -> Float[Array, "b n"]:
-    """As `band_weights`, for other wavelengths of the nodes and colour temperatures of the bands."""
+    """As `band_weights`, for other wavelengths of the nodes and colour temperatures of the bands; no slopes."""
     hot = teff > 0
     exponent = 14387.77 / (wavelength * jnp.where(hot, teff, 5000.0)[:, None])
     spectrum = jnp.where(hot[:, None], wavelength**-4 / jnp.expm1(exponent), 1.0)
     weight = plan.node_weight * spectrum
     return weight / weight.sum(axis=1, keepdims=True)
+
+
+def mean_wavelengths(instrument: Instrument, plan: Plan) -> Float[Array, " b"]:
+    """Mean wavelengths (µm) of the bands."""
+    wavelength = node_wavelengths(instrument, plan)
+    return weights_at(plan, wavelength, plan.teff) @ wavelength
 
 
 def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b r 4"]:
@@ -141,7 +152,7 @@ def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float
 
     rows = with_dispersion(instrument, at, wavelength)
     weights = band_weights(instrument, plan)
-    return in_bands(instrument, integrated(plan, weights, rows), weights @ wavelength)
+    return in_bands(instrument, integrated(plan, weights, rows), mean_wavelengths(instrument, plan))
 
 
 def integrated(
@@ -263,16 +274,33 @@ def stokes(instrument: Instrument, sight: Sight) -> Float[Array, "e 4"]:
         if type(one).polarisation is not Source.polarisation:
             seen = one.shines(sight) & ~taken
             qu, taken = jnp.where(seen[:, None], one.polarisation(sight), qu), taken | seen
-    one, zero = jnp.ones_like(exposures.clp_angle), jnp.zeros_like(exposures.clp_angle)
-    light = jnp.stack([one, qu[:, 0], qu[:, 1], zero], axis=-1)
-    if instrument.telescope():
-        light = jnp.where(indoors(instrument, sight)[:, None], light, light @ telescope(instrument, x, y).T)
-    for film in instrument.sky_films:
-        light = jnp.where(indoors(instrument, sight)[:, None], light, film.through(light, exposures, x, y))
+    light = _at_polariser(instrument, sight, jnp.ones_like(exposures.clp_angle), qu)
     polariser = instrument.polariser
     if polariser is None:
         return light
     return jnp.where(exposures.clp_in[:, None], polariser.light(exposures, x, y), light)
+
+
+def stokes_slopes(instrument: Instrument, sight: Sight) -> Float[Array, "e 4"]:
+    """Change of the Stokes vectors with wavelength (per µm) inside a band: standards are of no single colour."""
+    instrument = instrument.patched()
+    exposures, sight = sight.exposures, _turned(instrument, sight)
+    dark = jnp.zeros_like(exposures.clp_angle)
+    light = _at_polariser(instrument, sight, dark, instrument.standard.slope(sight))
+    return jnp.where(exposures.clp_in[:, None], 0.0, light)
+
+
+def _at_polariser(
+    instrument: Instrument, sight: Sight, intensity: Float[Array, " e"], qu: Float[Array, "e 2"]
+) -> Float[Array, "e 4"]:
+    """Light of an intensity and polarisation behind what light from the sky meets ahead of the polariser."""
+    exposures, x, y = sight.exposures, sight.x, sight.y
+    light = jnp.stack([intensity, qu[:, 0], qu[:, 1], jnp.zeros_like(intensity)], axis=-1)
+    if instrument.telescope():
+        light = jnp.where(indoors(instrument, sight)[:, None], light, light @ telescope(instrument, x, y).T)
+    for film in instrument.sky_films:
+        light = jnp.where(indoors(instrument, sight)[:, None], light, film.through(light, exposures, x, y))
+    return light
 
 
 def indoors(instrument: Instrument, sight: Sight) -> Bool[Array, " e"]:
@@ -310,6 +338,9 @@ def counts(
         result = jnp.einsum("bks,eb,es->ek", vectors, in_band, light)
     else:
         result = jnp.einsum("eks,es->ek", vectors[band], light)
+    if exposures.slope_band is not None:
+        slopes = stokes_slopes(instrument, sight)
+        result = result + jnp.einsum("eks,es->ek", vectors[exposures.slope_band], slopes)
     for part in instrument.cameras.exposures:
         result = result * part.factors(exposures, x, y)
         result = result + vectors[band, :, 0] * part.share(exposures, x, y)

@@ -104,7 +104,7 @@ def param(
     width: float | None = None,
     scale: float | None = None,
     loose: float | None = None,
-    default: float | None = None,
+    default: float | tuple[()] | None = None,
 ) -> Any:
     """Declare a parameter of an Equinox module; values become float64 arrays.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 
 import jax
 import numpy as np
@@ -15,10 +15,11 @@ from walop_jax.data.settings import Settings
 from walop_jax.io.errors import fail
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
+from walop_jax.model.fold import Turning
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import EXTRAPOLATED, MATERIALS
 from walop_jax.model.plan import Plan, blank_exposures, exposure_arrays, hours_of
-from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, rounded_up, waves_over
+from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, moments, rounded_up, waves_over
 from walop_jax.model.ray import CONDITIONS, Conditions
 from walop_jax.model.sources import ExposureArrays
 
@@ -34,22 +35,24 @@ def plan_for(
 ) -> Plan:
     """Lay out the nodes and bands of `exposures`, as detailed as the instrument and its effects need it.
 
-    Raises KeyError for a filter that `filters` does not hold and ValueError for a KIND without a source.
+    Standards that have a colour have the slopes of the bands as well. Raises KeyError for a filter that `filters` does
+    not hold and ValueError for a KIND without a source.
     """
     own = Settings.of(exposures, instrument.patched().moving())
-    stars = 0 if sources is None else len(sources)
+    each, stars = np.arange(len(exposures)), 0 if sources is None else len(sources)
     # A row for every exposure; of standards one for every star, as each may have a colour of its own.
     of_stars = exposures.direct("standard") & (stars > 0)
-    row = np.repeat(np.arange(len(exposures)), np.where(of_stars, stars, 1))
-    settings, seen = own[row], of_stars[row]
+    row = np.repeat(each, np.where(of_stars, stars, 1))
+    teff, last, seen = own.teff[row], len(row), of_stars[row]
     if sources is not None and seen.any():
         colour = np.tile(sources.teff, of_stars.sum())
-        teff = settings.teff.copy()
         teff[seen] = np.where(np.isfinite(colour), colour, teff[seen])
-        settings = dataclasses.replace(settings, teff=teff)
+    sloping = np.flatnonzero(of_stars) if instrument.standard.bands else each[:0]
+    row, teff = np.append(row, sloping), np.append(teff, np.full(len(sloping), _typical(sources)))
+    settings = dataclasses.replace(own[row], teff=teff)
 
     def band_of(band: Int[np.ndarray, " n"]) -> Int[np.ndarray, "e s"]:
-        table = np.empty((len(exposures), 1 + stars), int)
+        table = np.empty((len(each), 1 + stars), int)
         table[~of_stars] = band[~seen, None]
         table[of_stars, 1:] = band[seen].reshape(of_stars.sum(), stars)
         table[of_stars, 0] = table[of_stars, -1]  # nothing is used of a standard without its star
@@ -62,9 +65,34 @@ def plan_for(
     )
     if instrument.cameras.split or steady.any():
         arrays = _sharing(arrays, own, steady, split=instrument.cameras.split)
-    return _plan(
-        instrument, settings, exposures.kind[row], hours_of(exposures)[row], filters, arrays, band_of
+    slope = np.arange(len(row)) >= last
+    hours, kinds = hours_of(exposures)[row], exposures.kind[row]
+    plan, band = _plan(instrument, settings, hours, filters, arrays, kinds, slope)
+    plan = dataclasses.replace(plan, band_of=band_of(band[:last]))
+    if sources is None or not sloping.size:
+        return plan
+    curves = {name: filters[name] for name in np.unique(exposures.filter).tolist()}
+    slope_band = np.zeros(len(each), int)
+    slope_band[sloping] = band[last:]
+    seen = dataclasses.replace(
+        plan.exposures, colour=array(colours(exposures, curves, sources)), slope_band=array(slope_band, int)
     )
+    return dataclasses.replace(plan, exposures=seen)
+
+
+def _typical(sources: Sources | None) -> float:
+    """Colour temperature that stands for those of all stars where a slope of second order is meant."""
+    known = np.zeros(0) if sources is None else sources.teff[np.isfinite(sources.teff)]
+    return float(np.median(known)) if known.size else np.nan
+
+
+def colours(
+    exposures: Exposures, curves: Mapping[str, FilterCurve], sources: Sources
+) -> Float[np.ndarray, "e s 2"]:
+    """Mean wavelength and rms width (µm) of the photons of every star in every exposure."""
+    names, number = np.unique(exposures.filter, return_inverse=True)
+    each = [[moments(curves[n].wavelength, curves[n].throughput, t) for t in sources.teff] for n in names]
+    return np.array(each)[number]
 
 
 def _sharing(
@@ -99,8 +127,8 @@ def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mappi
     """
     settings.check_moving(instrument.patched().moving())
     blank = blank_exposures(instrument, len(settings))
-    kinds, hours = np.full(len(settings), ""), np.zeros(len(settings))
-    return _plan(instrument, settings, kinds, hours, filters, blank, lambda band: band[:, None])
+    plan, band = _plan(instrument, settings, np.zeros(len(settings)), filters, blank)
+    return dataclasses.replace(plan, band_of=band[:, None])
 
 
 @functools.lru_cache(maxsize=256)
@@ -168,26 +196,32 @@ def _fringes(instrument: Instrument, curve: FilterCurve, room: float = ROOM) -> 
 def _plan(
     instrument: Instrument,
     settings: Settings,
-    kinds: np.ndarray,
     hours: Float[np.ndarray, " n"],
     filters: Mapping[str, FilterCurve],
     exposures: ExposureArrays,
-    band_of: Callable[[Int[np.ndarray, " n"]], Int[np.ndarray, "e s"]],
-) -> Plan:
+    kinds: np.ndarray | None = None,
+    slope: Bool[np.ndarray, " n"] | None = None,
+) -> tuple[Plan, Int[np.ndarray, " n"]]:
+    """A plan, but for `Plan.band_of`, and the band of every setting; `slope` is true for those of slopes."""
     asked, patched = needs(instrument), instrument.patched()
     moving = patched.moving()
     names = sorted(asked.conditions)
     values = {"temperature": settings.temperature, "hour_angle": settings.hour_angle, "hours": hours}
     assert set(values) == set(CONDITIONS)
-    # A band is (positions, filter, conditions, colour temperature, KIND); sorting puts equal positions together.
-    # NaN (out, flat spectrum) becomes a sortable stand-in. KINDs are apart, so that a set in which the colour of one
-    # is another has a plan of the same shape.
-    states = _rows(
-        [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving], len(settings)
-    )
-    moments = _rows([values[name] for name in names], len(settings))
+    # A band is (positions, filter, conditions, colour temperature, slope, KIND); sorting puts equal positions together.
+    # NaN (out, flat spectrum) becomes a sortable stand-in. KINDs of one colour are apart, so that a set in which one of
+    # them has another has a plan of the same shape, and the same programs.
+    # The angle of each element, and after all of them by how much each turns.
+    still = np.zeros(len(settings))
+    places = [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving]
+    turns = [settings.turns.get(prefix, still) for prefix in moving]
+    states = _rows([*places, *turns], len(settings))
+    planned = _rows([values[name] for name in names], len(settings))
     teff = np.nan_to_num(settings.teff).tolist()
-    keys = list(zip(states, settings.filter.astype(str).tolist(), moments, teff, kinds.tolist(), strict=True))
+    sloping = np.zeros(len(settings), bool) if slope is None else slope
+    labels = [""] * len(settings) if kinds is None else kinds.tolist()
+    each = (states, settings.filter.astype(str).tolist(), planned, teff, sloping.tolist(), labels)
+    keys = list(zip(*each, strict=True))
     bands = sorted(set(keys))
     index = {key: i for i, key in enumerate(bands)}
 
@@ -223,9 +257,10 @@ def _plan(
     laid = []
     found = [key[0] for key in bands]
     for value in sorted(set(found)):
-        state = tuple(None if np.isinf(angle) else float(angle) for angle in value)
+        pairs = zip(value[: len(moving)], value[len(moving) :], strict=True)
+        state = tuple(None if np.isinf(at) else Turning(at, turn) if turn else at for at, turn in pairs)
         laid.append((state, found.index(value), len(found) - found[::-1].index(value)))
-    return Plan(
+    plan = Plan(
         wavelength=array(np.concatenate([rules[name][0] for name, _ in groups])),
         conditions=Conditions(
             band_width=per_node([width[name] for name, _ in groups]),
@@ -234,10 +269,12 @@ def _plan(
         node_weight=array(weight),
         teff=array([key[3] for key in bands], float),
         exposures=exposures,
-        band_of=band_of(np.array([index[key] for key in keys], int)),
+        band_of=np.zeros((0, 1), int),
         settings=tuple(laid),
         moving=moving,
+        slope=array([key[4] for key in bands], float) if sloping.any() else None,
     )
+    return plan, np.array([index[key] for key in keys], int)
 
 
 def _rows(columns: list[Float[np.ndarray, " n"]], count: int) -> list[tuple[float, ...]]:

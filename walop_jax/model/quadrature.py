@@ -62,6 +62,16 @@ def tabulated_measure(wavelength: Vector, throughput: Vector, waves: float = WAV
     return fine[inside], weight[inside] / weight[inside].sum()
 
 
+def moments(wavelength: Vector, throughput: Vector, teff: float) -> tuple[float, float]:
+    """Mean wavelength (µm) of the photons of a black body (K; NaN: flat spectrum) behind a filter, and rms width."""
+    node, weight = tabulated_measure(wavelength, throughput)
+    if np.isfinite(teff):
+        weight = weight * node**-4 / np.expm1(14387.77 / (node * teff))
+        weight = weight / weight.sum()
+    mean = float(weight @ node)
+    return mean, float(np.sqrt(weight @ (node - mean) ** 2))
+
+
 def waves_over(wavelength: Vector, retardance: Vector) -> float:
     """Waves at 0.62 µm of a fixed birefringence, which turns as 1/λ, that turn as often over a band as a retardance.
 

@@ -14,6 +14,7 @@ from walop_jax.model import legendre, quadrature
 from walop_jax.model.elements import WavePlate, Wedge
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import CRYSTALS, GLASSES
+from walop_jax.model.sources import COLOUR_OF_STANDARDS
 from walop_jax.model.specification import Model
 
 _OWN = "physics of this package; no outside source"
@@ -51,6 +52,8 @@ def references(model: Model, filters: Iterable[str] = ()) -> tuple[Reference, ..
     found.append(Reference("band integral", quadrature.SOURCE))
     if DEFAULT_FILTER in set(filters):
         found.append(Reference(f"{DEFAULT_FILTER} filter curve", "Doi et al. 2010, AJ 139, 1628, Table 4"))
+    if instrument.standard.bands:
+        found.append(Reference("colour of standards", COLOUR_OF_STANDARDS))
     found.append(Reference("throughput over the field", legendre.SOURCE))
     for source in instrument.sources:
         used = any(model.parameters[i].free for i in model.positions(source.name))

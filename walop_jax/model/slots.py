@@ -168,13 +168,18 @@ def vector_slopes(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> V
         return patched(instrument, [(Change(*slot[1:]), sizes[t]) for t, slot in each])
 
     def mean(shift: Scalar) -> Float[Array, " b"]:
-        return _mean(patched(instrument, [(Change(*whole[-1][1:]), shift)]), plan)
+        return light.mean_wavelengths(patched(instrument, [(Change(*whole[-1][1:]), shift)]), plan)
 
     found = _banded(plan, (x, y), moved, (most, len(whole)), jnp.zeros(1))
     rows = jnp.concatenate([part.reshape(-1, *found.rows.shape) for part in found[1:]])
     shifted = jax.jacfwd(mean)(jnp.zeros(()))
     means = jnp.zeros((len(rows), len(shifted))).at[-1].set(shifted)
-    neutral = found.rows, _mean(instrument, plan), instrument.throughput.at(x, y), jnp.zeros(cameras**2)
+    neutral = (
+        found.rows,
+        light.mean_wavelengths(instrument, plan),
+        instrument.throughput.at(x, y),
+        jnp.zeros(cameras**2),
+    )
     value, push = jax.linearize(functools.partial(_vectors, instrument, (x, y)), *neutral)
     none = [jnp.zeros_like(one) for one in neutral]
     slopes = (
@@ -201,15 +206,16 @@ def fringe_slopes(
     def vectors(rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
         none = jnp.zeros(len(instrument.cameras) ** 2)
         return _vectors(
-            instrument, (x, y), rows, _mean(instrument, plan), instrument.throughput.at(x, y), none
+            instrument,
+            (x, y),
+            rows,
+            light.mean_wavelengths(instrument, plan),
+            instrument.throughput.at(x, y),
+            none,
         )
 
     found = _banded(plan, (x, y), moved, (1, 0), gaps)
     return jax.vmap(jax.vmap(jax.linearize(vectors, found.rows)[1]))(found.plates[:, :, 0])
-
-
-def _mean(instrument: Instrument, plan: Plan) -> Float[Array, " b"]:
-    return light.band_weights(instrument, plan) @ light.node_wavelengths(instrument, plan)
 
 
 def _vectors(
@@ -354,7 +360,7 @@ def light_slots(instrument: Instrument) -> dict[Slot, int]:
     if any(isinstance(source, MoonSky) for source in instrument.sources):
         found += [(kind, "of", SKY) for kind in OF_SOURCES]
     if instrument.standard.names:
-        found += [(kind, "of", Standards.name) for kind in OF_QU]
+        found += [(kind, "of", Standards.name) for kind in (*OF_QU, "rotator")]
     if polariser is not None:
         found += [(kind, "of", polariser.name) for kind in (*OF_POLARISER, *GENERATORS)]
         found += [(kind, "ahead of", polariser.name) for kind in (*GENERATORS, *ADDED)]

@@ -4,15 +4,21 @@ Moon sky    (q, u) = δ (q₁, u₁) − p (q₁, u₁)/|(q₁, u₁)| + (q_e, u
             p₁ = sin²γ / (1 + cos²γ), perpendicular to the scattering plane; γ angle from the Moon; δ depolarisation,
             one for all patches and wavelengths; p degree that multiple scattering takes away; q_e, u_e what a patch has
             beyond it
-Standards   (q + iu) in the instrument frame = (Q + iU) exp(−2i ROTATOR), catalogue values in the equatorial frame
-Sources     Maharana et al. 2022, Paper II, eq. 8; multiple scattering: Berry, Dennis & Lee 2004, New J. Phys. 6, 162.
+Standards   (q + iu) in the instrument frame = (Q + iU) exp(−2i ROTATOR), catalogue values in the equatorial frame.
+            A star with a colour has in a band b what it has in the band a of its value, times
+            ⟨p⟩_b/⟨p⟩_a exp(2i turn (λ_b − λ_a)), p(λ) = exp(−K ln²(λmax/λ)), K = 1.66 λmax + 0.01, ⟨ ⟩ the mean over
+            the photons of a band, λ (µm) their mean wavelength; inside a band it changes by its slope there
+Sources     Maharana et al. 2022, Paper II, eq. 8; multiple scattering: Berry, Dennis & Lee 2004, New J. Phys. 6, 162;
+            law of Serkowski, Mathewson & Ford 1975, ApJ 196, 261, with K of Whittet et al. 1992, ApJ 386, 562
+Limits      λmax 0.4 to 0.8 µm, bands from 0.35 to 2 µm; bands are summed by three nodes, exact for p of fifth degree
+            over a band with the shape of a Gaussian
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,11 +26,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.records import KINDS, ExposureKind
+from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.parameters import Component, number, param
 from walop_jax.model.ray import NotPlannedError
 
 Scalar = Float[Array, ""]
 PAPER_II = "Maharana et al. 2022, Paper II"
+COLOUR_OF_STANDARDS = "Serkowski, Mathewson & Ford 1975, ApJ 196, 261; Whittet et al. 1992, ApJ 386, 562"
+WHITTET = "Whittet et al. 1992, ApJ 386, 562: 0.55 µm, most stars within 0.1 µm"
+TURN_SOURCE = "rms between V and R of the standards of Schmidt, Elston & Lupie 1992, AJ 104, 1563"
+LMAX = 0.55  # µm
+SHORTEST = 0.2  # µm: no λmax below
 
 
 class ExposureArrays(eqx.Module):
@@ -33,7 +45,9 @@ class ExposureArrays(eqx.Module):
     `kind` counts the kinds of `kinds`. Angles in radians; `clp_angle` is 0 when the polariser is out, `rotator` where
     it has no meaning; `shared` is 1 where an exposure belongs to a group that has its fluxes in common, None: no
     exposures have. `moving` holds angles of elements that move behind the polariser (NaN: out). `hours` since the first
-    exposure, temperature in Celsius, hour angle in h, exposure time in s.
+    exposure, temperature in Celsius, hour angle in h, exposure time in s. Where standards have a colour, `colour` holds
+    mean wavelength and rms width (µm) of the photons of each of them behind the filter, `slope_band` the band that is
+    weighted with the distance from its mean wavelength (`Plan.slope`).
     """
 
     kind: Int[Array, " e"]
@@ -48,7 +62,14 @@ class ExposureArrays(eqx.Module):
     median_counts: Float[Array, "e k"] | None = None
     shared: Float[Array, "e s"] | None = None
     moving: Mapping[str, Float[Array, " e"]] = dataclasses.field(default_factory=dict)
+    colour: Float[Array, "e s 2"] | None = None
+    slope_band: Int[Array, " e"] | None = None
     kinds: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def wavelength(self) -> Any:
+        """Mean wavelengths (µm) of the filters, as the first star sees them; the usual one where no colour matters."""
+        return REFERENCE_WAVELENGTH if self.colour is None else self.colour[:, 0, 0]
 
     @property
     def median(self) -> Float[Array, "e k"]:
@@ -150,31 +171,151 @@ class MoonSky(Source):
         return qu
 
 
+class StandardChange(Component):
+    """Change of q (axis 0) or u (1) of one value of a standard in single exposures."""
+
+    size: Scalar
+    value: int = eqx.field(static=True)
+    axis: int = eqx.field(static=True)
+
+    def factor(self, exposures: ExposureArrays) -> Float[Array, " e"]:
+        """Factor of the size in every exposure."""
+        raise NotImplementedError
+
+
 class Standards(Source):
-    """Catalogue Stokes parameters of the standard stars."""
+    """Catalogue Stokes parameters of the standard stars.
+
+    There is a value for each of `names`; `stars` holds for each the first value of its star, `bands` mean wavelength
+    and rms width (µm) of the band that it is of. Both are empty where no star has a colour: then a value holds for any
+    light. `unknown` are values of which no band is known, but that it is one of those that the star was seen in.
+    `changes` are added to the values in single exposures.
+    """
 
     names: tuple[str, ...] = eqx.field(static=True)
     q: Float[Array, " s"] = param(unit="", about="catalogue q", source="SOURCES table", scale=2e-4)
     u: Float[Array, " s"] = param(unit="", about="catalogue u", source="SOURCES table", scale=2e-4)
+    lmax: Float[Array, " c"] = param(
+        unit="um", about="wavelength of largest polarisation", source=WHITTET, width=0.1, default=()
+    )
+    turn: Float[Array, " c"] = param(
+        unit="deg/um", about="slope of the angle with wavelength", source=TURN_SOURCE, width=3.0, default=()
+    )
+    wavelength: Float[Array, " n"] = param(
+        unit="um",
+        about="wavelength at which the catalogue value holds",
+        source="FILTER of EXPOSURES",
+        default=(),
+    )
+    bands: tuple[tuple[float, float], ...] = eqx.field(static=True, default=())
+    stars: tuple[int, ...] = eqx.field(static=True, default=())
+    unknown: tuple[int, ...] = eqx.field(static=True, default=())
+    angle: Scalar | None = number(unit="deg", about="added to all position angles", default=None)
+    changes: tuple[StandardChange, ...] = ()
 
     name: ClassVar[str] = "standard"
     kind: ClassVar[str] = "standard"
 
+    @classmethod
+    def coloured(
+        cls,
+        names: Sequence[str],
+        qu: Float[np.ndarray, "2 s"],
+        bands: Sequence[tuple[float, float]],
+        stars: Sequence[int],
+        unknown: Sequence[int] = (),
+        lmax: float = LMAX,
+    ) -> Standards:
+        """Standards that follow the law of interstellar polarisation from band to band."""
+        each = len(set(stars))
+        numbers: dict[str, Any] = {
+            "q": qu[0],
+            "u": qu[1],
+            "lmax": np.full(each, lmax),
+            "turn": np.zeros(each),
+            "wavelength": [bands[i][0] for i in unknown],
+        }
+        return cls(
+            names=tuple(names), bands=tuple(bands), stars=tuple(stars), unknown=tuple(unknown), **numbers
+        )
+
+    @property
+    def star_names(self) -> tuple[str, ...]:
+        """One name for each star: that of its first value, without the band."""
+        firsts = sorted(set(self.stars or range(len(self.names))))
+        return tuple(self.names[i].partition(".")[0] for i in firsts)
+
     def labels(self, field: str) -> Sequence[str]:
-        """One name per star."""
-        return tuple(f"{name}.{field}" for name in self.names)
+        """One name per value, or per star."""
+        if field in ("lmax", "turn"):
+            return tuple(f"{name}.{field}" for name in self.star_names) if self.bands else ()
+        names = [self.names[i] for i in self.unknown] if field == "wavelength" else self.names
+        return tuple(f"{name}.{field}" for name in names)
 
     def shines(self, sight: Sight) -> Bool[Array, " e"]:
         """Whatever has a star as its source."""
         seen = sight.source >= 0
         return seen if self.names else jnp.zeros_like(seen)
 
+    def values(self, source: Int[Any, "*p e"], colour: Float[Any, "e s 2"] | None) -> Int[Any, "*p e"]:
+        """The value that each exposure of a source goes by: that of its star whose band is the nearest; −1 for none."""
+        if colour is None or len(set(self.stars)) == len(self.names):
+            return source
+        seen = colour[jnp.arange(source.shape[-1]), source, 0]
+        distance = jnp.abs(seen[..., None] - jnp.array([wavelength for wavelength, _ in self.bands]))
+        nearest = jnp.argmin(
+            jnp.where(jnp.array(self.stars) == source[..., None], distance, jnp.inf), axis=-1
+        )
+        return jnp.where(source >= 0, nearest, -1)
+
     def polarisation(self, sight: Sight) -> Float[Array, "e 2"]:
-        """That of the star of each exposure."""
+        """That of the star of each exposure, its mean over the band."""
         if not self.names:
             return super().polarisation(sight)
-        row = jnp.where(sight.source >= 0, sight.source, 0)
-        return turned(jnp.stack([self.q[row], self.u[row]], axis=-1), sight.exposures.rotator)
+        return self._seen(sight)[0]
+
+    def slope(self, sight: Sight) -> Float[Array, "e 2"]:
+        """Change of (q, u) with wavelength (per µm) at the mean wavelength of the band; 0 without a star."""
+        return jnp.where(sight.source[:, None] >= 0, self._seen(sight)[1], 0.0)
+
+    def _seen(self, sight: Sight) -> tuple[Float[Array, "e 2"], Float[Array, "e 2"]]:
+        """(q, u) in the instrument frame, and its slope."""
+        colour = sight.exposures.colour
+        row = jnp.maximum(self.values(sight.source, colour), 0)
+        qu, rotator = jnp.stack([self.q[row], self.u[row]], axis=-1), sight.exposures.rotator
+        for one in self.changes:
+            qu = qu.at[:, one.axis].add(
+                jnp.where(row == one.value, one.size * one.factor(sight.exposures), 0.0)
+            )
+        if self.angle is not None:
+            rotator = rotator - jnp.deg2rad(self.angle)
+        if colour is None or not self.bands:
+            return turned(qu, rotator), jnp.zeros_like(qu)
+        first, number = np.unique(self.stars, return_inverse=True)
+        here = colour[jnp.arange(len(row)), jnp.asarray(first[number])[row]]
+        there = jnp.array(self.bands).at[np.array(self.unknown, int), 0].set(self.wavelength)[row]
+        star = jnp.asarray(number)[row]
+        lmax, turn = jnp.maximum(self.lmax[star], SHORTEST), jnp.deg2rad(self.turn[star])
+        degree = mean_over_band(lmax, here) / mean_over_band(lmax, there)
+        seen = turned(degree[:, None] * qu, rotator - turn * (here[:, 0] - there[:, 0]))
+        # d/dλ of p exp(2i angle), relative to it
+        rising = 2.0 * width_of_law(lmax) * jnp.log(lmax / here[:, 0]) / here[:, 0]
+        across = jnp.stack([-seen[:, 1], seen[:, 0]], axis=-1)
+        return seen, rising[:, None] * seen + 2.0 * turn[:, None] * across
+
+
+def width_of_law(lmax: Array) -> Array:
+    """K of Serkowski's law (Whittet et al. 1992), λmax in µm."""
+    return 1.66 * lmax + 0.01
+
+
+def mean_over_band(lmax: Array, band: Float[Array, "*e 2"]) -> Array:
+    """Mean of exp(−K ln²(λmax/λ)) over bands of some mean wavelengths and rms widths (µm)."""
+    total = 0.0
+    for step, weight in ((-(3.0**0.5), 1 / 6), (0.0, 2 / 3), (3.0**0.5, 1 / 6)):
+        wavelength = band[..., 0] + step * band[..., 1]
+        total = total + weight * jnp.exp(-width_of_law(lmax) * jnp.log(lmax / wavelength) ** 2)
+    return jnp.asarray(total)
 
 
 class ThroughPolariser(Source):

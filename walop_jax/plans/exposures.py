@@ -36,7 +36,7 @@ from walop_jax.model.effects import EFFECTS, Effect, EffectKind, effect_by_name
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import Model, effect_context, with_effects
-from walop_jax.plans.could import PLATE_TURN, CandidateExposure, Could
+from walop_jax.plans.available import PLATE_TURN, Available, CandidateExposure
 from walop_jax.plans.families import Family, Listed, even_angles, harmonics, highest, spread_angles
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop
 from walop_jax.simulation.simulate import (
@@ -77,7 +77,7 @@ class Candidates:
     apart, parameters of the model as well, with whether their size is known.
     """
 
-    could: Could
+    available: Available
     model: Model
     choices: tuple[CandidateExposure, ...]
     families: tuple[Family, ...]
@@ -90,19 +90,19 @@ class Candidates:
 
     def with_plate(self, angles: Sequence[float]) -> Candidates:
         """The same with the calibration plate at some angles (deg) where it may stand at any."""
-        both: list[tuple[CandidateExposure, Family]] = []
+        pairs: list[tuple[CandidateExposure, Family]] = []
         for choice, family in zip(self.choices, self.families, strict=True):
             if isinstance(family, Polarised) and choice.free:
-                both += [(choice.with_plate(a), family.with_plate(a)) for a in angles]
+                pairs += [(choice.with_plate(a), family.with_plate(a)) for a in angles]
             else:
-                both.append((choice, family))
+                pairs.append((choice, family))
         return dataclasses.replace(
-            self, choices=tuple(c for c, _ in both), families=tuple(f for _, f in both)
+            self, choices=tuple(c for c, _ in pairs), families=tuple(f for _, f in pairs)
         )
 
 
 def candidates(
-    could: Could,
+    available: Available,
     *,
     draws: int = DRAWS,
     seed: int = 0,
@@ -120,10 +120,10 @@ def candidates(
     that do not act on light.
     """
     tell = progress or (lambda text: None)
-    choices, notes = could.choices()
+    choices, notes = available.choices()
     if not choices:
         raise ValueError("; ".join(("nothing could be observed", *notes)))
-    few, stops, turn = fewer_points(could.plan), [], 360.0 if effects else 180.0
+    few, stops, turn = fewer_points(available.plan), [], 360.0 if effects else 180.0
     choices = tuple(choice._replace(turn=turn) for choice in choices)
     for choice in choices:
         stops.append(_nodes(choice, bool(effects)))
@@ -138,61 +138,63 @@ def candidates(
     for i in (model.index(name) for name in model.names if _effect_of(name, stated)):
         values[:, i] = model.parameters[i].start
     likelihood = Likelihood.of(calset, model)
-    factor, flux, exptime = _factor(could.plan, few), fluxes(plan, None), plan.exposures().exptime
+    factor, flux, exptime = _factor(available.plan, few), fluxes(plan, None), plan.exposures().exptime
     noise, floor = PhotonNoise(plan.read_noise), model.template.cameras.floor
     shared = Sharing(model.template.cameras.together)
     responses = []
-    for number, one in enumerate(values):
+    for number, draw in enumerate(values):
         tell(f"expected counts of instrument {number + 1} of {draws}")
-        responses.append(_responses(likelihood, one))
+        responses.append(_responses(likelihood, draw))
     families: list[Family] = []
     for choice, start, stop in zip(choices, first[:-1], first[1:], strict=True):
         tell(f"information of {choice.text()}")
-        cost, each = choice.seconds + could.costs.of(choice.kind), []
+        cost, matrices = choice.seconds + available.costs.of(choice.kind), []
         polarised = choice.kind == "clp"
         for rows in [slice(start, stop)] if polarised else [slice(i, i + 1) for i in range(start, stop)]:
             at = likelihood.used[:, rows.start]
-            there = flux[at, rows.start] * choice.seconds / exptime[rows.start]
-            light = Illumination(there, noise, floor, shared, 1.0 if choice.kind == "standard" else factor)
+            electrons = flux[at, rows.start] * choice.seconds / exptime[rows.start]
+            light = Illumination(
+                electrons, noise, floor, shared, 1.0 if choice.kind == "standard" else factor
+            )
             counts = tuple((unit[at, rows], slopes[at, rows]) for unit, slopes in responses)
             if polarised:
                 families.append(Polarised(choice, light, counts, _orders(choice, angles), cost))
             else:
-                each.append(np.stack([light.information(*one)[0] for one in counts]))
-        if each:
-            families.append(Listed.of(np.stack(each, axis=1), cost))
+                matrices.append(np.stack([light.information(*draw)[0] for draw in counts]))
+        if matrices:
+            families.append(Listed.of(np.stack(matrices, axis=1), cost))
     lost = max([0.0, *(f.lost() for f in families if isinstance(f, Polarised))])
     rows = prior_rows(model).jacobian(model.selection())
     names = tuple(model.names[i] for i in model.free)
     base = np.array([not _effect_of(name, stated) for name in names])
-    known = (rows.T @ rows) * np.outer(base, base)
-    return Candidates(could, model, choices, tuple(families), values, names, known, lost, notes, stated)
+    prior = (rows.T @ rows) * np.outer(base, base)
+    return Candidates(available, model, choices, tuple(families), values, names, prior, lost, notes, stated)
 
 
 def _with(
     model: Model, calset: CalibrationSet, given: Sequence[str | Effect]
 ) -> tuple[Model, dict[str, bool]]:
     """The model with effects at their values, and which of them have one."""
-    context, stated, whole = effect_context(model.template, calset.exposures), {}, model
-    for one in given:
-        effect = one
-        if isinstance(one, str) and "=" in one:
-            effect = effect_from_text(one, context, model.catalogue)
+    context, stated, extended = effect_context(model.template, calset.exposures), {}, model
+    for item in given:
+        effect = item
+        if isinstance(item, str) and "=" in item:
+            effect = effect_from_text(item, context, model.catalogue)
         alone = isinstance(effect, str)
         name = effect.strip() if isinstance(effect, str) else effect.name
-        whole = with_effects(whole, (name if alone else effect,), context)
+        extended = with_effects(extended, (name if alone else effect,), context)
         kind = effect_by_name(name, model.catalogue)
         if kind.is_structural():
             raise ValueError(
                 f"{name} is there or it is not, and has no size that could be planned for; leave it out"
             )
         stated[name] = not alone
-        for p in whole.parameters if alone else ():
+        for p in extended.parameters if alone else ():
             if _effect_of(p.name, (name,)) and p.name.split(".")[1] not in kind.shape:
-                whole = whole.change(p.name, start=p.start + p.scale)
-    if given and not light.is_linear(whole.template):
+                extended = extended.change(p.name, start=p.start + p.scale)
+    if given and not light.is_linear(extended.template):
         raise ValueError("effects of the detectors cannot be planned for: only those that act on light")
-    return whole, stated
+    return extended, stated
 
 
 def _effect_of(name: str, effects: Iterable[str]) -> str:
@@ -217,21 +219,21 @@ def _factor(plan: ObservingPlan, few: ObservingPlan) -> float:
 
 def drawn(model: Model, draws: int, seed: int, around: Calibration | None) -> Float[np.ndarray, "r n"]:
     """Values of all parameters: from the priors, or from the posterior of a calibration as far as it has them."""
-    found = []
+    samples = []
     for draw in range(draws):
         rng = np.random.default_rng([seed, draw])
-        there = truth_values(draw_instrument(model, rng))
-        values = np.array([there[name] for name in model.names])
+        truth = truth_values(draw_instrument(model, rng))
+        values = np.array([truth[name] for name in model.names])
         if around is not None:
             of = around.model
-            own = of.selection() @ rng.multivariate_normal(
+            deviation = of.selection() @ rng.multivariate_normal(
                 np.zeros(len(of.free)), around.covariance[np.ix_(of.free, of.free)], method="eigh"
             )
             for i, name in enumerate(model.names):
                 if name in of.names:
-                    values[i] = around.values[of.index(name)] + own[of.index(name)]
-        found.append(values)
-    return np.stack(found)
+                    values[i] = around.values[of.index(name)] + deviation[of.index(name)]
+        samples.append(values)
+    return np.stack(samples)
 
 
 def _unit(instrument: Instrument, plan: Plan, point: engine.PointData) -> tuple[Array, Array]:
@@ -246,8 +248,8 @@ def _responses(
 ) -> tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]]:
     """Counts for light of unit flux, and their derivatives to the free parameters."""
     instrument, select = likelihood.model.instrument(values), likelihood.model.selection()
-    parts = [_unit_at(instrument, likelihood.plan, batch) for batch in likelihood.points]
-    unit, slopes = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
+    batches = [_unit_at(instrument, likelihood.plan, batch) for batch in likelihood.points]
+    unit, slopes = (np.concatenate([np.asarray(result[i]) for result in batches]) for i in (0, 1))
     count = likelihood.layout.points
     return unit[:count], slopes[:count] @ select
 
@@ -276,8 +278,8 @@ def _orders(choice: CandidateExposure, angles: int) -> tuple[int, ...]:
 
 def _interpolating(angle: Float[np.ndarray, " s"], nodes: int) -> Float[np.ndarray, "s e"]:
     """Weights of equidistant nodes in the series through them."""
-    there = harmonics(2 * np.pi * np.arange(nodes) / nodes, nodes // 2)
-    return harmonics(angle, nodes // 2) @ np.linalg.inv(there)
+    at_nodes = harmonics(2 * np.pi * np.arange(nodes) / nodes, nodes // 2)
+    return harmonics(angle, nodes // 2) @ np.linalg.inv(at_nodes)
 
 
 class Illumination(NamedTuple):
@@ -318,16 +320,16 @@ class Illumination(NamedTuple):
         """
         flux, count = self.flux[:, None, None], unit.shape[1]
         weight = 1.0 / self.sigma(flux * unit, 1) ** 2
-        both = unit * weight
+        weighted = unit * weight
         together = np.ones((count, count)) if self.shared.cameras is None else self.shared.cameras
-        share = both / (together @ (unit * both))
-        found = np.zeros((len(unit), unit.shape[2]))
+        share = weighted / (together @ (unit * weighted))
+        gain = np.zeros((len(unit), unit.shape[2]))
         for pair, (k, m) in enumerate(zip(*np.triu_indices(count), strict=True)):
             if k == m:
-                found += (weight[:, k] - both[:, k] * share[:, k]) * squares[:, pair]
+                gain += (weight[:, k] - weighted[:, k] * share[:, k]) * squares[:, pair]
             elif together[k, m]:
-                found -= 2.0 * both[:, k] * share[:, m] * squares[:, pair]
-        return self.scale * (self.flux**2) @ found
+                gain -= 2.0 * weighted[:, k] * share[:, m] * squares[:, pair]
+        return self.scale * (self.flux**2) @ gain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -363,21 +365,23 @@ class Polarised(Family):
         return (plate[:, :, None] * _interpolating(polariser, angles)[:, None]).reshape(len(places), -1)
 
     def information(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "r s n n"]:
-        """The matrices at these phases (`could.CandidateExposure`), kept for the next time."""
+        """The matrices at these phases (`available.CandidateExposure`), kept for the next time."""
         new = [place for place in places if place.tobytes() not in self.known]
         if new:
             weights = self._weights(np.stack(new))
-            made = []
+            new_matrices = []
             for unit, slopes in self.counts:
                 matrices = self.light.information(_mixed(weights, unit), _mixed(weights, slopes))
-                made += [matrices] if self.by is None else [t.T @ matrices @ t for t in self.by]
-            self.known.update(zip((place.tobytes() for place in new), np.stack(made, axis=1), strict=True))
+                new_matrices += [matrices] if self.by is None else [t.T @ matrices @ t for t in self.by]
+            self.known.update(
+                zip((place.tobytes() for place in new), np.stack(new_matrices, axis=1), strict=True)
+            )
         return np.stack([self.known[place.tobytes()] for place in places], axis=1)
 
     def turned(self, by: Float[np.ndarray, "b f n"]) -> Polarised:
         """The same exposures."""
-        both = by if self.by is None else np.concatenate([one @ by for one in self.by])
-        return dataclasses.replace(self, by=both, known={})
+        combined = by if self.by is None else np.concatenate([matrix @ by for matrix in self.by])
+        return dataclasses.replace(self, by=combined, known={})
 
     def cost_at(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, " s"]:
         """The cost, which is the same everywhere."""
@@ -395,8 +399,8 @@ class Polarised(Family):
     def gains(self, g: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, ...]:
         """Σ_r tr G_r M_r at even angles: products of derivatives are series of twice the degree of the counts."""
         if self.by is not None:
-            parts = g.reshape(len(self.counts), len(self.by), *g.shape[1:])
-            g = np.einsum("bfn,rbnm,bgm->rfg", self.by, parts, self.by, optimize=True)
+            blocks = g.reshape(len(self.counts), len(self.by), *g.shape[1:])
+            g = np.einsum("bfn,rbnm,bgm->rfg", self.by, blocks, self.by, optimize=True)
         plates, angles = (count // 2 for count in self._nodes)
         low = (2 * angles, 2 * (plates + round(2 * PLATE_TURN / self.choice.turn) * angles))[
             : len(self.orders)
@@ -407,15 +411,15 @@ class Polarised(Family):
             for o, n in zip(self.orders, low, strict=True)
         ]
         total = np.zeros(np.prod([len(f) for f in finer]))
-        for (unit, slopes), one in zip(self.counts, g, strict=True):
-            root = _root(one)
+        for (unit, slopes), matrix in zip(self.counts, g, strict=True):
+            root = _root(matrix)
             for i in range(0, len(unit), _AT_ONCE[len(finer) - 1]):
-                part = slice(i, i + _AT_ONCE[len(finer) - 1])
-                along = np.tensordot(weights, slopes[part] @ root, (1, 1))
+                chunk = slice(i, i + _AT_ONCE[len(finer) - 1])
+                along = np.tensordot(weights, slopes[chunk] @ root, (1, 1))
                 squares = (along @ along.swapaxes(2, 3))[:, :, *np.triu_indices(unit.shape[2])]
                 squares = squares.transpose(1, 2, 0)
-                u = np.tensordot(weights, unit[part], (1, 1)).transpose(1, 2, 0)
-                light = self.light._replace(flux=self.light.flux[part])
+                u = np.tensordot(weights, unit[chunk], (1, 1)).transpose(1, 2, 0)
+                light = self.light._replace(flux=self.light.flux[chunk])
                 total += light.gain(_refined(u, finer), _refined(squares, finer))
         return total.reshape([len(f) for f in finer])
 
@@ -435,20 +439,22 @@ class Polarised(Family):
     def lost(self) -> float:
         """Largest relative error of the gain of all parameters between its angles; or of the counts, if more."""
         places = 2 * np.pi * np.random.default_rng(1).random((_BETWEEN, len(self.orders)))
-        one = dataclasses.replace(self, counts=self.counts[:1], known={})
-        exact = one.information(places)[0]
+        first_draw = dataclasses.replace(self, counts=self.counts[:1], known={})
+        exact = first_draw.information(places)[0]
         size = np.einsum("saa->a", exact) / len(exact)
         weight = np.where(size > 0, 1.0 / np.where(size > 0, size, 1.0), 0.0)
         true = np.einsum("saa,a->s", exact, weight)
-        made = one.gains(np.diag(weight)[None])[None]
+        approximate = first_draw.gains(np.diag(weight)[None])[None]
         for order, angle in zip(self.orders, places.T, strict=True):
             at = _interpolating(angle, 2 * order + 1)
-            made = np.einsum("si,si...->s...", at, np.broadcast_to(made, (len(at), *made.shape[1:])))
+            approximate = np.einsum(
+                "si,si...->s...", at, np.broadcast_to(approximate, (len(at), *approximate.shape[1:]))
+            )
         # The highest harmonic of the counts beside their mean: none where the series holds them.
         unit = self.counts[0][0]
         series = np.abs(np.fft.fft2(unit.reshape(len(unit), *self._nodes, unit.shape[2]), axes=(1, 2)))
         high = [np.take(series, n // 2, i).max() for i, n in enumerate(self._nodes, 1) if n > 3]
-        return float(max(np.abs(made / true - 1.0).max(), *high / series[:, 0, 0].max()))
+        return float(max(np.abs(approximate / true - 1.0).max(), *high / series[:, 0, 0].max()))
 
 
 def _refined(values: Float[np.ndarray, "*f s"], finer: Sequence[np.ndarray]) -> Float[np.ndarray, "*f u"]:
@@ -463,8 +469,8 @@ def _root(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n m"]:
     size = np.sqrt(np.clip(np.diag(matrix), 0.0, None))
     size = np.where(size > 0, size, 1.0)
     value, vector = np.linalg.eigh(matrix / np.outer(size, size))
-    kept = value > _ROUNDING * value[-1]
-    return size[:, None] * vector[:, kept] * np.sqrt(value[kept])
+    significant = value > _ROUNDING * value[-1]
+    return size[:, None] * vector[:, significant] * np.sqrt(value[significant])
 
 
 def _mixed(
@@ -477,8 +483,10 @@ def information_of(
     known: Calibration, names: Sequence[str], effects: Iterable[str] = ()
 ) -> Float[np.ndarray, "f f"]:
     """Information of a calibration on parameters by name; none on those that it has not, nor on those of `effects`."""
-    both = [i for i, name in enumerate(names) if name in known.model.names and not _effect_of(name, effects)]
-    there = [known.model.index(names[i]) for i in both]
-    whole = np.zeros((len(names), len(names)))
-    whole[np.ix_(both, both)] = pseudo_inverse(known.covariance[np.ix_(there, there)], 1e-12)
-    return whole
+    shared = [
+        i for i, name in enumerate(names) if name in known.model.names and not _effect_of(name, effects)
+    ]
+    columns = [known.model.index(names[i]) for i in shared]
+    information = np.zeros((len(names), len(names)))
+    information[np.ix_(shared, shared)] = pseudo_inverse(known.covariance[np.ix_(columns, columns)], 1e-12)
+    return information

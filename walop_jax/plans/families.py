@@ -128,10 +128,10 @@ def highest(values: Float[np.ndarray, ...], most: int) -> tuple[Float[np.ndarray
     at = np.ix_(*(w.astype(int) % n for w, n in zip(waves, counts, strict=True)))
 
     def finer(series: Complex[np.ndarray, ...]) -> Float[np.ndarray, ...]:
-        whole = np.zeros(counts, complex)
-        whole[at] = series
-        half = whole[..., : counts[-1] // 2 + 1]
-        return np.asarray(fft.irfftn(half, counts)) * whole.size
+        padded = np.zeros(counts, complex)
+        padded[at] = series
+        half = padded[..., : counts[-1] // 2 + 1]
+        return np.asarray(fft.irfftn(half, counts)) * padded.size
 
     fine = finer(series)
     widest = 1 / np.prod([np.cos(np.pi * o / n) for o, n in zip(orders, counts, strict=True)])

@@ -98,8 +98,8 @@ class Experiment:
 
     def of_one(self, shares: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "r k"]:
         """Multipliers with sum 1 in each group."""
-        whole = shares.reshape(len(shares) // self.together, -1).sum(axis=1)
-        return shares / np.repeat(whole, self.together)[:, None]
+        total = shares.reshape(len(shares) // self.together, -1).sum(axis=1)
+        return shares / np.repeat(total, self.together)[:, None]
 
     def reduced(self) -> Experiment:
         """The same in coordinates in which the information of everything together is the identity.
@@ -109,29 +109,29 @@ class Experiment:
         shares = [
             self.budget / len(self.families) / family.cost_at(family.spread()) for family in self.families
         ]
-        whole = self.known.mean(axis=0) + sum(
+        total = self.known.mean(axis=0) + sum(
             np.tensordot(w / len(w), f.information(f.spread()).mean(axis=0), (0, 0))
             for w, f in zip(shares, self.families, strict=True)
         )
-        size = np.sqrt(np.clip(np.diag(whole), 0.0, None))
+        size = np.sqrt(np.clip(np.diag(total), 0.0, None))
         size = np.where(size > 0, size, 1.0)
-        value, vector = linalg.eigh(whole / np.outer(size, size))
-        seen = value > _UNSEEN * value[-1]
-        to_seen = vector[:, seen] / size[:, None] / np.sqrt(value[seen])  # θ = to_seen · z
-        lost = np.einsum("na,rknq->rkaq", vector[:, ~seen] / size[:, None], self.targets)
-        kept = np.einsum("na,rknq->rkaq", to_seen, self.targets)
+        value, vector = linalg.eigh(total / np.outer(size, size))
+        informed = value > _UNSEEN * value[-1]
+        to_seen = vector[:, informed] / size[:, None] / np.sqrt(value[informed])  # θ = to_seen · z
+        lost = np.einsum("na,rknq->rkaq", vector[:, ~informed] / size[:, None], self.targets)
+        visible = np.einsum("na,rknq->rkaq", to_seen, self.targets)
         # A target is estimable if it has no part along what is not seen, beside its part along what is.
-        part = np.linalg.norm(lost, axis=(2, 3)) if lost.shape[2] else np.zeros(lost.shape[:2])
-        if np.any(part > 1e-6 * np.linalg.norm(kept, axis=(2, 3))):
-            bad = np.unique(np.argwhere(part > 1e-6 * np.linalg.norm(kept, axis=(2, 3)))[:, 1])
+        lost_share = np.linalg.norm(lost, axis=(2, 3)) if lost.shape[2] else np.zeros(lost.shape[:2])
+        if np.any(lost_share > 1e-6 * np.linalg.norm(visible, axis=(2, 3))):
+            bad = np.unique(np.argwhere(lost_share > 1e-6 * np.linalg.norm(visible, axis=(2, 3)))[:, 1])
             raise NotEstimableError(
                 f"targets {', '.join(map(str, bad[:5].tolist()))} depend on parameters that no candidate informs about"
             )
 
         families = tuple(family.turned(to_seen[None]) for family in self.families)
         # What a few candidates leave open is known to next to nothing instead: no target needs it, or it is found bad.
-        known = to_seen.T @ self.known @ to_seen + _NOTHING * np.eye(int(seen.sum()))
-        return Experiment(known, kept, families, self.budget, self.together)
+        prior = to_seen.T @ self.known @ to_seen + _NOTHING * np.eye(int(informed.sum()))
+        return Experiment(prior, visible, families, self.budget, self.together)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,8 +202,8 @@ class _Some:
     def information(self, weight: Float[np.ndarray, " s"]) -> Float[np.ndarray, "r n n"]:
         """M(w) of every draw."""
         r, s, n, _ = self.matrices.shape
-        there = self.experiment.known + (weight @ self.matrices.reshape(r, s, -1)).reshape(r, n, n)
-        return 0.5 * (there + np.swapaxes(there, 1, 2))
+        information = self.experiment.known + (weight @ self.matrices.reshape(r, s, -1)).reshape(r, n, n)
+        return 0.5 * (information + np.swapaxes(information, 1, 2))
 
     def covariance(self, weight: Float[np.ndarray, " s"]) -> Float[np.ndarray, "r n n"]:
         """M(w)⁻¹ of every draw."""
@@ -221,11 +221,11 @@ class _Some:
     def gains(self, y: Float[np.ndarray, "r n kq"]) -> Float[np.ndarray, "r s k"]:
         """−∂φ/∂w: tr y_kᵀ M_s y_k of every target and candidate, y = M⁻¹ A."""
         (k, q), (r, s, n, _) = self.per_target, self.matrices.shape
-        found = np.empty((r, s, k))
-        for one, matrices, into in zip(y, self.matrices, found, strict=True):
-            each = one.reshape(n, k, q).transpose(1, 0, 2)
-            into[:] = matrices.reshape(s, -1) @ (each @ each.swapaxes(1, 2)).reshape(k, -1).T
-        return found
+        gains = np.empty((r, s, k))
+        for columns, matrices, into in zip(y, self.matrices, gains, strict=True):
+            by_target = columns.reshape(n, k, q).transpose(1, 0, 2)
+            into[:] = matrices.reshape(s, -1) @ (by_target @ by_target.swapaxes(1, 2)).reshape(k, -1).T
+        return gains
 
     def value(self, weight: Float[np.ndarray, " s"]) -> float:
         """The criterion f(w)."""
@@ -242,17 +242,17 @@ class _Some:
         weight = np.maximum(weight, 1e-3 * self.experiment.budget / self.costs.sum())
         weight *= self.experiment.budget / (self.costs @ weight)
         phi = self.variances(self.covariance(weight))
-        seen = np.zeros(phi.shape)
+        peak = np.zeros(phi.shape)
         while True:
-            seen = np.maximum(seen, self.experiment.relative(phi))
-            near = _nearest(seen)
+            peak = np.maximum(peak, self.experiment.relative(phi))
+            near = _nearest(peak)
             weight, shares = self._of_targets(near)._solved(weight, gap)
             phi = self.variances(self.covariance(weight))
             top = self.experiment.largest(np.take_along_axis(phi, near, axis=1))
             if np.all(self.experiment.largest(phi) <= (1.0 + 0.1 * gap) * top):
-                whole = np.zeros(phi.shape)
-                np.put_along_axis(whole, near, shares, axis=1)
-                return weight, whole
+                multipliers = np.zeros(phi.shape)
+                np.put_along_axis(multipliers, near, shares, axis=1)
+                return weight, multipliers
 
     def worst(self, phi: Float[np.ndarray, "r k"]) -> _Some:
         """The same for the targets with the largest variances: whose value bounds that of all from below."""
@@ -260,12 +260,12 @@ class _Some:
 
     def _of_targets(self, near: Int[np.ndarray, "r l"]) -> _Some:
         """The same for some of the targets of each draw."""
-        other = copy.copy(self)
+        subset = copy.copy(self)
         r, _, n, q = self.experiment.targets.shape
-        some = np.take_along_axis(self.wide.reshape(r, n, -1, q), near[:, None, :, None], axis=2)
-        other.wide = some.reshape(r, n, -1)
-        other.per_target = (near.shape[1], q)
-        return other
+        columns = np.take_along_axis(self.wide.reshape(r, n, -1, q), near[:, None, :, None], axis=2)
+        subset.wide = columns.reshape(r, n, -1)
+        subset.per_target = (near.shape[1], q)
+        return subset
 
     def _solved(
         self, weight: Float[np.ndarray, " s"], gap: float
@@ -306,7 +306,7 @@ class _Some:
     ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " g"]]:
         """Newton's method for one μ, until its decrement is `enough` of μ."""
         s, r = len(weight), len(level)
-        some = slice(None, None, -(-len(self.wide) // _BENT))
+        sample = slice(None, None, -(-len(self.wide) // _BENT))
 
         def grouped(values: Float[np.ndarray, "*d"]) -> Float[np.ndarray, "*g"]:
             return values.reshape(r, -1, *values.shape[1:]).sum(axis=1)
@@ -319,11 +319,13 @@ class _Some:
             push = mu / slack
             # Curvature of the φ: Σ_k push_k 2 tr(M_s P M_t Q), P = M⁻¹, Q = Σ_k push_k y_k y_kᵀ. Its main part in some
             # of the draws, which are much alike, is enough to step by.
-            pushed = y[some] * np.repeat(push[some], self.per_target[1], axis=1)[:, None]
-            left = np.linalg.inv(np.linalg.cholesky(self.information(weight)[some]))
-            right = root_of(pushed @ np.swapaxes(y[some], 1, 2), _MAIN)
-            flat = np.moveaxis(left[:, None] @ (self.matrices[some] @ right[:, None]), 1, 0).reshape(s, -1)
-            alike = push.sum() / push[some].sum()
+            pushed = y[sample] * np.repeat(push[sample], self.per_target[1], axis=1)[:, None]
+            inverse_root = np.linalg.inv(np.linalg.cholesky(self.information(weight)[sample]))
+            right = root_of(pushed @ np.swapaxes(y[sample], 1, 2), _MAIN)
+            flat = np.moveaxis(
+                inverse_root[:, None] @ (self.matrices[sample] @ right[:, None]), 1, 0
+            ).reshape(s, -1)
+            alike = push.sum() / push[sample].sum()
             hessian = np.zeros((s + r, s + r))
             gradient = np.zeros(s + r)
             gradient[:s] = np.einsum("rk,rsk->s", push, slope) - mu / weight
@@ -336,11 +338,11 @@ class _Some:
             hessian[s:, s:] += np.diag(grouped(stiff.sum(axis=1)))
             step = _on_the_budget(hessian, gradient, np.append(self.costs, np.zeros(r)))
             decrement = float(-gradient @ step)
-            here, length = self._barrier(weight, level, mu), 1.0
+            current, length = self._barrier(weight, level, mu), 1.0
             while length > 1e-10:
                 new = weight + length * step[:s], level + length * step[s:]
-                there = self._barrier(*new, mu)
-                if there <= here - 0.1 * length * decrement:
+                trial = self._barrier(*new, mu)
+                if trial <= current - 0.1 * length * decrement:
                     break
                 length *= 0.5
             else:
@@ -359,8 +361,8 @@ def _side_by_side(targets: Float[np.ndarray, "r k n q"]) -> Float[np.ndarray, "r
 
 def _nearest(relative: Float[np.ndarray, "r k"]) -> Int[np.ndarray, "r l"]:
     """Numbers of the targets that come near the largest, as many in each draw."""
-    most = int((relative >= _NEAR).sum(axis=1).max())
-    return np.argsort(-relative, axis=1)[:, :most]
+    count = int((relative >= _NEAR).sum(axis=1).max())
+    return np.argsort(-relative, axis=1)[:, :count]
 
 
 def _on_the_budget(
@@ -394,13 +396,13 @@ def optimise(
 def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | None = None) -> Allocation:
     """As `optimise`, for a problem in the coordinates of `Experiment.reduced`."""
     chosen = [(number, place) for number, f in enumerate(problem.families) for place in f.spread()]
-    some = _Some(problem, chosen)
-    weight = np.full(len(chosen), problem.budget / some.costs.sum())
+    active_problem = _Some(problem, chosen)
+    weight = np.full(len(chosen), problem.budget / active_problem.costs.sum())
     best_bound, best, plan, idle, accuracy = 0.0, None, None, 0, 0.2
     for turn in range(1, _ROUNDS + 1):
-        weight, shares = some.solve(weight, accuracy)
-        value = some.value(weight)
-        proof = lower_bound(problem, some.covariance(weight), shares)
+        weight, shares = active_problem.solve(weight, accuracy)
+        value = active_problem.value(weight)
+        proof = lower_bound(problem, active_problem.covariance(weight), shares)
         bound = proof.value(problem.budget)
         best = proof if best is None or bound > best_bound else best
         better = (
@@ -409,7 +411,7 @@ def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | Non
         idle = 0 if better else idle + 1
         best_bound = max(best_bound, bound)
         least = _LEAST_WEIGHT * problem.budget
-        plan = _plan(some, weight, least, value, best_bound, best, turn)
+        plan = _plan(active_problem, weight, least, value, best_bound, best, turn)
         if progress is not None:
             progress(
                 f"round {turn}: criterion {value:.6g}, bound {best_bound:.6g}, gap {100 * plan.gap:.2g} %"
@@ -417,16 +419,16 @@ def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | Non
         exact = accuracy <= 0.5 * gap
         if plan.gap <= gap or (exact and idle >= _PATIENCE):
             break
-        used = weight * some.costs > least
-        kept = [c for c, keep in zip(some.chosen, used, strict=True) if keep]
-        new = [top for top in proof.tops if not any(_same(top, there) for there in kept)]
+        used = weight * active_problem.costs > least
+        active = [c for c, keep in zip(active_problem.chosen, used, strict=True) if keep]
+        new = [top for top in proof.tops if not any(_same(top, candidate) for candidate in active)]
         if exact and not new and turn > 3:
             break
         # Far from the end candidates matter, not their exact weights.
         accuracy = 0.5 * gap if idle or not new else max(0.5 * gap, min(accuracy, 0.3 * plan.gap))
         share = 0.05 * problem.budget / max(len(new), 1)
-        some = _Some(problem, [*kept, *new])
-        weight = np.concatenate([0.95 * weight[used], share / some.costs[len(kept) :]])
+        active_problem = _Some(problem, [*active, *new])
+        weight = np.concatenate([0.95 * weight[used], share / active_problem.costs[len(active) :]])
     assert plan is not None
     return plan
 
@@ -465,14 +467,14 @@ def lower_bound(
     shared = y * np.repeat(shares, experiment.targets.shape[3], axis=1)[:, None]
     g = shared @ y.swapaxes(1, 2)
     groups = len(g) // experiment.together
-    here = float((shared * wide).sum()) / groups
-    known = float((g * experiment.known).sum()) / groups
+    trace = float((shared * wide).sum()) / groups
+    prior = float((g * experiment.known).sum()) / groups
     tops, ratio = [], 0.0
     for number, family in enumerate(experiment.families):
         places, largest = family.best(g / groups, _TOPS)
         ratio = max(ratio, largest)
         tops += [(number, place) for place in places]
-    return Bound(here, known, ratio, tuple(tops))
+    return Bound(trace, prior, ratio, tuple(tops))
 
 
 def least_budget(experiment: Experiment, value: float, *, gap: float = GAP) -> tuple[Allocation, float]:
@@ -510,23 +512,23 @@ def rounded(experiment: Experiment, plan: Allocation) -> Allocation:
     and NotEstimableError for one that does not pay for all that the targets need.
     """
     problem = experiment.reduced()
-    some = _Some(problem, list(zip(plan.family.tolist(), plan.place, strict=True)))
-    if some.costs.min() > problem.budget:
+    chosen = _Some(problem, list(zip(plan.family.tolist(), plan.place, strict=True)))
+    if chosen.costs.min() > problem.budget:
         raise ValueError(
-            f"the budget, {problem.budget:g}, is less than the cheapest candidate costs: {some.costs.min():g}"
+            f"the budget, {problem.budget:g}, is less than the cheapest candidate costs: {chosen.costs.min():g}"
         )
     count = np.floor(plan.weight + 1e-9)
-    count = _filled(some, count, plan.weight)
-    if some.value(count) > _HOPELESS * plan.value:
+    count = _filled(chosen, count, plan.weight)
+    if chosen.value(count) > _HOPELESS * plan.value:
         raise NotEstimableError(
             f"the budget, {problem.budget:g}, pays for {count.sum():.0f} of the candidates, which do not determine all "
             "targets: raise it"
         )
     for _ in range(_EXCHANGES):
-        some, count, better = _exchanged(some, count)
+        chosen, count, better = _exchanged(chosen, count)
         if not better:
             break
-    return _plan(some, count, 0.0, some.value(count), plan.bound, plan.proof, plan.rounds)
+    return _plan(chosen, count, 0.0, chosen.value(count), plan.bound, plan.proof, plan.rounds)
 
 
 def worth(
@@ -534,11 +536,11 @@ def worth(
 ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
     """The criterion without each candidate of a plan, and with one more of it, over that of the plan."""
     problem = experiment.reduced()
-    some = _Some(problem, list(zip(plan.family.tolist(), plan.place, strict=True)))
-    here, each = some.value(plan.weight), np.eye(len(plan.weight))
-    without = [some.value(plan.weight * (1.0 - one)) for one in each]
-    more = [some.value(plan.weight + one) for one in each]
-    return np.array(without) / here, np.array(more) / here
+    chosen = _Some(problem, list(zip(plan.family.tolist(), plan.place, strict=True)))
+    value, units = chosen.value(plan.weight), np.eye(len(plan.weight))
+    without = [chosen.value(plan.weight * (1.0 - unit)) for unit in units]
+    added = [chosen.value(plan.weight + unit) for unit in units]
+    return np.array(without) / value, np.array(added) / value
 
 
 def _filled(
@@ -546,36 +548,36 @@ def _filled(
 ) -> Float[np.ndarray, " s"]:
     """Spend what is left of the budget, one candidate at a time."""
     while True:
-        left = some.experiment.budget - some.costs @ count
-        can = np.flatnonzero(some.costs <= left * (1 + 1e-9))
+        remaining = some.experiment.budget - some.costs @ count
+        can = np.flatnonzero(some.costs <= remaining * (1 + 1e-9))
         if not len(can):
             return count
         # A plan that is not whole yet may not determine everything: a thousandth of the weights stands in for the rest.
         base = count + 1e-3 * weight
         phi = some.variances(some.covariance(base))
-        here, near = float(some.experiment.largest(phi).mean()), some.worst(phi)
-        gain = [(here - near.value(base + (np.arange(len(count)) == i))) / some.costs[i] for i in can]
+        value, near = float(some.experiment.largest(phi).mean()), some.worst(phi)
+        gain = [(value - near.value(base + (np.arange(len(count)) == i))) / some.costs[i] for i in can]
         count = count + (np.arange(len(count)) == can[int(np.argmax(gain))])
 
 
 def _exchanged(some: _Some, count: Float[np.ndarray, " s"]) -> tuple[_Some, Float[np.ndarray, " _"], bool]:
     """One exchange that lowers the criterion, if there is one: the most promising by their slopes are tried."""
-    problem, here = some.experiment, some.value(count)
+    problem, value = some.experiment, some.value(count)
     covariance = some.covariance(count)
     phi = some.variances(covariance)
     # The worst targets, smoothly: the slope of the maximum alone would forget the next one.
     shares = problem.of_one(problem.relative(phi) ** _SHARPNESS)
     promising = lower_bound(problem, covariance, shares).tops
-    new = [top for top in promising if not any(_same(top, there) for there in some.chosen)]
-    kept = np.flatnonzero(count)
-    some = _Some(problem, [*(some.chosen[i] for i in kept), *new])
-    count = np.concatenate([count[kept], np.zeros(len(new))])
+    new = [top for top in promising if not any(_same(top, candidate) for candidate in some.chosen)]
+    used = np.flatnonzero(count)
+    some = _Some(problem, [*(some.chosen[i] for i in used), *new])
+    count = np.concatenate([count[used], np.zeros(len(new))])
     y = covariance @ some.wide
     slope = np.einsum("rsk,rk->s", some.gains(y), shares)
     worst = some.worst(phi)
-    left = problem.budget - some.costs @ count
-    out, into = np.meshgrid(np.arange(len(kept)), np.arange(len(count)), indexing="ij")
-    fits = (some.costs[into] - some.costs[out] <= left * (1 + 1e-9)) & (out != into)
+    remaining = problem.budget - some.costs @ count
+    out, into = np.meshgrid(np.arange(len(used)), np.arange(len(count)), indexing="ij")
+    fits = (some.costs[into] - some.costs[out] <= remaining * (1 + 1e-9)) & (out != into)
     promise = np.where(fits, slope[into] - slope[out], -np.inf)
     for flat in np.argsort(-promise, axis=None)[:_TRIED]:
         i, j = np.unravel_index(flat, promise.shape)
@@ -584,7 +586,7 @@ def _exchanged(some: _Some, count: Float[np.ndarray, " s"]) -> tuple[_Some, Floa
         changed = count.copy()
         changed[i] -= 1
         changed[j] += 1
-        least = here * (1 - 1e-9)
+        least = value * (1 - 1e-9)
         if worst.value(changed) < least and some.value(changed) < least:
             return some, changed, True
     return some, count, False

@@ -1,8 +1,7 @@
 """A plan of calibration exposures: which, how often, in what order, what it achieves, how far from the best it is.
 
-The best weights and their proof are those of `optimal`, candidates those of `exposures`, what is asked that of
-`wanted`. Here they become whole exposures in an order with few changes, with the gain of each and the price of leaving
-it out.
+Here the best weights (`optimal`) of candidates (`exposures`) for a criterion (`criteria`) become whole exposures in an
+order with few changes, with the gain of each and the price of leaving it out.
 
 Plate        Where it may stand at any angle the bound holds for all of them; exposures are taken at few, those that the
              best weights use most, as many as are worth their changes.
@@ -28,7 +27,17 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind
-from walop_jax.plans.could import Could, separation
+from walop_jax.plans.available import Available, separation
+from walop_jax.plans.criteria import (
+    APART,
+    NAMED,
+    WORST,
+    Criterion,
+    FieldErrors,
+    check_wishes,
+    criterion_by_name,
+    field_errors,
+)
 from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
 from walop_jax.plans.optimal import (
     GAP,
@@ -39,16 +48,6 @@ from walop_jax.plans.optimal import (
     optimise,
     rounded,
     worth,
-)
-from walop_jax.plans.wanted import (
-    APART,
-    NAMED,
-    WORST,
-    FieldErrors,
-    Wanted,
-    check_wishes,
-    field_errors,
-    wanted,
 )
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 
@@ -103,8 +102,8 @@ class PlannedExposure:
 class ExposurePlan(Displayed):
     """The exposures of a budget, the proof, and the error of p over the field before and after.
 
-    `value` is the criterion of the exposures, `bound` what no plan of the same time can undercut, both as `wanted`
-    tells them (% for errors of p). `needed` are the minutes in which the best plan reaches `goal`, and those in which
+    `value` is the criterion of the exposures, `bound` what no plan of the same time can undercut, both as `criteria`
+    reports them (% for errors of p). `needed` are the minutes in which the best plan reaches `goal`, and those in which
     none can.
     `before` and `after` (draw, point) are errors of p (fraction) at `x`, `y` (deg), NaN where one exposure holds no u.
     `beside` are other plans of the same time: their criterion, told likewise; `notes` what had to be left out, and
@@ -114,7 +113,7 @@ class ExposurePlan(Displayed):
 
     minutes: float
     lines: tuple[PlannedExposure, ...]
-    wanted: Wanted
+    criterion: Criterion
     value: float
     bound: float
     weights_gap: float
@@ -133,13 +132,13 @@ class ExposurePlan(Displayed):
     @property
     def gap(self) -> float:
         """Proven relative distance of the exposures' variance from the best: that of the criterion of `optimal`."""
-        return self.wanted.variance(self.value) / self.wanted.variance(self.bound) - 1.0
+        return self.criterion.variance(self.value) / self.criterion.variance(self.bound) - 1.0
 
     @property
     def share(self) -> float | None:
         """Share of the field points and colours, of those that hold u, at which the error of p is below 0.1 %."""
-        seen = self.after[:, np.isfinite(self.after).all(axis=0)]
-        return float(np.mean(seen < GOAL)) if seen.size else None
+        errors = self.after[:, np.isfinite(self.after).all(axis=0)]
+        return float(np.mean(errors < GOAL)) if errors.size else None
 
     @property
     def seconds(self) -> float:
@@ -148,15 +147,15 @@ class ExposurePlan(Displayed):
 
     def document(self) -> dict[str, Any]:
         """The plan as plain data."""
-        found: dict[str, Any] = {
+        document: dict[str, Any] = {
             "minutes": self.minutes,
             "seconds": self.seconds,
             "exposures": [
                 dataclasses.asdict(line) | {"positions": dict(line.positions)} for line in self.lines
             ],
-            "criterion": self.wanted.name,
-            "what": self.wanted.what,
-            "unit": self.wanted.unit,
+            "criterion": self.criterion.name,
+            "what": self.criterion.what,
+            "unit": self.criterion.unit,
             "value": self.value,
             "bound": self.bound,
             "gap": self.gap,
@@ -173,27 +172,29 @@ class ExposurePlan(Displayed):
             "notes": list(self.notes),
             "plan": self.observing_plan.document(),
         }
-        if self.wanted.name == WORST:
-            found |= {"p_error_worst": 0.01 * self.value, "p_error_bound": 0.01 * self.bound}
+        if self.criterion.name == WORST:
+            document |= {"p_error_worst": 0.01 * self.value, "p_error_bound": 0.01 * self.bound}
         if len(self.x):
             before, after = np.median(self.before, axis=0), np.median(self.after, axis=0)
-            found["field"] = {
+            document["field"] = {
                 "x": self.x.tolist(), "y": self.y.tolist(), "p_error": after.tolist(), "before": before.tolist()
             }  # fmt: skip
-        return found
+        return document
 
     def display(self) -> Display:
         """The exposures in order, and how good they are."""
-        unit = f" {self.wanted.unit}" if self.wanted.unit else ""
-        better = "above" if self.wanted.inverse else "below"
+        unit = f" {self.criterion.unit}" if self.criterion.unit else ""
+        better = "above" if self.criterion.inverse else "below"
         facts = {
             "time": f"{self.seconds / 60:.1f} of {self.minutes:g} min",
-            self.wanted.what: f"{digits(self.value, '.3g')}{unit}",
+            self.criterion.what: f"{digits(self.value, '.3g')}{unit}",
             "proof": f"no plan of this time gets {better} {digits(self.bound, '.3g')}{unit}",
         }
         if self.share is not None:
-            seen = np.isfinite(self.after).all(axis=0)
-            without, middle = (100.0 * np.median(errors[:, seen]) for errors in (self.before, self.after))
+            measurable = np.isfinite(self.after).all(axis=0)
+            without, middle = (
+                100.0 * np.median(errors[:, measurable]) for errors in (self.before, self.after)
+            )
             facts["over the field"] = (
                 f"error of p {middle:.3g} % in the median ({without:.3g} % without them), below 0.1 % in "
                 f"{100 * self.share:.0f} % of the field where one exposure measures u"
@@ -203,11 +204,11 @@ class ExposurePlan(Displayed):
                 f"{digits(self.needed[0], '.3g')} min, not counting changes; no plan needs less than "
                 f"{digits(self.needed[1], '.3g')} min"
             )
-        own = self.wanted.variance(self.value)
-        for name, told in self.beside.items():
-            factor = self.wanted.variance(told) / own
+        variance_of_plan = self.criterion.variance(self.value)
+        for name, other_value in self.beside.items():
+            factor = self.criterion.variance(other_value) / variance_of_plan
             variance = "the same variance" if f"{factor:.2g}" == "1" else f"{factor:.2g} times the variance"
-            facts[name] = f"{digits(told, '.3g')}{unit}; {variance}"
+            facts[name] = f"{digits(other_value, '.3g')}{unit}; {variance}"
         rows = tuple(
             (
                 line.kind
@@ -236,7 +237,7 @@ def _angle(angle: float | None) -> str:
 
 
 def plan_exposures(
-    could: Could | ObservingPlan,
+    available: Available | ObservingPlan,
     minutes: float,
     *,
     criterion: str | InputTable = WORST,
@@ -249,10 +250,10 @@ def plan_exposures(
     catalogue: Sequence[EffectKind] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> ExposurePlan:
-    """The calibration exposures of `minutes` that make a criterion (`wanted`) best.
+    """The calibration exposures of `minutes` that make a criterion (`criteria`) best.
 
     `known` is a calibration that is there already; `goal` a value of the criterion, as it is told, to which the time
-    is found. `apart` are effects that are to be told apart (`wanted.APART`), each with its value or by name alone, of
+    is found. `apart` are effects that are to be told apart (`criteria.APART`), each with its value or by name alone, of
     the `catalogue`; their goal is `NAMED` unless another is given. Raises ValueError as `check_wishes` and for a time
     that pays for nothing, NotEstimableError where nothing that could be observed, or too little in that time,
     determines what is asked.
@@ -260,8 +261,8 @@ def plan_exposures(
     check_wishes(minutes, goal, draws)
     if apart:
         criterion, goal = APART, NAMED if goal is None else goal
-    found = candidates(
-        Could.of(could),
+    choices = candidates(
+        Available.of(available),
         draws=draws,
         seed=seed,
         around=known,
@@ -270,13 +271,13 @@ def plan_exposures(
         progress=progress,
     )
     if progress is not None:
-        progress("what is wanted")
-    field = None if apart or len(found.model.template.cameras.pairs) != 2 else field_errors(found)
+        progress("criterion")
+    field = None if apart or len(choices.model.template.cameras.pairs) != 2 else field_errors(choices)
     if field is None and criterion in ("worst", "mean"):
-        field = field_errors(found)  # raises, with advice
+        field = field_errors(choices)  # raises, with advice
     return plan_from(
-        found, minutes, wanted(found, field, criterion), field,
-        known=None if known is None else information_of(known, found.names, found.effects),
+        choices, minutes, criterion_by_name(choices, field, criterion), field,
+        known=None if known is None else information_of(known, choices.names, choices.effects),
         goal=goal, gap=gap, progress=progress,
     )  # fmt: skip
 
@@ -284,7 +285,7 @@ def plan_exposures(
 def plan_from(
     found: Candidates,
     minutes: float,
-    want: Wanted,
+    criterion: Criterion,
     field: FieldErrors | None = None,
     *,
     known: Float[np.ndarray, "f f"] | None = None,
@@ -295,39 +296,39 @@ def plan_from(
     """As `plan_exposures`, from candidates that are there; `known` is the information of what was measured before."""
     tell = progress or (lambda text: None)
     check_wishes(minutes, goal)
-    shortest = min(choice.seconds + found.could.costs.of(choice.kind) for choice in found.choices)
+    shortest = min(choice.seconds + found.available.costs.of(choice.kind) for choice in found.choices)
     if 60.0 * minutes < shortest:
         raise ValueError(
             f"{minutes:g} minutes do not pay for a single exposure: the shortest takes {shortest / 60:.2g}, with "
             "read-out or pointing"
         )
     tell("looking for the best plan")
-    whole = experiment_of(found, minutes, want, known)
+    problem = experiment_of(found, minutes, criterion, known)
     try:
-        weights = optimise(whole, gap=0.5 * gap, progress=tell)
-        if weights.proof.ratio * whole.budget < _NOTHING * weights.proof.known:
+        weights = optimise(problem, gap=0.5 * gap, progress=tell)
+        if weights.proof.ratio * problem.budget < _NOTHING * weights.proof.known:
             raise NotEstimableError
     except NotEstimableError:
         missing = [k for k in ("moon", "standard") if not any(c.kind == k for c in found.choices)]
         advice = f"; no {' or '.join(missing)} exposures could be taken" if missing else ""
-        said = f"{want.what}: nothing that could be observed says more of it than is known"
-        raise NotEstimableError("; ".join((f"{said}{advice}", *found.notes))) from None
-    best, lines, some, experiment = _at_few_angles(
-        found, weights, lambda part: experiment_of(part, minutes, want, known), gap
+        reason = f"{criterion.what}: nothing that could be observed says more of it than is known"
+        raise NotEstimableError("; ".join((f"{reason}{advice}", *found.notes))) from None
+    best, lines, chosen, experiment = _at_few_angles(
+        found, weights, lambda part: experiment_of(part, minutes, criterion, known), gap
     )
     needed, endless = None, ()
     if goal is not None:
         tell("how long the goal takes")
         try:
-            cheapest, least = least_budget(whole, want.variance(goal), gap=gap)
-            needed = (_cost(whole, cheapest.weights) / 60.0, least / 60.0)
+            cheapest, least = least_budget(problem, criterion.variance(goal), gap=gap)
+            needed = (_cost(problem, cheapest.weights) / 60.0, least / 60.0)
         except NotEstimableError:
-            said = f"no time reaches {digits(goal, '.3g')} {want.unit}"
-            endless = (f"{want.what}: {said}; add other settings to what could be observed",)
+            reason = f"no time reaches {digits(goal, '.3g')} {criterion.unit}"
+            endless = (f"{criterion.what}: {reason}; add other settings to what could be observed",)
     total = experiment.known + information_of_weights(experiment, best.weights)[0]
     plan = dataclasses.replace(
-        some.could.plan,
-        stops=tuple(some.choices[line.choice].stop(line.place, line.times) for line in lines),
+        chosen.available.plan,
+        stops=tuple(chosen.choices[line.choice].stop(line.place, line.times) for line in lines),
         patches=(),
         stars=(),
     )
@@ -335,10 +336,10 @@ def plan_from(
     unseen = () if known is not None else tuple(map(str, about_exposures(plan.exposures())))
     return ExposurePlan(
         minutes=minutes,
-        lines=tuple(_described(some, experiment, lines, best)),
-        wanted=want,
-        value=want.told(best.value),
-        bound=want.told(weights.bound),
+        lines=tuple(_described(chosen, experiment, lines, best)),
+        criterion=criterion,
+        value=criterion.reported(best.value),
+        bound=criterion.reported(weights.bound),
         weights_gap=weights.gap,
         truncation=found.truncation,
         goal=goal,
@@ -347,10 +348,10 @@ def plan_from(
         y=np.zeros(0) if field is None else field.y,
         before=_errors(found, field, covariance(experiment.known)),
         after=_errors(found, field, covariance(total)),
-        beside=dict(_beside(found, whole, want)),
+        beside=dict(_beside(found, problem, criterion)),
         observing_plan=plan,
         notes=(*found.notes, *endless, *unseen),
-        any_plate=found.could.any_plate,
+        any_plate=found.available.any_plate,
     )
 
 
@@ -359,20 +360,20 @@ Weights = Mapping[tuple[int, tuple[float, ...]], float]
 
 
 def experiment_of(
-    found: Candidates, minutes: float, want: Wanted, known: Float[np.ndarray, "f f"] | None = None
+    found: Candidates, minutes: float, criterion: Criterion, prior: Float[np.ndarray, "f f"] | None = None
 ) -> Experiment:
     """The problem of a budget in minutes; `known` is added to what is known beforehand."""
-    before = found.prior if known is None else found.prior + known
-    families, pairs, budget = found.families, want.blocks, 60.0 * minutes
+    before = found.prior if prior is None else found.prior + prior
+    families, pairs, budget = found.families, criterion.blocks, 60.0 * minutes
     if pairs is None:
-        known = np.broadcast_to(before, (len(want.targets), *before.shape)).copy()
-        return Experiment(known, want.targets, families, budget)
+        prior = np.broadcast_to(before, (len(criterion.targets), *before.shape)).copy()
+        return Experiment(prior, criterion.targets, families, budget)
 
     families = tuple(family.turned(pairs) for family in families)
     # Where a rival has fewer parameters than another the rest are known.
     idle = np.stack([np.diag(1.0 * ~pair.any(axis=0)) for pair in pairs])
-    known = pairs.swapaxes(1, 2) @ before @ pairs + idle
-    return Experiment(np.tile(known, (len(found.values), 1, 1)), want.targets, families, budget, len(pairs))
+    prior = np.tile(pairs.swapaxes(1, 2) @ before @ pairs + idle, (len(found.values), 1, 1))
+    return Experiment(prior, criterion.targets, families, budget, len(pairs))
 
 
 def _errors(
@@ -403,26 +404,26 @@ def _at_few_angles(
             near = [a for a in angles if abs((a - angle + 90.0) % 180.0 - 90.0) < _ALIKE]
             angles[near[0] if near else angle] = angles.get(near[0] if near else angle, 0.0) + weight
     order = sorted(angles, key=lambda a: -angles[a])
-    best, said = None, None
+    best, failure = None, None
     for count in range(len(order) + 1):
         if best is not None and best[0].value <= weights.bound * (1 + gap):
             break  # no other angle can be worth more than this
-        some = found.with_plate(order[:count])
-        if not some.choices:
+        chosen = found.with_plate(order[:count])
+        if not chosen.choices:
             continue
-        part = experiment(some)
+        problem = experiment(chosen)
         try:
-            one = _whole(some, part, optimise(part, gap=0.5 * gap) if free else weights)
+            trial = _whole(chosen, problem, optimise(problem, gap=0.5 * gap) if free else weights)
         except ValueError as error:
-            said = error
+            failure = error
             continue
-        if best is None or one[0].value < best[0].value:
-            best = (dataclasses.replace(one[0], bound=weights.bound), one[1], some, part)
+        if best is None or trial[0].value < best[0].value:
+            best = (dataclasses.replace(trial[0], bound=weights.bound), trial[1], chosen, problem)
         elif count > 1:
             break
     if best is None:
-        assert said is not None
-        raise said
+        assert failure is not None
+        raise failure
     return best
 
 
@@ -432,45 +433,45 @@ def _whole(found: Candidates, experiment: Experiment, weights: Allocation) -> tu
     settings = list(dict.fromkeys(found.choices[i].setting for i in used))
     best = _within(found, experiment, weights, range(len(found.choices)))
     for setting in settings if len(settings) > 1 else ():
-        kept = [i for i, choice in enumerate(found.choices) if choice.setting != setting]
+        remaining = [i for i, choice in enumerate(found.choices) if choice.setting != setting]
         try:
-            other = _within(found, experiment, weights, kept)
+            trial = _within(found, experiment, weights, remaining)
         except ValueError:
             continue
-        best = min(best, other, key=lambda one: one[0].value)
+        best = min(best, trial, key=lambda one: one[0].value)
     return best
 
 
 def _within(
-    found: Candidates, experiment: Experiment, weights: Allocation, kept: Any
+    found: Candidates, experiment: Experiment, weights: Allocation, allowed: Any
 ) -> tuple[Allocation, list[Line]]:
     """Whole exposures of some choices, with their changes."""
-    kept, budget, changes = list(kept), experiment.budget, 0.0
-    at = [i for i, family in enumerate(weights.family) if family in kept]
+    allowed, budget, changes = list(allowed), experiment.budget, 0.0
+    at = [i for i, family in enumerate(weights.family) if family in allowed]
     if not at:
         raise ValueError("none of the best exposures is left")
     for _ in range(_TRIES):
-        left = budget - changes
-        if left <= 0:
+        remaining = budget - changes
+        if remaining <= 0:
             raise ValueError(
                 f"{budget / 60:g} minutes: changes of filter, moving elements and pointing alone take "
                 f"{changes / 60:.1f}; give more time, or fewer filters and settings"
             )
         problem = dataclasses.replace(
-            experiment, families=tuple(experiment.families[i] for i in kept), budget=left
+            experiment, families=tuple(experiment.families[i] for i in allowed), budget=remaining
         )
-        some = dataclasses.replace(
+        scaled = dataclasses.replace(
             weights,
-            family=np.array([kept.index(weights.family[i]) for i in at]),
+            family=np.array([allowed.index(weights.family[i]) for i in at]),
             place=[weights.place[i] for i in at],
-            weight=weights.weight[at] * left / budget,
+            weight=weights.weight[at] * remaining / budget,
         )
-        whole = rounded(problem, some)
-        whole = dataclasses.replace(whole, family=np.array([kept[i] for i in whole.family]))
-        lines = _ordered(found, whole)
+        integer = rounded(problem, scaled)
+        integer = dataclasses.replace(integer, family=np.array([allowed[i] for i in integer.family]))
+        lines = _ordered(found, integer)
         between = sum(_changes(found, lines))
-        if _cost(experiment, whole.weights) + between <= budget * (1 + 1e-9):
-            return whole, lines
+        if _cost(experiment, integer.weights) + between <= budget * (1 + 1e-9):
+            return integer, lines
         changes = max(between, changes + 1.0)
     raise ValueError(f"{budget / 60:g} minutes do not pay for the changes between exposures; give more time")
 
@@ -503,14 +504,14 @@ def _pointings(found: Candidates, lines: list[Line]) -> list[tuple[float, float]
     stops = tuple(found.choices[line.choice].stop(line.place) for line in lines)
     if not stops:
         return []
-    exposures = dataclasses.replace(found.could.plan, stops=stops, patches=(), stars=()).exposures()
+    exposures = dataclasses.replace(found.available.plan, stops=stops, patches=(), stars=()).exposures()
     return list(zip(exposures.ra.tolist(), exposures.dec.tolist(), strict=True))
 
 
 def _changes(found: Candidates, lines: list[Line]) -> Iterator[float]:
     """Time (s) of what must be changed ahead of each line; what stands at the beginning is set up beforehand."""
-    costs = found.could.costs
-    last, there = None, None
+    costs = found.available.costs
+    last, previous = None, None
     for line in lines:
         choice = found.choices[line.choice]
         time = 0.0
@@ -518,9 +519,9 @@ def _changes(found: Candidates, lines: list[Line]) -> Iterator[float]:
             time += costs.filter * (choice.filter != last.filter)
             time += costs.position * sum(choice.positions[p] != a for p, a in last.positions.items())
         if choice.kind in ("moon", "standard"):
-            (here,) = _pointings(found, [line])
-            time += 0.0 if there is None else costs.slew * float(separation(there, here))
-            there = here
+            (pointing,) = _pointings(found, [line])
+            time += 0.0 if previous is None else costs.slew * float(separation(previous, pointing))
+            previous = pointing
         last = choice
         yield time
 
@@ -533,7 +534,7 @@ def covariance(total: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r n n"]:
     return np.stack([pseudo_inverse(matrix, 1e-13) for matrix in total])
 
 
-def criterion(experiment: Experiment, total: Float[np.ndarray, "r n n"]) -> float:
+def largest_variance(experiment: Experiment, total: Float[np.ndarray, "r n n"]) -> float:
     """f of the information of everything in every draw."""
     a = experiment.targets
     c = covariance(total)
@@ -544,11 +545,11 @@ def _described(
     found: Candidates, experiment: Experiment, lines: list[Line], best: Allocation
 ) -> Iterator[PlannedExposure]:
     keys = list(best.weights)
-    without, more = worth(experiment, best)
+    without, added = worth(experiment, best)
     for line, change in zip(lines, _changes(found, lines), strict=True):
         choice, i = found.choices[line.choice], keys.index((line.choice, line.place))
         stop = choice.stop(line.place)
-        each = float(experiment.families[line.choice].cost_at(np.atleast_2d(line.place))[0])
+        seconds = float(experiment.families[line.choice].cost_at(np.atleast_2d(line.place))[0])
         yield PlannedExposure(
             kind=choice.kind,
             filter=choice.filter,
@@ -556,9 +557,9 @@ def _described(
             polariser_angle=float("nan") if stop.polariser_angle is None else stop.polariser_angle,
             number=stop.number if choice.kind in ("moon", "standard") else -1,
             times=line.times,
-            seconds=line.times * each,
+            seconds=line.times * seconds,
             left_out=float(without[i]),
-            one_more=float(more[i]),
+            one_more=float(added[i]),
             exptime=choice.seconds,
             change=change,
             place=stop.place,
@@ -570,15 +571,15 @@ def usual_plans(found: Candidates) -> Iterator[tuple[str, dict[tuple[int, tuple[
     polariser = {c.setting: i for i, c in reversed(list(enumerate(found.choices))) if c.kind == "clp"}
     order = [i for i, c in enumerate(found.choices) if polariser.get(c.setting) == i]
     moon = next((i for i, c in enumerate(found.choices) if c.kind == "moon"), None)
-    for name, (angles, each, patches) in USUAL.items():
-        if (each and len(order) < 2) or (patches and moon is None):
+    for name, (angles, everywhere, patches) in USUAL.items():
+        if (everywhere and len(order) < 2) or (patches and moon is None):
             continue
         weights = {
-            (i, found.choices[i].place(a)): 1.0 for i in (order if each else order[:1]) for a in angles
+            (i, found.choices[i].place(a)): 1.0 for i in (order if everywhere else order[:1]) for a in angles
         }
         if patches and moon is not None:
-            there = len(found.choices[moon].stops)
-            weights |= {(moon, (float(k),)): patches / there for k in range(there)}
+            count = len(found.choices[moon].stops)
+            weights |= {(moon, (float(k),)): patches / count for k in range(count)}
         yield name, weights
 
 
@@ -587,11 +588,12 @@ def information_of_weights(
 ) -> tuple[Float[np.ndarray, "r n n"], float]:
     """M of weights of (choice, place) without what is known, and their cost."""
     families = experiment.families
-    whole = sum(w * families[f].information(np.atleast_2d(p))[:, 0] for (f, p), w in weights.items())
-    return np.asarray(whole), _cost(experiment, weights)
+    total = sum(w * families[f].information(np.atleast_2d(p))[:, 0] for (f, p), w in weights.items())
+    return np.asarray(total), _cost(experiment, weights)
 
 
-def _beside(found: Candidates, experiment: Experiment, want: Wanted) -> Iterator[tuple[str, float]]:
+def _beside(found: Candidates, experiment: Experiment, criterion: Criterion) -> Iterator[tuple[str, float]]:
     for name, weights in usual_plans(found):
-        whole, cost = information_of_weights(experiment, weights)
-        yield name, want.told(criterion(experiment, experiment.known + experiment.budget / cost * whole))
+        information, cost = information_of_weights(experiment, weights)
+        total = experiment.known + experiment.budget / cost * information
+        yield name, criterion.reported(largest_variance(experiment, total))

@@ -112,7 +112,10 @@ class ObservingPlan:
     plate in `plate` (deg, None: out); Moon patches and standards take the settings in turn, in the first filter.
     `filters` are names of those that are built in, and `FilterCurve`s; also a dict of curves by name. The Moon is
     observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after.
-    `electrons` is the level of a camera in unpolarised light of full transparency, ahead of reflections.
+    `star_lmax` are the wavelengths (µm) of largest polarisation of the polarised standards, in turn: these are then
+    observed in every filter, and the catalogue has their values in the first one; none: they are observed in that one,
+    unless stops say, and have 0.55 µm. `electrons` is the level of a camera in unpolarised light of full transparency,
+    ahead of reflections.
 
     `instrument` is one that comes with the package, by name, or any other; None: the first of the family. `moving`
     holds the positions (deg, None: out) of further moving elements by the prefix of their columns: the polariser goes
@@ -136,6 +139,7 @@ class ObservingPlan:
     standards: int = 8
     unpolarised: int = 2
     catalogue_error: float = 2e-4
+    star_lmax: tuple[float, ...] = ()
     filters: Sequence[str | FilterCurve] | Mapping[str, Any] = (DEFAULT_FILTER,)
     plate: tuple[float | None, ...] = (None,)
     electrons: float = 1e6
@@ -151,12 +155,12 @@ class ObservingPlan:
     stars: tuple[int, ...] | None = None
 
     def __repr__(self) -> str:
-        said = (
+        text = (
             f"{field.name}={getattr(self, field.name)!r}"
             for field in dataclasses.fields(self)
             if field.name != "instrument" and getattr(self, field.name) != field.default
         )
-        return f"ObservingPlan({', '.join([repr(self.name), *said])})"
+        return f"ObservingPlan({', '.join([repr(self.name), *text])})"
 
     def __post_init__(self) -> None:
         if isinstance(self.instrument, str):
@@ -178,6 +182,8 @@ class ObservingPlan:
             )
         if min(self.moon_patches, self.standards, self.unpolarised) < 0:
             raise ValueError("numbers of Moon patches and standards cannot be negative")
+        if any(not 0.3 <= lmax <= 1.0 for lmax in self.star_lmax):
+            raise ValueError(f"star_lmax = {list(self.star_lmax)}: give wavelengths from 0.3 to 1.0 um")
         if not self.electrons > 0:
             raise ValueError(f"{self.electrons} electrons: a camera needs some light")
         if not (self.filters and self.plate):
@@ -190,7 +196,7 @@ class ObservingPlan:
         elif not (self.lamps or self.stops or self.moon_patches or self.standards):
             raise ValueError("no exposures: give lamps, Moon patches or standards")
         if isinstance(self.filters, Mapping):
-            object.__setattr__(self, "filters", tuple(_own_filter(*each) for each in self.filters.items()))
+            object.__setattr__(self, "filters", tuple(_own_filter(*item) for item in self.filters.items()))
         if len(self.curves()) < len(self.filters):
             raise ValueError("filters: one is there twice; give each a name of its own")
         for stop in self.stops:
@@ -250,11 +256,11 @@ class ObservingPlan:
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         degree = self.design.throughput.degree if self.throughput_degree is None else self.throughput_degree
         fields |= {"instrument": self.name, "throughput_degree": degree, "moving": dict(self.moving)}
-        if any(isinstance(one, FilterCurve) for one in self.filters):
-            fields["filters"] = {_name_of(one): _curve_document(one) for one in self.filters}
+        if any(isinstance(entry, FilterCurve) for entry in self.filters):
+            fields["filters"] = {_name_of(entry): _curve_document(entry) for entry in self.filters}
         # Named only where there are any: plans of other instruments read as they always did.
         fields["stops"] = [stop.document() for stop in self.stops]
-        later = {"moving": {}, "lamps": 0, "stops": [], "patches": None, "stars": None}
+        later = {"moving": {}, "lamps": 0, "stops": [], "patches": None, "stars": None, "star_lmax": ()}
         return {key: value for key, value in fields.items() if key not in later or value != later[key]}
 
     @property
@@ -298,7 +304,7 @@ class ObservingPlan:
 
     def curves(self) -> dict[str, FilterCurve]:
         """The filters with their curves. Raises ValueError for a name that is not known and a curve that is none."""
-        return {_name_of(one): filter_curve(one) for one in self.filters}
+        return {_name_of(entry): filter_curve(entry) for entry in self.filters}
 
     @property
     def _angles(self) -> tuple[float, ...]:
@@ -319,25 +325,26 @@ class ObservingPlan:
         ]
         # Where every exposure is said, those of the sky are taken with the plate at its first setting.
         plates = self.plate[:1] if self.stops else self.plate
-        said = {stop.kind for stop in self.stops}
+        kinds = {stop.kind for stop in self.stops}
         sky = [
-            Stop(None, self.filter_names[0], plates[i % len(plates)], further[0], kind=kind, number=number)
+            Stop(None, name, plates[i % len(plates)], further[0], kind=kind, number=number)
             for kind, numbers, total in (
                 ("moon", self.patches, self.moon_patches),
                 ("standard", self.stars, self.standards),
             )
+            for name in self.filter_names[: None if kind == "standard" and self.star_lmax else 1]
             for i, number in enumerate(
-                numbers if numbers is not None else () if kind in said else range(total)
+                numbers if numbers is not None else () if kind in kinds else range(total)
             )
         ]
         return (*indoors, *sky)
 
     def exposures(self) -> Exposures:
         """All exposures in the order in which they are taken."""
-        taken = self._taken
-        n = len(taken)
-        kind = np.array([stop.kind for stop in taken])
-        number = np.array([stop.number for stop in taken])
+        stops = self._taken
+        n = len(stops)
+        kind = np.array([stop.kind for stop in stops])
+        number = np.array([stop.number for stop in stops])
         moon, star = np.flatnonzero(kind == "moon"), np.flatnonzero(kind == "standard")
         sky = np.append(moon, star)
         mjd = self.start + _SPACING * (np.arange(n) - (sky.min() if len(sky) else n))
@@ -357,8 +364,8 @@ class ObservingPlan:
             exposure=np.arange(n),
             kind=kind,
             mjd=mjd,
-            exptime=np.array([EXPOSED[s.kind] if s.seconds is None else s.seconds for s in taken]),
-            filter=np.array([stop.filter for stop in taken]),
+            exptime=np.array([EXPOSED[s.kind] if s.seconds is None else s.seconds for s in stops]),
+            filter=np.array([stop.filter for stop in stops]),
             temp=np.linspace(*self.temperature, n),
             ha=ha,
             ra=ra,
@@ -366,9 +373,9 @@ class ObservingPlan:
             rotator=rotator,
             teff=np.full(n, self.teff),
             positions={
-                POLARISER: Position.at(stop.polariser_angle for stop in taken),
-                CALIBRATION_PLATE: Position.at(stop.plate for stop in taken),
-                **{prefix: Position.at(stop.moving.get(prefix) for stop in taken) for prefix in self.moving},
+                POLARISER: Position.at(stop.polariser_angle for stop in stops),
+                CALIBRATION_PLATE: Position.at(stop.plate for stop in stops),
+                **{prefix: Position.at(stop.moving.get(prefix) for stop in stops) for prefix in self.moving},
             },
         )
 
@@ -382,11 +389,11 @@ class ObservingPlan:
 
     def layout(self) -> tuple[Bool[np.ndarray, "p e"], np.ndarray]:
         """True for the (point, exposure) pairs that are measured, and the row of the star in each (−1: none)."""
-        taken, points = self._taken, self.points()
+        stops, points = self._taken, self.points()
         place = np.arange(len(points)) - (len(points) - (self.standard_grid**2 if self.standards else 0))
-        star = np.array([stop.number if stop.kind == "standard" else -1 for stop in taken])
+        star = np.array([stop.number if stop.kind == "standard" else -1 for stop in stops])
         used = (place[:, None] >= 0) == (star >= 0)
-        for e, stop in enumerate(taken):
+        for e, stop in enumerate(stops):
             if stop.place is not None and stop.kind == "standard":
                 used[:, e] &= place == stop.place
         return used, np.where(used, star, -1)
@@ -417,9 +424,9 @@ def filter_curve(given: str | FilterCurve) -> FilterCurve:
         return FilterCurve(given, NARROW_BANDS[given] + offset, throughput)
     if given in BUILTIN_FILTERS or single_wavelength(given) is not None:
         return builtin_filter(given)
-    known = nearest(given, (*BUILTIN_FILTERS, *NARROW_BANDS, "MONO-6500"))
+    suggestion = nearest(given, (*BUILTIN_FILTERS, *NARROW_BANDS, "MONO-6500"))
     raise ValueError(
-        f"filters: there is no filter {given!r}; {known}; a filter of your own is a table [filters.{given}] with "
+        f"filters: there is no filter {given!r}; {suggestion}; a filter of your own is a table [filters.{given}] with "
         "wavelength (um) and throughput, in Python a FilterCurve"
     )
 
@@ -480,15 +487,15 @@ def read_plan(
 
 
 def plan_of(
-    content: dict[str, Any], folder: Path, instrument: str | os.PathLike[str] | None = None
+    content: dict[str, Any], folder: Path, instrument: str | os.PathLike[str] | Instrument | None = None
 ) -> ObservingPlan:
     """The plan of the entries of a file in `folder`; the rest as `read_plan`."""
     content = dict(content)
     hints, of_stops, read = typing.get_type_hints(ObservingPlan), typing.get_type_hints(Stop), Reader("")
     check_names("entry of a plan", content, (*hints, FULL_TURN))
-    own = instrument_named(content, folder)
+    named = instrument_named(content, folder)
     content.pop("instrument", None)
-    instrument = own if instrument is None else instrument
+    instrument = named if instrument is None else instrument
     full_turn, angles = content.pop(FULL_TURN, None), content.get("polariser_angles", _ANGLES)
     if isinstance(angles, int):
         if angles < 1:
@@ -501,7 +508,7 @@ def plan_of(
     stops, filters = content.pop("stops", []), content.pop("filters", None)
     values = read.values(hints, content, "")
     if filters is not None:
-        if not isinstance(filters, list | dict) or any(not isinstance(one, str) for one in filters):
+        if not isinstance(filters, list | dict) or any(not isinstance(entry, str) for entry in filters):
             raise read.fault("", f"filters = {filters!r} must be a list of names, or tables [filters.NAME]")
         values["filters"] = tuple(filters) if isinstance(filters, list) else filters
     for stop in stops:
@@ -510,17 +517,22 @@ def plan_of(
                 position = "; where an element stands is moving = { HWP = 22.5 }" if name.isupper() else ""
                 raise ValueError(f"{unknown_name('entry of a stop', name, of_stops)}{position}")
     values["stops"] = tuple(Stop(**read.values(of_stops, stop, "stops")) for stop in stops)
-    return ObservingPlan(
-        None if instrument is None else Instrument.read(instrument, elements=defined_elements()), **values
-    )
+    if isinstance(instrument, str | os.PathLike):
+        instrument = Instrument.read(instrument, elements=defined_elements())
+    return ObservingPlan(instrument, **values)
+
+
+def plan_of_document(document: Mapping[str, Any], instrument: Instrument) -> ObservingPlan:
+    """The plan whose `document` was written, for an instrument as designed."""
+    return plan_of(_entries(document), Path(), instrument)
 
 
 def instrument_named(content: Mapping[str, Any], folder: Path) -> str | Path | None:
     """The instrument that a plan in `folder` names: that of the package, or the description file beside it."""
-    if (own := content.get("instrument")) is None:
+    if (name := content.get("instrument")) is None:
         return None
-    beside = folder / str(own)
-    return beside if beside.suffix == ".toml" else str(own)
+    beside = folder / str(name)
+    return beside if beside.suffix == ".toml" else str(name)
 
 
 def plan_text(plan: ObservingPlan, described: str | None = None) -> str:
@@ -528,20 +540,21 @@ def plan_text(plan: ObservingPlan, described: str | None = None) -> str:
 
     An instrument of one's own goes by its name, or by the file beside the plan in which it is `described`.
     """
-    unused = {"polariser_angles"} if plan.stops else set()  # every exposure says its own
-    return tomlkit.dumps(
-        {
-            name: _written(value)
-            for name, value in (plan.document() | ({"instrument": described} if described else {})).items()
-            if value is not None and name not in unused
-        }
-    )
+    return tomlkit.dumps(_entries(plan.document() | ({"instrument": described} if described else {})))
+
+
+def _entries(document: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries of the file of a plan."""
+    unused = {"polariser_angles"} if document.get("stops") else set()  # every exposure says its own
+    return {
+        name: _written(value) for name, value in document.items() if value is not None and name not in unused
+    }
 
 
 def _written(value: Any) -> Any:
     """Lists and tables as TOML has them, OUT for what is out."""
     if isinstance(value, Mapping):
-        return {name: _written(one) for name, one in value.items()}
+        return {name: _written(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_written(one) for one in value]
+        return [_written(entry) for entry in value]
     return OUT if value is None else value

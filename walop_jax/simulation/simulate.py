@@ -20,16 +20,18 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre, light
+from walop_jax.model.cameras import with_floor
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, EffectKind, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.elements import Analyser
 from walop_jax.model.instrument import Instrument, adapted
-from walop_jax.model.parameters import leaves, unknown_name, values_of
+from walop_jax.model.parameters import leaves, unknown_name, values_of, with_values
 from walop_jax.model.plan import with_median
 from walop_jax.model.sources import Standards
 from walop_jax.model.specification import Model, make_model, series_indices
+from walop_jax.model.standards import standards_of
 from walop_jax.simulation.observing_plan import EXPOSED, ObservingPlan
 
 Cube = Float[np.ndarray, "p e k"]
@@ -120,8 +122,26 @@ def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, 
         q_err=np.full(n, plan.catalogue_error),
         u_err=np.full(n, plan.catalogue_error),
         teff=rng.uniform(*_STAR_TEFF, n),
+        filter=np.full(n, plan.filter_names[0] if plan.star_lmax else ""),
     )
-    return sources, Standards(q=true[0], u=true[1], names=plan.star_names)
+    standards = standards_of(sources, plan.exposures(), plan.curves())
+    lmax = np.asarray(standards.lmax).copy()
+    if plan.star_lmax:
+        polarised = np.arange(n) - plan.unpolarised
+        lmax = np.where(
+            polarised < 0, lmax, np.resize(plan.star_lmax, polarised.max(initial=0) + 1)[polarised]
+        )
+    return sources, dataclasses.replace(standards, q=array(true[0]), u=array(true[1]), lmax=array(lmax))
+
+
+def _stars_of(plan: ObservingPlan, catalogue: Sources, true: Standards) -> tuple[Sources, Standards]:
+    """The first stars of a catalogue, with a value each, and what they really are: as in `true`, by name."""
+    rows = np.unique(catalogue.stars)[: plan.standards]
+    sources = Sources(**{f.name: getattr(catalogue, f.name)[rows] for f in dataclasses.fields(catalogue)})
+    standards = standards_of(sources, plan.exposures(), plan.curves())
+    known = dict(zip((leaf.name for leaf in leaves(true)), np.asarray(values_of(true)), strict=True))
+    values = zip((leaf.name for leaf in leaves(standards)), np.asarray(values_of(standards)), strict=True)
+    return sources, with_values(standards)(np.array([known.get(*pair) for pair in values]))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,6 +186,8 @@ def simulate(
     noiseless: bool = False,
     steady: bool = False,
     catalogue_seed: int | None = None,
+    catalogue: Sources | None = None,
+    night: int | None = None,
 ) -> Simulated:
     """Simulate a calibration run: the same plan, seed and effects give the same set, bit for bit.
 
@@ -174,17 +196,18 @@ def simulate(
     counts as they are and states the errors that they would have; `steady` gives every exposure the mean transparency
     and every star the mean brightness. Effects that depend on the run are made
     with `plan.context()`. `catalogue_seed` draws the standards apart from the rest (default: from `seed`): nights of
-    one survey share their stars.
+    one survey share their stars. With a `catalogue` nothing is drawn: the standards of `instrument` are what its stars
+    really are, and the plan takes the first of them. `night` is the number of days after the start of the plan; each
+    has noise and weather of its own, also with the same seed.
     """
-    build, stars, sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
-    if catalogue_seed is not None:
-        stars = np.random.default_rng(np.random.SeedSequence(catalogue_seed).spawn(4)[1])
-    sources, standards = _catalogue(plan, stars)
-    if instrument is None:
-        nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
-        instrument = draw_instrument(make_model(plan.name, nominal), build)
-    active = in_order((*instrument.effects, *effects))
-    truth = jax.tree.map(array, dataclasses.replace(instrument.with_source(standards), effects=active))
+    plan = plan if not night else dataclasses.replace(plan, mjd=plan.start + night)
+    sources, truth = true_instrument(
+        plan, seed, instrument=instrument, effects=effects, catalogue_seed=catalogue_seed, catalogue=catalogue
+    )
+    streams = np.random.SeedSequence(seed).spawn(4)[2:]
+    if night:
+        streams = np.random.SeedSequence((seed, night)).spawn(2)
+    sky, noise = map(np.random.default_rng, streams)
     blank = _without_light(plan, sources, seed, len(truth.cameras))
     expected = _expected(blank, truth, fluxes(plan, None if steady else sky))
     detector = PhotonNoise(plan.read_noise)
@@ -193,11 +216,46 @@ def simulate(
     else:
         # A generator for each point: a last digit that another machine computes differently stays where it is.
         drawn = [detector.draw(*pair) for pair in zip(noise.spawn(len(expected)), expected, strict=True)]
-        counts, sigma = (np.stack(part) for part in zip(*drawn, strict=True))
+        counts, sigma = (np.stack(arrays) for arrays in zip(*drawn, strict=True))
+        counts += _beyond_photons(detector.sigma(expected), expected, truth.cameras.floor, noise)
     table = TableIntensities.of(blank.intensities, blank.points)
     at = table.point, table.exposure
     measured = dataclasses.replace(table, counts=counts[at], sigma=sigma[at])
     return Simulated(dataclasses.replace(blank, intensities=measured), truth)
+
+
+def true_instrument(
+    plan: ObservingPlan,
+    seed: int = 0,
+    *,
+    instrument: Instrument | None = None,
+    effects: Sequence[Effect] = (),
+    catalogue_seed: int | None = None,
+    catalogue: Sources | None = None,
+) -> tuple[Sources, Instrument]:
+    """The catalogue of standards and the true instrument of `simulate`, by the same arguments."""
+    build, stars = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)[:2])
+    if catalogue_seed is not None:
+        stars = np.random.default_rng(np.random.SeedSequence(catalogue_seed).spawn(4)[1])
+    if catalogue is None or instrument is None:
+        sources, standards = _catalogue(plan, stars)
+    else:
+        sources, standards = _stars_of(plan, catalogue, instrument.standard)
+    if instrument is None:
+        nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
+        instrument = draw_instrument(make_model(plan.name, nominal), build)
+    active = in_order((*instrument.effects, *effects))
+    return sources, jax.tree.map(
+        array, dataclasses.replace(instrument.with_source(standards), effects=active)
+    )
+
+
+def _beyond_photons(sigma: Cube, expected: Cube, floor: float, rng: np.random.Generator) -> Cube | float:
+    """Noise that brings an error up to the `floor` of the cameras, which fits take it to have and N_ERR does not."""
+    if floor == 0.0:
+        return 0.0
+    total = with_floor(sigma, expected, floor)
+    return np.sqrt(total**2 - sigma**2) * rng.standard_normal(expected.shape)
 
 
 def as_planned(plan: ObservingPlan) -> CalibrationSet:
@@ -253,8 +311,8 @@ def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, 
         return light_counts
     counts = light_counts
     for _ in range(_MEDIAN_ROUNDS if needs(truth).median else 1):
-        seen = np.where(likelihood.used[:, :, None], counts, np.nan)
-        plan = with_median(likelihood.plan, np.nanmedian(seen, axis=0))
+        used_counts = np.where(likelihood.used[:, :, None], counts, np.nan)
+        plan = with_median(likelihood.plan, np.nanmedian(used_counts, axis=0))
         counts = np.asarray(engine.detected(truth, plan.exposures, array(light_counts)))
     return counts
 
@@ -265,37 +323,37 @@ def effect_from_text(text: str, context: Context, catalogue: Sequence[EffectKind
     A value is a number, numbers between slashes (one for each element of the parameter), or a word for a discrete
     choice. Raises ValueError, with the nearest names, for what does not exist, and for values that are missing.
     """
-    name, _, rest = (part.strip() for part in text.partition("="))
+    name, _, assignments = (item.strip() for item in text.partition("="))
     kind = effect_by_name(name, catalogue)
     parameters = tuple(kind.numbers())
     values: dict[str, Any] = {}
-    if rest and ":" not in rest:
+    if assignments and ":" not in assignments:
         if len(parameters) != 1:
             listed = f"{name}={','.join(f'{n}:…' for n in parameters)}" if parameters else f"{name} alone"
             raise ValueError(f"effect {name!r} has {len(parameters)} parameters, not one: give {listed}")
-        values[parameters[0]] = _value(rest, name)
-    elif rest:
-        values = _named_values(rest, name)
-    known = [*parameters, *kind.neutral(context).choices()]
+        values[parameters[0]] = _value(assignments, name)
+    elif assignments:
+        values = _named_values(assignments, name)
+    accepted = [*parameters, *kind.neutral(context).choices()]
     for parameter in values:
-        if parameter not in known:
-            error = unknown_name(f"parameter of {name}", parameter, known)
-            raise ValueError(f"{error}; {name} takes {', '.join(known)}")
+        if parameter not in accepted:
+            error = unknown_name(f"parameter of {name}", parameter, accepted)
+            raise ValueError(f"{error}; {name} takes {', '.join(accepted)}")
     if parameters and not any(parameter in values for parameter in kind.amplitudes()):
-        wanted = " or ".join(kind.amplitudes())
-        raise ValueError(f"{name} needs a value of {wanted}, e.g. {name}={kind.amplitudes()[0]}:…")
+        alternatives = " or ".join(kind.amplitudes())
+        raise ValueError(f"{name} needs a value of {alternatives}, e.g. {name}={kind.amplitudes()[0]}:…")
     try:
         return kind.of(context, **values)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"effect {name!r}: {rest!r} does not fit its parameters ({error})") from None
+        raise ValueError(f"effect {name!r}: {assignments!r} does not fit its parameters ({error})") from None
 
 
 def _named_values(text: str, name: str) -> dict[str, Any]:
     values: dict[str, Any] = {}
-    for part in text.split(","):
-        parameter, colon, value = (piece.strip() for piece in part.partition(":"))
+    for item in text.split(","):
+        parameter, colon, value = (piece.strip() for piece in item.partition(":"))
         if not colon or not value or parameter in values:
-            raise ValueError(f"effect {name!r}: {part!r} is not par:value (each once)")
+            raise ValueError(f"effect {name!r}: {item!r} is not par:value (each once)")
         values[parameter] = _value(value, name)
     return values
 
@@ -303,7 +361,7 @@ def _named_values(text: str, name: str) -> dict[str, Any]:
 def _value(text: str, name: str) -> Any:
     try:
         if "/" in text:
-            return [float(part) for part in text.split("/")]
+            return [float(item) for item in text.split("/")]
         return int(text) if text.lstrip("+-").isdigit() else float(text)
     except ValueError:
         if text.isidentifier():

@@ -110,8 +110,8 @@ def offset_direction(
     """Return right ascension and declination of the points that far from others, north through east; all in degrees."""
     from astropy.coordinates import offset_by
 
-    there = offset_by(*(np.deg2rad(angle) for angle in (ra, dec, position_angle, separation)))
-    return np.mod(there[0].deg, 360.0), np.asarray(there[1].deg)
+    direction = offset_by(*(np.deg2rad(angle) for angle in (ra, dec, position_angle, separation)))
+    return np.mod(direction[0].deg, 360.0), np.asarray(direction[1].deg)
 
 
 def local_sidereal_time(mjd: Float[np.ndarray, " e"], longitude: float) -> Float[np.ndarray, " e"]:

@@ -20,11 +20,11 @@ def night_of(mjd: Float[np.ndarray, " e"], longitude: float) -> Float[np.ndarray
     """The night of every exposure (`mjd` UTC, days), NaN where the time is not known; NaN is an unknown longitude."""
     if np.isfinite(longitude):
         return np.floor(mjd + longitude / 360.0 - 0.5)
-    found, known = np.full(len(mjd), np.nan), np.flatnonzero(np.isfinite(mjd))
-    order = known[np.argsort(mjd[known], kind="stable")]
+    night, dated = np.full(len(mjd), np.nan), np.flatnonzero(np.isfinite(mjd))
+    order = dated[np.argsort(mjd[dated], kind="stable")]
     first = first_of_nights(mjd[order])
-    found[order] = np.repeat(np.floor(mjd[order][first]), np.diff(np.append(first, len(order))))
-    return found
+    night[order] = np.repeat(np.floor(mjd[order][first]), np.diff(np.append(first, len(order))))
+    return night
 
 
 def first_of_nights(mjd: Float[np.ndarray, " e"]) -> Int[np.ndarray, " n"]:

@@ -37,6 +37,7 @@ from walop_jax.diagnosis.examination import Examination, examine  # noqa: E402
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates, said_by  # noqa: E402
 from walop_jax.diagnosis.score import ABSORBED, FAINTEST  # noqa: E402
 from walop_jax.fit.refit import FitResult  # noqa: E402
+from walop_jax.likelihood.columns import Columns  # noqa: E402
 from walop_jax.likelihood.flux import project_flux  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
@@ -86,7 +87,7 @@ class Layout:
             said: Sequence[Probe],
         ) -> Examination:
             """With the columns of all exposures that were taken: the one before may be kept back."""
-            both = all_candidates(Likelihood.of(whole, result.model), result.values, wanted, said)
+            both = all_candidates(Columns(Likelihood.of(whole, result.model), result.values), wanted, said)
             self.columns = {name: one.columns for some in both for name, one in some.items()}
             named, told = (
                 {n: dataclasses.replace(one, columns=one.columns[self.inside]) for n, one in some.items()}

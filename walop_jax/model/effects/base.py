@@ -154,11 +154,11 @@ class Effect(Component):
 
     def moved(self, amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
         """With numbers added to its amplitudes, in the order of its parameters."""
-        rest, changed = np.asarray(amplitudes, float), {}
+        remaining, changed = np.asarray(amplitudes, float), {}
         for name in self.kind.amplitudes():
             value = np.asarray(getattr(self, name))
-            changed[name] = value + rest[: value.size].reshape(value.shape)
-            rest = rest[value.size :]
+            changed[name] = value + remaining[: value.size].reshape(value.shape)
+            remaining = remaining[value.size :]
         return self.replaced(**changed)
 
     def choices(self) -> dict[str, Any]:
@@ -215,6 +215,6 @@ def numbered_camera(effect: str, camera: int | str, names: Sequence[str]) -> int
     if camera in names:
         return names.index(camera)  # type: ignore[arg-type]
     if camera not in range(len(names)):
-        known = ", ".join(f"{name} ({number})" for number, name in enumerate(names))
-        raise ValueError(f"{effect}: camera {camera!r} does not exist; cameras are {known}")
+        cameras = ", ".join(f"{name} ({number})" for number, name in enumerate(names))
+        raise ValueError(f"{effect}: camera {camera!r} does not exist; cameras are {cameras}")
     return int(camera)

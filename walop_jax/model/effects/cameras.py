@@ -123,13 +123,13 @@ class OfDetectors(_Cameras, DetectorPart):
 
     def reported(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
         """Counts with what is added."""
-        added, whole = ADDED[self.stage](counts, exposures), counts
+        added, total = ADDED[self.stage](counts, exposures), counts
         for change, size in zip(self.changes, self.sizes, strict=True):
-            if any(one.depends_on != COUNTS for one in change.grows_with):
-                whole = whole + size * added * in_exposures(change, exposures)[:, None]
+            if any(factor.depends_on != COUNTS for factor in change.grows_with):
+                total = total + size * added * in_exposures(change, exposures)[:, None]
             else:
-                whole = whole + size * added
-        return whole
+                total = total + size * added
+        return total
 
 
 def stage_of(change: Change) -> str:
@@ -140,7 +140,7 @@ def stage_of(change: Change) -> str:
         return {"reported gain": "reported", "afterglow": "afterglow"}[change.kind]
     if "counts" in change.factors:
         return "square"
-    still = all(one.depends_on in (FIELD, WAVELENGTH) for one in change.grows_with)
+    still = all(factor.depends_on in (FIELD, WAVELENGTH) for factor in change.grows_with)
     return "throughput" if still else "counts"
 
 

@@ -66,15 +66,15 @@ EffectKind = type[Effect] | Entry
 
 def entries(content: Mapping[str, Any]) -> tuple[EffectKind, ...]:
     """The effects that tables describe, by name. Raises ValueError, naming entry and key, for what is wrong."""
-    found = []
+    result = []
     for name, table in content.items():
         if not isinstance(table, Mapping):
             raise ValueError(f"{name} = {table!r} must be a table, [{name}]")
         try:
-            found.append(_class_of(name, table) if "class" in table else _entry(name, table))
+            result.append(_class_of(name, table) if "class" in table else _entry(name, table))
         except (TypeError, ValueError) as error:
             raise ValueError(f"[{name}] {error}") from None
-    return tuple(found)
+    return tuple(result)
 
 
 def _class_of(name: str, table: Mapping[str, Any]) -> EffectKind:
@@ -82,7 +82,9 @@ def _class_of(name: str, table: Mapping[str, Any]) -> EffectKind:
 
 
 def _entry(name: str, table: Mapping[str, Any]) -> Entry:
-    parameters = {key: own for key, own in table.items() if key not in KEYS and isinstance(own, Mapping)}
+    parameters = {
+        key: value for key, value in table.items() if key not in KEYS and isinstance(value, Mapping)
+    }
     check_names("key", [key for key in table if key not in parameters], KEYS)
     for key in NEEDED:
         if not isinstance(table.get(key), str):
@@ -110,43 +112,45 @@ def _entry(name: str, table: Mapping[str, Any]) -> Entry:
 def _member(
     name: str, parameters: Mapping[str, Mapping[str, Any]], source: str, choices: Mapping[str, Any]
 ) -> Member:
-    own = parameters[name]
-    check_names(f"key of {name}", own, PARAMETER_KEYS)
-    known = {key: float(own[key]) for key in ("width", "scale", "loose") if key in own}
-    if "unit" not in own or "about" not in own or not known:
+    settings = parameters[name]
+    check_names(f"key of {name}", settings, PARAMETER_KEYS)
+    numbers = {key: float(settings[key]) for key in ("width", "scale", "loose") if key in settings}
+    if "unit" not in settings or "about" not in settings or not numbers:
         raise ValueError(f"{name}: needs unit, about, and width or scale and loose")
-    prior = (0.0, known["width"]) if "width" in known else None
+    prior = (0.0, numbers["width"]) if "width" in numbers else None
     declared = Parameter(
         "",
-        own["unit"],
-        own["about"],
+        settings["unit"],
+        settings["about"],
         source,
         prior=prior,
-        scale=known.get("scale", 0.0),
-        loose=known.get("loose"),
+        scale=numbers.get("scale", 0.0),
+        loose=numbers.get("loose"),
     )
-    neutral, does = float(own.get("neutral", 0.0)), _texts(own.get("does", ()))
+    neutral, does = float(settings.get("neutral", 0.0)), _texts(settings.get("does", ()))
     if not does:
-        if name not in (other.get("polar") for other in parameters.values()):
+        if name not in (parameter.get("polar") for parameter in parameters.values()):
             raise ValueError(f"{name}: needs does = a change")
         return Member(name, declared, neutral=neutral)
-    said = _texts(own.get("said", does))
-    for text in (*does, *said):
+    sentences = _texts(settings.get("said", does))
+    for text in (*does, *sentences):
         check_names(f"choice of {name}", re.findall(r"{(\w*)}", text), choices)
         Change.parsed(re.sub(r"[{}]", "", text.replace("every ", "every_")))
-    per_unit = own.get("per_unit", 1.0)
+    per_unit = settings.get("per_unit", 1.0)
     sizes = tuple(map(float, per_unit)) if isinstance(per_unit, Sequence) else (float(per_unit),) * len(does)
-    polar, each = own.get("polar", ""), own.get("each", "")
+    polar, index = settings.get("polar", ""), settings.get("each", "")
     if (polar and (polar not in parameters or len(does) != 2)) or len(sizes) != len(does):
         raise ValueError(f"{name}: polar = the name of a parameter; does and per_unit then have two elements")
-    check_names("each", [each] if each else (), EACH)
-    absolute, turns = bool(own.get("absolute", False)), float(own.get("turns", 1.0))
+    check_names("each", [index] if index else (), EACH)
+    absolute, turns = bool(settings.get("absolute", False)), float(settings.get("turns", 1.0))
     if absolute and any(Change.parsed(text).kind != "extinction" for text in does):
         raise ValueError(
             f"{name}: absolute is for the extinction of the polariser alone; say what is added instead"
         )
     unit = RADIANS[parameters[polar]["unit"]] if polar else 1.0
-    return Member(name, declared, does, sizes, said, each, polar, turns * unit, turns == 2, absolute, neutral)
+    return Member(
+        name, declared, does, sizes, sentences, index, polar, turns * unit, turns == 2, absolute, neutral
+    )
 
 
 def _texts(value: Any) -> tuple[str, ...]:
@@ -196,20 +200,20 @@ def catalogue_with(own: str | os.PathLike[str] | None) -> tuple[EffectKind, ...]
     if own is None:
         return EFFECTS
     if os.fspath(own).endswith(".toml"):
-        found = {effect.name: effect for effect in own_entries(own)}
+        by_name = {effect.name: effect for effect in own_entries(own)}
     else:
-        found = classes_of(
+        by_name = classes_of(
             own,
             Effect,
             "give a TOML file, or Python with subclasses of Effect (walop-jax docs adding-an-effect)",
         )
-        found = {name: effect for name, effect in found.items() if not inspect.isabstract(effect)}
-    if not found:
+        by_name = {name: effect for name, effect in by_name.items() if not inspect.isabstract(effect)}
+    if not by_name:
         raise fail("defines no effect", file=own, advice="see walop-jax docs adding-an-effect")
-    taken = {effect.name for effect in EFFECTS}
-    for class_name, effect in found.items():
-        if not effect.name or effect.name in taken:
+    names = {effect.name for effect in EFFECTS}
+    for class_name, effect in by_name.items():
+        if not effect.name or effect.name in names:
             what = f"{class_name} has {'the name of another effect' if effect.name else 'no name'}"
             raise fail(what, file=own, advice="give it a name of its own")
-        taken.add(effect.name)
-    return (*EFFECTS, *found.values())
+        names.add(effect.name)
+    return (*EFFECTS, *by_name.values())

@@ -169,7 +169,7 @@ class Change:
         """True if what it does to a star is known from the counts and the place of the star alone."""
         elsewhere = self.kind == "afterglow" or (self.kind == "light" and self.origin in ("", OPPOSITE))
         return not elsewhere and not any(
-            one.text == "hours" or one.form in ("hours", *SINGLE) for one in self.grows_with
+            item.text == "hours" or item.form in ("hours", *SINGLE) for item in self.grows_with
         )
 
     def times(self, *factors: str) -> Change:
@@ -188,10 +188,10 @@ class Change:
 
     def _only(self, form: str, what: str, example: str) -> str:
         """Value given in the only factor of a form."""
-        found = [one.given[0] for one in self.grows_with if one.form == form]
-        if len(found) != 1:
+        matches = [item.given[0] for item in self.grows_with if item.form == form]
+        if len(matches) != 1:
             raise ValueError(f"{self.text!r}: say {what}, as in '{self.kind} of {self.place} * {example}'")
-        return found[0]
+        return matches[0]
 
     def factor(self, at: Any) -> Any:
         """Product of its factors, 1 without any."""
@@ -204,15 +204,15 @@ class Change:
     def check_factors(self, instrument: Instrument) -> None:
         """Raise ValueError for a factor that the kind would leave out."""
         allowed, angle = KINDS[self.kind].grows(instrument, self)
-        for one in self.grows_with:
-            if one.form == "kind":
-                check_names("KIND of exposures", one.given, instrument.kinds)
-            known = angle is None or (one.form in ("cos", "sin") and one.given[-1] == angle)
-            single = one.form in ("cos", "sin", *SINGLE)
-            if one.depends_on not in allowed or (single and not known):
+        for item in self.grows_with:
+            if item.form == "kind":
+                check_names("KIND of exposures", item.given, instrument.kinds)
+            matching = angle is None or (item.form in ("cos", "sin") and item.given[-1] == angle)
+            single = item.form in ("cos", "sin", *SINGLE)
+            if item.depends_on not in allowed or (single and not matching):
                 takes = ", ".join(allowed) or "nothing"
                 only = f"; of angles that of {angle} alone" if angle else ""
-                what = f"{self.kind} {self.where} {self.place} cannot grow with {one.text!r}"
+                what = f"{self.kind} {self.where} {self.place} cannot grow with {item.text!r}"
                 raise ValueError(f"{self.text!r}: {what}, only with {takes}{only}")
 
     def in_words(self) -> str:
@@ -244,16 +244,16 @@ class Change:
 
 @functools.lru_cache(maxsize=8192)
 def _parsed(text: str) -> tuple[str, str, str, tuple[str, ...], str]:
-    head, *factors = (part.strip() for part in text.split("*"))
-    found = _pattern().fullmatch(head)
-    if found is None:
+    head, *factors = (item.strip() for item in text.split("*"))
+    match = _pattern().fullmatch(head)
+    if match is None:
         raise ValueError(
             f"cannot read {text!r}: expected KIND of|in|behind|ahead of PLACE [* FACTOR ...]; kinds are "
             f"{', '.join(KINDS)}"
         )
-    for each in factors:
-        factor(each)
-    return found["kind"], found["where"], found["place"], tuple(factors), found["origin"] or ""
+    for text_of_factor in factors:
+        factor(text_of_factor)
+    return match["kind"], match["where"], match["place"], tuple(factors), match["origin"] or ""
 
 
 @functools.cache
@@ -269,17 +269,17 @@ def patched(instrument: Instrument, terms: Iterable[Term]) -> Instrument:
     together: dict[tuple[Any, Hashable], list[Term]] = {}
     for change, size in terms:
         change.check_factors(instrument)
-        kind, own = KINDS[change.kind], change.counted_in(instrument.units)
-        together.setdefault((kind.patch, kind.together(own)), []).append((own, size))
-    for (patch, _), some in together.items():
-        instrument = patch(instrument, some)
+        kind, scaled = KINDS[change.kind], change.counted_in(instrument.units)
+        together.setdefault((kind.patch, kind.together(scaled)), []).append((scaled, size))
+    for (patch, _), changes_alike in together.items():
+        instrument = patch(instrument, changes_alike)
     return instrument
 
 
 def product(factors: Iterable[Given], at: Any, units: Units) -> Any:
     """Product of factors, 1 without any."""
-    each = (factor(one).value(at, units) if isinstance(one, str) else one(at) for one in factors)
-    return functools.reduce(operator.mul, each, 1.0)
+    values = (factor(item).value(at, units) if isinstance(item, str) else item(at) for item in factors)
+    return functools.reduce(operator.mul, values, 1.0)
 
 
 def add(size: Scalar) -> Any:
@@ -298,8 +298,8 @@ class _InTrain:
     axis: Any
 
     def __getattr__(self, name: str) -> Any:
-        known = self.ray if name in ("x", "y", "wavelength") else self.ray.conditions
-        return getattr(known, name)
+        source = self.ray if name in ("x", "y", "wavelength") else self.ray.conditions
+        return getattr(source, name)
 
     def angle(self, prefix: str) -> Any:
         """That of the element itself, the only one that the optics know (`Grows`)."""

@@ -114,7 +114,9 @@ class Described(Effect):
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
         """Each amplitude is a change."""
         changes = [Change.parsed(text) for text in self.sentences]
-        return tuple(((1.0, one),) for name in AMPLITUDES for one in changes if one.parameter == name)
+        return tuple(
+            ((1.0, change),) for name in AMPLITUDES for change in changes if change.parameter == name
+        )
 
     def patch(self, instrument: Instrument) -> Instrument:
         """All changes, those at one place together."""

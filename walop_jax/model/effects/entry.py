@@ -103,7 +103,7 @@ class Entry:
 
     def head(self) -> str:
         """Equation, symbols, source, neutral values and what reveals it."""
-        neutral = [f"{one.name} = {one.neutral:g}" for one in self.members if one.does]
+        neutral = [f"{member.name} = {member.neutral:g}" for member in self.members if member.does]
         units = {
             name: f" [{declared.unit}]" * bool(declared.unit) for name, declared in self.numbers().items()
         }
@@ -139,7 +139,7 @@ class Entry:
 
     def probes(self, context: Context) -> tuple[tuple[Named, ...], ...]:
         """Every choice; of a polar pair both directions."""
-        known: Mapping[Any, Sequence[Any]] = {
+        choices: Mapping[Any, Sequence[Any]] = {
             "cameras": range(len(context.cameras)),
             "stars": context.sources,
         }
@@ -149,7 +149,7 @@ class Entry:
             shapes = [{polar.polar: phase / polar.turns} for phase in (0.0, 0.5 * np.pi)]
         return tuple(
             tuple(self.of(context, **dict(zip(names, chosen, strict=True)), **shape) for shape in shapes)
-            for chosen in itertools.product(*(known.get(of, of) for _, of in self.choices))
+            for chosen in itertools.product(*(choices.get(of, of) for _, of in self.choices))
         )
 
     def combine(self, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Named:
@@ -174,10 +174,10 @@ class Named(Effect):
 
     def __check_init__(self) -> None:
         chosen = self.choices()
-        for choice, known in self.entry.choices:
-            if not isinstance(known, str) and chosen[choice] not in known:
+        for choice, allowed in self.entry.choices:
+            if not isinstance(allowed, str) and chosen[choice] not in allowed:
                 what = f"{choice} {chosen[choice]!r} does not exist"
-                raise ValueError(f"{self.name}: {what}, choose {' or '.join(known)}")
+                raise ValueError(f"{self.name}: {what}, choose {' or '.join(allowed)}")
 
     def __getattr__(self, name: str) -> Any:
         for inside in (vars(self).get("values", {}), dict(vars(self).get("chosen", ()))):
@@ -197,12 +197,12 @@ class Named(Effect):
 
     def labels(self, field: str) -> Sequence[str]:
         """One value for each camera, or for each exposure of the Moon by its EXPOSURE number."""
-        each = next(member.each for member in self.entry.members if member.name == field)
-        if not each:
+        index = next(member.each for member in self.entry.members if member.name == field)
+        if not index:
             return (field,)
         of_cameras = [f"n{k}" for k in range(len(self.values[field]))]
         return tuple(
-            f"{field}.{one}" for one in (of_cameras if each == "camera" else [n for _, n in self.moon])
+            f"{field}.{label}" for label in (of_cameras if index == "camera" else [n for _, n in self.moon])
         )
 
     def choices(self) -> dict[str, Any]:
@@ -228,10 +228,10 @@ class Named(Effect):
         """As for any effect; there may be no star that a choice could name."""
         if "" in self.choices().values():
             return NO_STANDARD
-        if not (wanted := self.entry.arrangement):
+        if not (arrangement := self.entry.arrangement):
             return super().lacks(instrument)
-        known = alternatives(dataclasses.replace(instrument, effects=()))
-        return "" if wanted in known else str(unknown_name("arrangement", wanted, known))
+        available = alternatives(dataclasses.replace(instrument, effects=()))
+        return "" if arrangement in available else str(unknown_name("arrangement", arrangement, available))
 
     # ------------------------------------------------------------------------------------ what it does
 
@@ -242,19 +242,19 @@ class Named(Effect):
         terms = [
             (change, size * value)
             for member in self.entry.members
-            for value, each in zip(
+            for value, item in zip(
                 self._values(member, instrument), self._parts(member, instrument), strict=False
             )
-            for size, change in each
+            for size, change in item
         ]
         return patched(instrument, terms)
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
         """The changes of each amplitude, with what one unit of it is of them."""
         return tuple(
-            tuple((float(size), change) for size, change in each)
+            tuple((float(size), change) for size, change in combination)
             for member in self.entry.members
-            for each in self._parts(member, instrument)
+            for combination in self._parts(member, instrument)
         )
 
     def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
@@ -262,9 +262,9 @@ class Named(Effect):
         return tuple(
             _behind(Change.parsed(text), instrument).text
             for member in self.entry.members
-            for said in member.said
-            for each in self._each(member, said, instrument)
-            for text in each
+            for sentence in member.said
+            for expanded in self._each(member, sentence, instrument)
+            for text in expanded
         )
 
     @property
@@ -291,10 +291,10 @@ class Named(Effect):
         return [
             [
                 (size * weight, Change.parsed(text))
-                for size, weight, some in zip(member.per_unit, weights, parts, strict=True)
-                for text in some
+                for size, weight, items in zip(member.per_unit, weights, row, strict=True)
+                for text in items
             ]
-            for parts in zip(*texts, strict=True)
+            for row in zip(*texts, strict=True)
         ]
 
     def _each(self, member: Member, text: str, instrument: Instrument) -> list[list[str]]:
@@ -304,23 +304,23 @@ class Named(Effect):
             names = instrument.cameras.names
             chosen["camera"] = names[numbered_camera(self.name, chosen["camera"], names)]
         text = text.format_map({name: str(value).replace(" ", "_") for name, value in chosen.items()})
-        every = list(_expanded(text, instrument))
+        expanded = list(_expanded(text, instrument))
         if member.each == "camera":
-            return [[one] for one in every]
+            return [[item] for item in expanded]
         if member.each:
-            return [[f"{one} * exposure {at}" for one in every] for at, _ in self.moon]
-        return [every]
+            return [[f"{item} * exposure {at}" for item in expanded] for at, _ in self.moon]
+        return [expanded]
 
 
 def _expanded(text: str, instrument: Instrument) -> Iterator[str]:
-    head, every, tail = text.partition("every ")
-    if not every:
+    head, keyword, tail = text.partition("every ")
+    if not keyword:
         yield text
         return
-    name, blank, rest = tail.partition(" ")
+    name, blank, remainder = tail.partition(" ")
     for number, place in enumerate(EVERY[name](instrument)):
         origin = instrument.cameras.orthogonal[number] if name == "camera" else 0
-        yield f"{head.replace(' of orthogonal ', f' of {instrument.cameras.names[origin]} ')}{place}{blank}{rest}"
+        yield f"{head.replace(' of orthogonal ', f' of {instrument.cameras.names[origin]} ')}{place}{blank}{remainder}"
 
 
 def _behind(change: Change, instrument: Instrument) -> Change:
@@ -328,7 +328,7 @@ def _behind(change: Change, instrument: Instrument) -> Change:
     if change.where != "ahead of" or change.kind.startswith("displacement"):
         return change
     arm, _, name = change.place.rpartition(".")
-    path = next((one.path for one in instrument.arms if one.name == arm), instrument.path)
+    path = next((candidate.path for candidate in instrument.arms if candidate.name == arm), instrument.path)
     at = path.index(name) if name in path else 0
     polariser = instrument.polariser
     if not at or (polariser is not None and name == polariser.name):

@@ -147,7 +147,7 @@ FORMS: Mapping[str, tuple[str, Callable[..., Factor]]] = {
 
 
 def _plain() -> Mapping[str, Factor]:
-    made = (
+    factors = (
         Factor("x", FIELD, f"growing with X {AT}", MORE_POINTS, lambda at, units: at.x / units.field),
         Factor("y", FIELD, f"growing with Y {AT}", MORE_POINTS, lambda at, units: at.y / units.field),
         Factor(
@@ -196,7 +196,7 @@ def _plain() -> Mapping[str, Factor]:
             lambda at, _: 1.0,
         ),
     )  # fmt: skip
-    return {one.text: one for one in made}
+    return {item.text: item for item in factors}
 
 
 PLAIN = _plain()
@@ -209,6 +209,6 @@ def factor(text: str) -> Factor:
     if text in PLAIN:
         return PLAIN[text]
     for pattern, make in FORMS.values():
-        if found := re.fullmatch(pattern, text):
-            return make(*found.groups())
+        if match := re.fullmatch(pattern, text):
+            return make(*match.groups())
     raise unknown_name("factor", text, (*PLAIN, *FORMS))

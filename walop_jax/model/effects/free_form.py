@@ -90,15 +90,15 @@ class FreeShares(ExposurePart):
 
     def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"]:
         """Addition in units of the response to unpolarised light."""
-        found = jnp.zeros(())
+        total = jnp.zeros(())
         if self.harmonics.size:
             angle = exposures.clp_angle[:, None] * jnp.asarray(HARMONICS)
             waves = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
             size = self.harmonics @ legendre.basis(x, y, GRADIENT, self.scale)
-            found += jnp.where(exposures.clp_in[:, None], jnp.einsum("ehw,khw->ek", waves, size), 0.0)
+            total += jnp.where(exposures.clp_in[:, None], jnp.einsum("ehw,khw->ek", waves, size), 0.0)
         if self.exposures.size:
-            found += self.exposures
-        return found / (1.0 + _fine(self.fine, x, y, self.scale)) if self.fine.size else found
+            total += self.exposures
+        return total / (1.0 + _fine(self.fine, x, y, self.scale)) if self.fine.size else total
 
 
 class FreeForm(Effect):
@@ -160,7 +160,9 @@ class FreeForm(Effect):
                 for tag in _tags(_GRADIENT_TERMS)
             ]
         return [
-            f"{field}.{camera}.{rest}" for camera in _cameras(getattr(self, field).shape[0]) for rest in inner
+            f"{field}.{camera}.{suffix}"
+            for camera in _cameras(getattr(self, field).shape[0])
+            for suffix in inner
         ]
 
     def patch(self, instrument: Instrument) -> Instrument:

@@ -81,8 +81,8 @@ def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
     )
     if "depolarisation" in sums:
         lost = jnp.asarray(sums["depolarisation"])[..., None, None]
-        kept = 1.0 - lost * jnp.array([[0.0], [1.0], [1.0], [1.0]])
-        matrix = kept * (jnp.eye(4) if matrix is None else matrix)
+        transmitted = 1.0 - lost * jnp.array([[0.0], [1.0], [1.0], [1.0]])
+        matrix = transmitted * (jnp.eye(4) if matrix is None else matrix)
     assert matrix is not None
     return matrix
 
@@ -168,8 +168,8 @@ class Displaced(Element):
 
 def with_air_gap(instrument: Instrument, place: str, contrast: Scalar, gap: Scalar) -> Instrument:
     """The instrument with one more air gap (µm) ahead of a wave plate."""
-    own = AirGap(contrast, gap, LARGEST_GAP)
-    return instrument.changed(place, air_gaps=lambda gaps: (*gaps, own))
+    air_gap = AirGap(contrast, gap, LARGEST_GAP)
+    return instrument.changed(place, air_gaps=lambda gaps: (*gaps, air_gap))
 
 
 # ------------------------------------------------------------------------------------------------------- the kinds
@@ -209,7 +209,7 @@ def _is_ahead(instrument: Instrument, change: Change) -> bool:
 
 def _differs(instrument: Instrument, terms: Sequence[Term]) -> bool:
     """True for changes ahead of the polariser that differ from exposure to exposure."""
-    with_exposure = any(one.depends_on == EXPOSURE for change, _ in terms for one in change.grows_with)
+    with_exposure = any(item.depends_on == EXPOSURE for change, _ in terms for item in change.grows_with)
     return with_exposure and _is_ahead(instrument, terms[0][0])
 
 
@@ -230,12 +230,12 @@ def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
     polariser, factors, stage, colour = instrument.polariser, change.factors, "light", ()
     if polariser is None or change.place != polariser.name or change.where == "behind":
         stage, colour = "inserted", (factors.count("colour"),)
-        factors = tuple(one for one in factors if one != "colour")
+        factors = tuple(item for item in factors if item != "colour")
         moves = instrument.element(change.place).moves if change.where == "of" else None
         factors = factors if moves is None else (*factors, Inside(moves))
     return [
-        SlotTerm((stage, kind, change.where, change.place, *colour), size, (*factors, *more))
-        for kind, size, more in generators_of(change.kind)
+        SlotTerm((stage, kind, change.where, change.place, *colour), size, (*factors, *extra))
+        for kind, size, extra in generators_of(change.kind)
     ]
 
 
@@ -243,10 +243,10 @@ def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """(0, q, u, 0) per unit of light added, as mirrors of a telescope do to weakly polarised light."""
     if _is_ahead(instrument, terms[0][0]) and any(change.factors for change, _ in terms):
         return instrument.changed("", sky_films=lambda films: (*films, SkyFilm(**_columns(terms))))
-    own: dict[str, Any] = {"q": jnp.zeros(()), "u": jnp.zeros(())}
-    for one, size in terms:
-        own[one.kind[-1]] = own[one.kind[-1]] + size
-    return _beside(instrument, AddedPolarisation(name="described", **own), terms[0][0])
+    components: dict[str, Any] = {"q": jnp.zeros(()), "u": jnp.zeros(())}
+    for item, size in terms:
+        components[item.kind[-1]] = components[item.kind[-1]] + size
+    return _beside(instrument, AddedPolarisation(name="described", **components), terms[0][0])
 
 
 def _grows_added(instrument: Instrument, change: Change) -> Grows:
@@ -265,7 +265,7 @@ def _fringes(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 
 def _slots_of_fringes(instrument: Instrument, change: Change) -> list[SlotTerm]:
-    factors = tuple(one for one in change.factors if not str(one).startswith("gap "))
+    factors = tuple(item for item in change.factors if not str(item).startswith("gap "))
     return [SlotTerm(("fringes", change.place, change.gap), 1.0, factors)]
 
 

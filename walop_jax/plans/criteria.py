@@ -46,7 +46,7 @@ TARGET_GRID = 9  # field points along each axis at which the error of p is asked
 
 
 @dataclasses.dataclass(frozen=True)
-class Wanted:
+class Criterion:
     """Linear functions of the parameters, `targets` (draw, target, parameter, column), and what their variance says.
 
     `unit` is that of the root of the largest variance, after `scale`; `what` says in words what it is. `inverse`: its
@@ -62,7 +62,7 @@ class Wanted:
     inverse: bool = False
     blocks: Float[np.ndarray, "b f n"] | None = None
 
-    def told(self, variance: float) -> float:
+    def reported(self, variance: float) -> float:
         """The number that is told for a value of the criterion."""
         root = self.scale * float(np.sqrt(variance))
         return 1.0 / root if self.inverse else root
@@ -129,12 +129,12 @@ def field_errors(
 
     `stars` (q, u) are those over which the square is averaged, at all points or at each: those with p ≤ 5 %.
     """
-    plan = found.could.plan
+    plan = found.available.plan
     edge = np.linspace(-plan.field, plan.field, TARGET_GRID)
     x, y = (np.tile(edge, TARGET_GRID), np.repeat(edge, TARGET_GRID)) if points is None else points
     light = sample_stars() if stars is None else stars
-    parts = [_at(found, values, x, y, light, colours) for values in found.values]
-    slopes, forms = (np.stack(part) for part in zip(*parts, strict=True))
+    results = [_at(found, values, x, y, light, colours) for values in found.values]
+    slopes, forms = (np.stack(arrays) for arrays in zip(*results, strict=True))
     repeated = len(colours) * len(plan.filters)
     return FieldErrors(np.tile(x, repeated), np.tile(y, repeated), slopes, forms)
 
@@ -147,7 +147,7 @@ def _at(
     stars: Float[np.ndarray, "*b m 2"],
     colours: Sequence[float],
 ) -> tuple[Float[np.ndarray, "t 6 f"], Float[np.ndarray, "t 6 6"]]:
-    model, plan = found.model, found.could.plan
+    model, plan = found.model, found.available.plan
     instrument, select = model.instrument(values), model.selection()
     slopes, forms = [], []
     for name in plan.filter_names:
@@ -166,7 +166,7 @@ def _at(
     return np.concatenate(slopes), np.concatenate(forms)
 
 
-def wanted(found: Candidates, field: FieldErrors | None, criterion: str | InputTable) -> Wanted:
+def criterion_by_name(found: Candidates, field: FieldErrors | None, criterion: str | InputTable) -> Criterion:
     """A criterion by its name: `WORST`, `MEAN`, a parameter; or a table of stars (X, Y, Q, U; TEFF).
 
     Raises ValueError for a name that is none of these, and where no star can be seen.
@@ -177,19 +177,19 @@ def wanted(found: Candidates, field: FieldErrors | None, criterion: str | InputT
         assert field is not None
         targets = field.targets()
         if criterion == WORST:
-            return Wanted(WORST, "error of p at the worst point and colour", "%", targets)
-        whole = np.einsum("rkfi,rkgi->rfg", targets, targets, optimize=True) / targets.shape[1]
-        return Wanted(MEAN, "error of p, rms over the field", "%", root_of(whole)[:, None])
+            return Criterion(WORST, "error of p at the worst point and colour", "%", targets)
+        mean_square = np.einsum("rkfi,rkgi->rfg", targets, targets, optimize=True) / targets.shape[1]
+        return Criterion(MEAN, "error of p, rms over the field", "%", root_of(mean_square)[:, None])
     if criterion == APART:
         return _apart(found)
     check_names("criterion or parameter", [criterion], (WORST, MEAN, APART, *found.names))
     unit = found.model.parameters[found.model.index(criterion)].unit
-    one = np.zeros((len(found.values), 1, len(found.names), 1))
-    one[:, 0, found.names.index(criterion)] = 1.0
-    return Wanted(criterion, f"error of {criterion}", unit, one)
+    unit_vector = np.zeros((len(found.values), 1, len(found.names), 1))
+    unit_vector[:, 0, found.names.index(criterion)] = 1.0
+    return Criterion(criterion, f"error of {criterion}", unit, unit_vector)
 
 
-def _of_stars(found: Candidates, table: InputTable) -> Wanted:
+def _of_stars(found: Candidates, table: InputTable) -> Criterion:
     rules: dict[str, Any] = {
         name: Column("float", unit) for name, unit in (("X", "deg"), ("Y", "deg"), ("Q", ""), ("U", ""))
     }
@@ -199,21 +199,21 @@ def _of_stars(found: Candidates, table: InputTable) -> Wanted:
         raise ValueError(
             f"{table.path}: a star with Q = U = 0 has no p; leave it out, or state what is expected of it"
         )
-    parts = []
+    targets_by_colour = []
     for colour in np.unique(teff):
-        here = np.flatnonzero((teff == colour) | (np.isnan(teff) & np.isnan(colour)))
-        stars = np.stack([q[here], u[here]], axis=1)[:, None]
-        at = field_errors(found, colours=(float(colour),), points=(x[here], y[here]), stars=stars)
-        parts.append(at.targets())
-    targets = np.concatenate(parts, axis=1)
+        members = np.flatnonzero((teff == colour) | (np.isnan(teff) & np.isnan(colour)))
+        stars = np.stack([q[members], u[members]], axis=1)[:, None]
+        at = field_errors(found, colours=(float(colour),), points=(x[members], y[members]), stars=stars)
+        targets_by_colour.append(at.targets())
+    targets = np.concatenate(targets_by_colour, axis=1)
     if not targets.shape[1]:
         raise ValueError(
             f"{table.path}: no star lies where one exposure holds u; observe them at several angles of the rotator"
         )
-    return Wanted("stars", f"error of p of the worst of {targets.shape[1]} stars", "%", targets)
+    return Criterion("stars", f"error of p of the worst of {targets.shape[1]} stars", "%", targets)
 
 
-def _apart(found: Candidates) -> Wanted:
+def _apart(found: Candidates) -> Criterion:
     names, effects = np.array(found.names), found.effects
     of = {effect: np.flatnonzero(np.char.startswith(names, f"{effect}.")) for effect in effects}
     if len(effects) < 2 or not any(effects.values()):
@@ -227,15 +227,15 @@ def _apart(found: Candidates) -> Wanted:
         if size[i] and p.prior is not None:
             size[i] -= p.prior[0]
     widest, blocks = max(map(len, of.values())), []
-    for own, rival in itertools.permutations(effects, 2):
-        if not effects[own]:
+    for truth, rival in itertools.permutations(effects, 2):
+        if not effects[truth]:
             continue
         block = np.zeros((len(names), len(base) + 1 + widest))
         block[base, np.arange(len(base))] = 1.0
-        block[of[own], len(base)] = size[of[own]]
+        block[of[truth], len(base)] = size[of[truth]]
         block[of[rival], len(base) + 1 + np.arange(len(of[rival]))] = 1.0
         blocks.append(block)
     targets = np.zeros((len(blocks) * len(found.values), 1, blocks[0].shape[1], 1))
     targets[:, 0, len(base)] = 1.0
     what = f"least distance of {', '.join(effects)}"
-    return Wanted(APART, what, "σ", targets, inverse=True, blocks=np.stack(blocks))
+    return Criterion(APART, what, "σ", targets, inverse=True, blocks=np.stack(blocks))

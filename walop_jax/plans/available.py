@@ -120,7 +120,7 @@ class CandidateExposure(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Could:
+class Available:
     """Exposures that could be taken: those of an observing plan, at any angle of the polariser; costs and limits.
 
     `seconds` are exposure times to choose from, by kind; pointings lower than `altitude` (deg) are left out; `places`
@@ -151,9 +151,9 @@ class Could:
         return CALIBRATION_PLATE in self.plan.design.moving()
 
     @classmethod
-    def of(cls, given: Could | ObservingPlan | str | os.PathLike[str]) -> Could:
+    def of(cls, given: Available | ObservingPlan | str | os.PathLike[str]) -> Available:
         """From a file, an observing plan, or the name or description of an instrument."""
-        if isinstance(given, Could):
+        if isinstance(given, Available):
             return given
         if isinstance(given, ObservingPlan):
             return cls(given)
@@ -164,30 +164,30 @@ class Could:
             return cls.read(parse_toml(read_text(given)), Path(given).parent)
 
     @classmethod
-    def read(cls, content: Mapping[str, Any], folder: Path) -> Could:
+    def read(cls, content: Mapping[str, Any], folder: Path) -> Available:
         """From the entries of a file; raises ValueError for what is not known or not allowed."""
-        content, own = dict(content), {}
+        content, options = dict(content), {}
         for name in ("altitude", "places"):
             if name in content:
-                own[name] = content.pop(name)
+                options[name] = content.pop(name)
         costs = dict(content.pop("costs", {}))
         check_names("cost", costs, Costs.__dataclass_fields__)
         plate = content.get("plate", ())
-        if own.setdefault("any_plate", ANY in plate if isinstance(plate, list) else plate == ANY):
+        if options.setdefault("any_plate", ANY in plate if isinstance(plate, list) else plate == ANY):
             listed = [angle for angle in plate if angle != ANY] if isinstance(plate, list) else []
             content["plate"] = plate = listed or [OUT]
         check_names("angle of the plate", (a for a in plate if isinstance(a, str) and a != OUT), (OUT, ANY))
         seconds = {kind: tuple(np.atleast_1d(v).tolist()) for kind, v in content.pop("seconds", {}).items()}
-        return cls(plan_of(content, folder), Costs(**costs), seconds, **own)
+        return cls(plan_of(content, folder), Costs(**costs), seconds, **options)
 
     def choices(self) -> tuple[tuple[CandidateExposure, ...], tuple[str, ...]]:
         """All choices, and in words what had to be left out, with what would do."""
         plan, notes = self.plan, []
         up: dict[str, tuple[int, ...]] = {}
         for kind, total in (("moon", plan.moon_patches), ("standard", plan.standards)):
-            up[kind], said = self._up(kind, total)
-            notes += said
-        found = []
+            up[kind], remarks = self._up(kind, total)
+            notes += remarks
+        candidates = []
         positions = {CALIBRATION_PLATE: plan.plate, **plan.moving}
         for name, stops in itertools.product(plan.filter_names, itertools.product(*positions.values())):
             where = dict(zip(positions, stops, strict=True))
@@ -203,10 +203,10 @@ class Could:
                         else tuple(self._members(blank, up.get(kind, ())))
                     )
                     if members:
-                        found.append(CandidateExposure(kind, name, where, seconds, members))
+                        candidates.append(CandidateExposure(kind, name, where, seconds, members))
                     if kind == "clp" and self.any_plate and stops[0] == plan.plate[0]:
-                        found.append(found[-1]._replace(free=True))
-        return tuple(found), tuple(notes)
+                        candidates.append(candidates[-1]._replace(free=True))
+        return tuple(candidates), tuple(notes)
 
     def _members(self, blank: Stop, numbers: tuple[int, ...]) -> Iterator[Stop]:
         single = self.places and blank.kind == "standard"

@@ -1,0 +1,76 @@
+"""The standards of a set as the model sees them: names of their values, and whether they have a colour."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from walop_jax.data.records import Exposures, FilterCurve, Sources
+from walop_jax.data.settings import PHOTOMETRIC_BANDS, builtin_filter
+from walop_jax.model.quadrature import moments
+from walop_jax.model.sources import Standards
+
+LEAST_RANGE = 0.01  # µm
+WIDTHS_PER_RMS = 2.355  # full width at half maximum of a Gaussian
+Curves = Mapping[str, FilterCurve]
+
+
+def standard_names(sources: Sources) -> tuple[str, ...]:
+    """Unique names of the values of standards, usable in parameter names: of the star, with the band if it is known."""
+    plain = [
+        _usable(str(name)) or f"source{number}"
+        for number, name in zip(sources.source, sources.name, strict=True)
+    ]
+    names: dict[int, str] = {}
+    for number, name in zip(sources.source.tolist(), plain, strict=True):
+        # A name that another star bears by right is not given to a namesake.
+        unique = name
+        while number not in names and (unique in names.values() or (unique != name and unique in plain)):
+            unique = f"{unique}_{number}"
+        names.setdefault(number, unique)
+    bands = [f".{_usable(str(band), '-+')}" if band else "" for band in sources.filter]
+    return tuple(names[number] + band for number, band in zip(sources.source.tolist(), bands, strict=True))
+
+
+def _usable(name: str, further: str = "") -> str:
+    return "".join(c if c.isalnum() or c in further else "_" for c in name.strip())
+
+
+def standards_of(sources: Sources, exposures: Exposures, filters: Curves) -> Standards:
+    """The standards of a set, with their values as they are.
+
+    They have a colour where a band is stated for any of them, or where they were seen in several filters: else a value
+    is that of the only filter.
+    """
+    names, qu = standard_names(sources), np.stack([sources.q, sources.u])
+    seen = _filters_seen(exposures)
+    stated = sources.filter != ""
+    if not (stated.any() or len(seen) > 1):
+        return Standards(names=names, q=qu[0], u=qu[1])
+    bands = []
+    for teff, band in zip(sources.teff.tolist(), sources.filter.tolist(), strict=True):
+        each = [_band(name, teff, filters) for name in ([band] if band else seen)]
+        wavelength, width = np.mean(each, axis=0) if each else _band("V", teff, filters)
+        bands.append((float(wavelength), float(width)))
+    unknown = np.flatnonzero(~stated).tolist() if len(seen) > 1 else ()
+    return Standards.coloured(names, qu, bands, sources.stars.tolist(), unknown)
+
+
+def _filters_seen(exposures: Exposures) -> list[str]:
+    return np.unique(exposures.filter[exposures.direct("standard")]).tolist()
+
+
+def half_range(sources: Sources, row: int, exposures: Exposures, filters: Curves) -> float:
+    """Half of the range of the mean wavelengths in which a star was seen (µm)."""
+    seen = [_band(name, float(sources.teff[row]), filters)[0] for name in _filters_seen(exposures)]
+    return 0.5 * max(max(seen) - min(seen), LEAST_RANGE)
+
+
+def _band(name: str, teff: float, filters: Curves) -> tuple[float, float]:
+    """Mean wavelength and rms width (µm) of a band; of a photometric one those of any light."""
+    if name in PHOTOMETRIC_BANDS and name not in filters:
+        wavelength, width = PHOTOMETRIC_BANDS[name]
+        return wavelength, width / WIDTHS_PER_RMS
+    curve = filters[name] if name in filters else builtin_filter(name)
+    return moments(curve.wavelength, curve.throughput, teff)
