@@ -43,18 +43,18 @@ def plan_for(
     # A row for every exposure; of standards one for every star, as each may have a colour of its own.
     of_stars = exposures.direct("standard") & (stars > 0)
     row = np.repeat(each, np.where(of_stars, stars, 1))
-    teff, last, seen = own.teff[row], len(row), of_stars[row]
-    if sources is not None and seen.any():
+    teff, last, starlight = own.teff[row], len(row), of_stars[row]
+    if sources is not None and starlight.any():
         colour = np.tile(sources.teff, of_stars.sum())
-        teff[seen] = np.where(np.isfinite(colour), colour, teff[seen])
+        teff[starlight] = np.where(np.isfinite(colour), colour, teff[starlight])
     sloping = np.flatnonzero(of_stars) if instrument.standard.bands else each[:0]
     row, teff = np.append(row, sloping), np.append(teff, np.full(len(sloping), _typical(sources)))
     settings = dataclasses.replace(own[row], teff=teff)
 
     def band_of(band: Int[np.ndarray, " n"]) -> Int[np.ndarray, "e s"]:
         table = np.empty((len(each), 1 + stars), int)
-        table[~of_stars] = band[~seen, None]
-        table[of_stars, 1:] = band[seen].reshape(of_stars.sum(), stars)
+        table[~of_stars] = band[~starlight, None]
+        table[of_stars, 1:] = band[starlight].reshape(of_stars.sum(), stars)
         table[of_stars, 0] = table[of_stars, -1]  # nothing is used of a standard without its star
         return table
 
