@@ -118,10 +118,11 @@ def diagnose(
     # Another reading that comes near competes with names and with other descriptions of the instrument.
     if nameless and readings and readings[0].explained * judge.fit.dof < judge.fit.chi2:
         raise refusal(before, readings)
-    if judge.steps and (stated := instead_of_names(before, judge.fit, policy)):
-        names = ", ".join(step.effect for step in judge.steps)
+    if (judge.steps or nameless) and (stated := instead_of_names(before, judge.fit, policy)):
+        parts = () if nameless is None else nameless.parts
+        names = ", ".join([step.effect for step in judge.steps] or parts) or "none that holds"
         text = f"one number that the set states explains more than names do ({names}), if it is {stated}"
-        nameless = Unexplained(first.table.p_global, text, ())
+        nameless = Unexplained(first.table.p_global, text, (), parts=parts)
         judge, last = dataclasses.replace(judge, fit=before, steps=[]), first
     steps = tuple(judge.finished(step, last) for step in judge.steps)
     verdict: Outcome = "unexplained" if nameless else "effect_found" if steps else "consistent"
