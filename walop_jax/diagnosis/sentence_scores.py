@@ -14,10 +14,10 @@ import numpy as np
 from scipy import linalg
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates
-from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import ScoreSpace, ScoreTable
 
 TOGETHER = 1e8  # numbers of columns that are there at a time
@@ -28,7 +28,8 @@ def sentence_scores(design: Design) -> ScoreTable:
     """The scores of all descriptions that an instrument and its exposures allow, with their corrected p."""
     fit = design.fit
     calset: CalibrationSet = fit.calset
-    every = grammar.sentences(fit.model.template, calset.exposures, len(calset.points))
+    model = fit.model
+    every = hypotheses(model.catalogue, model.template, calset.exposures, len(calset.points)).every
     residual = design.projector(design.residual)
     noise = float(np.sqrt(residual @ residual / max(design.projector.free, 1))) or 1.0
     names: list[str] = []
@@ -69,13 +70,13 @@ def _columns(design: Design, some: list[Probe]) -> Iterator[tuple[Probe, np.ndar
     yield from ((probe, said[probe.name].columns) for probe in some if probe.name in said)
 
 
-def described_doubts(design: Design, policy: Policy = POLICY) -> Iterator[str]:
+def described_doubts(design: Design) -> Iterator[str]:
     """A sentence if descriptions of what may be missing explain more than noise does."""
     table = sentence_scores(design)
-    if table.p_global >= policy.alarm:
+    if table.p_global >= thresholds.ALARM:
         return
-    names = table.significant(policy.alarm, _SHOWN)
+    names = table.significant(thresholds.ALARM, _SHOWN)
     yield (
         f"the residuals are explained better with something that the model has not (p = {table.p_global:.2g}, limit "
-        f"{policy.alarm:g}; nearest: {' | '.join(names)}): walop-jax diagnose looks for the cause"
+        f"{thresholds.ALARM:g}; nearest: {' | '.join(names)}): walop-jax diagnose looks for the cause"
     )
