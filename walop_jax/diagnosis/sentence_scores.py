@@ -14,9 +14,8 @@ import numpy as np
 from scipy import linalg
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import thresholds
+from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates
 from walop_jax.diagnosis.score import ScoreSpace, ScoreTable
 
@@ -28,8 +27,7 @@ def sentence_scores(design: Design) -> ScoreTable:
     """The scores of all descriptions that an instrument and its exposures allow, with their corrected p."""
     fit = design.fit
     calset: CalibrationSet = fit.calset
-    model = fit.model
-    every = hypotheses(model.catalogue, model.template, calset.exposures, len(calset.points)).every
+    every = grammar.sentences(fit.model.template, calset.exposures, len(calset.points))
     residual = design.projector(design.residual)
     noise = float(np.sqrt(residual @ residual / max(design.projector.free, 1))) or 1.0
     names: list[str] = []
