@@ -33,6 +33,7 @@ SAID = {
     "Compare two nights": "HAS CHANGED",
     "My arrays": "Fit of WALOP-SOUTH",
     "How good would a plan be?": "M33_ERR",
+    "The quality of nights": "CHI2DOF",
 }
 
 
@@ -60,8 +61,8 @@ def folder(tmp_path_factory) -> Path:
     return path
 
 
-def test_there_are_eight_of_at_most_six_lines():
-    assert len(SCRIPTS) == 8
+def test_there_are_nine_of_at_most_six_lines():
+    assert len(SCRIPTS) == 9
     for title, script in SCRIPTS.items():
         lines = [line for line in script.splitlines() if line.strip()]
         assert 0 < len(lines) <= MOST_LINES, title

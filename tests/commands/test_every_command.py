@@ -63,7 +63,7 @@ LINES = {
     ],
     "plan": [
         Line("plan bench.toml --minutes 10 --draws 1 --criterion window.delta -o PLAN", "plan"),
-        Line("plan plan.toml --minutes 20 --draws 1 -o PLAN", "plan", "seconds"),
+        Line("plan plan.toml --minutes 20 --draws 1 --schedule night.json -o PLAN", "plan", "seconds"),
         Line("plan WALOP-SOUTH --minutes 20 --draws 1 -o PLAN", "plan", "minutes"),
         Line("plan RUN --minutes 10 --draws 1 -o PLAN", "plan", "minutes"),
     ],
