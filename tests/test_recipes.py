@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.table import Table
+from camera_files import ascii_head, four
 from quick import quick
 from small_run import SEED, SMALL
 
+import walop_jax as walop
 from walop_jax.commands.docs import pages
 from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.refit import refit
@@ -51,6 +53,7 @@ def folder(tmp_path_factory) -> Path:
     write_calibration(path / "RUN" / "calibration.fits", Calibration.from_fit(refit(calset).judged()))
     x, y = np.random.default_rng(0).uniform(-0.25, 0.25, (2, 30))
     Table({"X": x, "Y": y}).write(path / "stars.csv")
+    four(walop.simulate(SMALL, seed=SEED, stars=60), path, ascii_head)
     clp = np.flatnonzero(calset.exposures.kind == "clp")
     block = calset.intensities.block(0, len(calset.points))
     points = np.flatnonzero(block.used[:, clp].all(axis=1))
@@ -76,3 +79,5 @@ def test_it_runs(title, folder, monkeypatch, capsys):
     assert SAID.get(title, "") in capsys.readouterr().out
     if title == "The matrix at my stars":
         assert len(Table.read(folder / "matrix.fits")) == 30
+    if title == "From SExtractor to a table for others":
+        assert walop.check_common_table(folder / "stars.fits") == ()

@@ -43,7 +43,7 @@ _OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Word:
-    """What a column is made of: the first of `words` that is there, or a fixed `value`.
+    """Origin of a column: the first of `words` that is there, or a fixed `value`.
 
     `values` replace what the word says (names of filters, kinds, positions), `unit` is that of the word, `expression`
     makes the value of the column of x, the value in the unit of the column, and of other columns by name.
