@@ -192,7 +192,7 @@ MOST_LINES = {
     "fit": 2200,
     "calibration": 2850,
     "posterior": 2400,
-    "science": 6000,
+    "science": 6250,
     "diagnosis": 7500,
     "nights": 2800,
     "plans": 2350,

@@ -28,7 +28,7 @@ from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, CatalogueSearch
 from walop_jax.science.detectors import detector_slopes, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
-from walop_jax.science.left_over_sky import sky_in
+from walop_jax.science.left_over_sky import with_sky
 from walop_jax.science.star_residuals import StarResiduals
 
 STAR_SAMPLE = 16384
@@ -107,18 +107,7 @@ def apply(
         watched += work.residuals(block, chosen)
         if progress is not None:
             progress(done, len(catalogue))
-    return _with_sky(work.together(_joined(parts), work.checked(watched, chosen)), catalogue)
-
-
-def _with_sky(stars: Stars, catalogue: Catalogue) -> Stars:
-    """The stars with what the sky left in them may do, where the catalogue states its level."""
-    found, ratio = sky_in(catalogue, stars.qu, stars.photon)
-    if found is None:
-        return stars
-    changed = stars.changed + np.nan_to_num(found.covariance(ratio))
-    flag = stars.flag | (Quality.CATALOGUE if found.found else 0)
-    check, bound = dataclasses.replace(stars.check, sky=found), found.bound * ratio
-    return dataclasses.replace(stars, changed=changed, flag=flag, check=check, sky_bound=bound)
+    return with_sky(work.together(_joined(parts), work.checked(watched, chosen)), catalogue)
 
 
 def results_of(calibration: Calibration, catalogue: Catalogue) -> Stars:

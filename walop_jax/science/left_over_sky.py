@@ -13,13 +13,17 @@ Limits      a sky of one polarisation in the whole catalogue; first order in S/L
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import with_error
 from walop_jax.science.catalogue import Catalogue
+
+if TYPE_CHECKING:
+    from walop_jax.science.apply import Stars
 
 CHANCE = 1e-5
 """Probability that noise finds something in a sound catalogue."""
@@ -55,7 +59,7 @@ class LeftOverSky:
         return float(np.hypot(*self.share) + _SEEN * self.errors.max())
 
     def covariance(self, ratio: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2 2"]:
-        """What it may do to stars with a `ratio` of sky to light: nothing where none was found."""
+        """Covariance of its shift of stars with a `ratio` of sky to light, 0 where none was found."""
         whole = np.outer(self.share, self.share) + np.diag(self.errors**2)
         return np.where(self.found, ratio**2, 0.0)[:, None, None] * whole
 
@@ -144,14 +148,18 @@ def _scatter(left: Float[np.ndarray, " s"], variance: Float[np.ndarray, " s"]) -
     return 0.5 * (low + high)
 
 
-def sky_in(
-    catalogue: Catalogue, qu: Float[np.ndarray, "s 2"], photon: Float[np.ndarray, "s 2 2"]
-) -> tuple[LeftOverSky | None, Float[np.ndarray, " s"]]:
-    """The sky left over in the stars of a catalogue, and the ratio of sky to light of each; none without SKY."""
+def with_sky(stars: Stars, catalogue: Catalogue) -> Stars:
+    """The stars with what the sky left in them may do, where the catalogue states its level."""
     if catalogue.sky is None:
-        return None, np.zeros(len(qu))
+        return stars
     both = np.isfinite(catalogue.counts) & np.isfinite(catalogue.sky)
     sums = (np.where(both, one, 0.0).sum(axis=1) for one in (catalogue.counts, catalogue.sky))
     light, level = (np.bincount(catalogue.star, one) for one in sums)
     ratio = np.where(light > 0, level / np.where(light > 0, light, 1.0), np.nan)
-    return left_over_sky(qu, photon, light, ratio), ratio
+    found = left_over_sky(stars.qu, stars.photon, light, ratio)
+    if found is None:
+        return stars
+    changed = stars.changed + np.nan_to_num(found.covariance(ratio))
+    flag = stars.flag | (Quality.CATALOGUE if found.found else 0)
+    check, bound = dataclasses.replace(stars.check, sky=found), found.bound * ratio
+    return dataclasses.replace(stars, changed=changed, flag=flag, check=check, sky_bound=bound)
