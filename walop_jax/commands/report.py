@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, command_of
-from walop_jax.commands.inputs import DataOf, Effects, PathLike, catalogue_of, folder_of, save
+from walop_jax.commands.inputs import DataOf, Effects, Goal, PathLike, catalogue_of, folder_of, goal_of, save
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:
@@ -45,11 +45,13 @@ def report(
     *,
     data: DataOf = None,
     effects: Effects = None,
+    goal: Goal = None,
 ) -> Outcome[Page]:
     """Write one HTML page about a run, figures inside: it needs no network and no other file, and can be mailed or
     printed.
 
-    The verdict, the accuracy of p over the field, what the data were, what was found, residuals before and after, maps
+    First whether the calibration is good enough for --goal (default: that of the fit), and what to do if not. The
+    verdict, the accuracy of p over the field, what the data were, what was found, residuals before and after, maps
     of the matrix and of its errors, pulls from the priors, all parameters, warnings, inputs and versions, as far as RUN
     holds them; the page says what is missing. What sample and limits have put into RUN is there as well; compare,
     epoch, limits, plan, stack, watch and certify have pages of their own. A page that exists is made anew; another file
@@ -70,7 +72,7 @@ def report(
             raise UsageError("say where the page of a fit in memory is to be written", "output")
         with tempfile.TemporaryDirectory() as temporary:
             save(run, Path(temporary) / "fit")
-            return command_of(report).body(job, Path(temporary) / "fit", output, effects=effects)
+            return command_of(report).body(job, Path(temporary) / "fit", output, effects=effects, goal=goal)
     folder = folder_of(run)
     target = folder / PAGE if output is None else Path(output)
     job.begin("reading")
@@ -79,7 +81,7 @@ def report(
     overwrite = job.overwrite or _is_page(target)
     check_output(target, overwrite=overwrite)
     job.tell("drawing", "drawing")
-    text, missing = render_other(folder, kind) if found is None else render(found)
+    text, missing = render_other(folder, kind) if found is None else render(found, goal_of(goal))
     text = encodable(text)
     with atomic_path(target, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")

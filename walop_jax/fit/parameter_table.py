@@ -41,6 +41,11 @@ class Fitted(Result):
     covariance: Float[np.ndarray, "n n"]
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all parameters, in the order of `values`."""
+        return self.model.names
+
+    @property
     def sigma(self) -> Vector:
         """Standard errors of all parameters."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
@@ -111,6 +116,4 @@ def parameter_notes(model: Model, sigma: Vector) -> tuple[str, ...]:
 
 
 def _state(p: Parameter, idle: tuple[str, ...]) -> str:
-    if p.tie is not None:
-        return f"tied to {p.tie}"
-    return "fixed" if not p.free else "prior only" if p.name in idle else ""
+    return p.state or ("prior only" if p.name in idle else "")

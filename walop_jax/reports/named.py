@@ -17,11 +17,10 @@ from walop_jax.reports import diagnosis_figures, figures, paper_figures, posteri
 from walop_jax.reports.run import FigureSource
 from walop_jax.reports.style import PLATES, AnyFigure
 from walop_jax.reports.wording import listed
-from walop_jax.science.field_accuracy import field_accuracy
 
 
 def _accuracy(source: FigureSource) -> AnyFigure:
-    found = field_accuracy(source.rebuilt)
+    found = source.accuracy
     if found is None:
         advice = "plot matrix-errors"
         raise fail("has a single arm: one exposure holds no p", file=source.folder, advice=advice)
