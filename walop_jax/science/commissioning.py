@@ -58,13 +58,13 @@ def requirements(
                 strip = f"{100 * accuracy.without_u:.0f} % of the field"
                 cause = f", worst beside the {strip} where one exposure carries almost no information on u"
                 advice = "observe the stars there with the calibration plate at 22.5° as well"
-            asked = f"p known to {two_digits(100 * most)} % in {where}"
-            said = f"{two_digits(100 * reached)} %{cause}"
-            found.append(Requirement(asked, reached <= most, said, advice, needed))
-        for name, one in unmeasured(accuracy.not_measured).items():
-            asked = f"what moves stars by {two_digits(100 * most)} % is measured"
-            lacking = f"{name} not measured, {off_by(*one.error)} at the usual size"
-            found.append(Requirement(asked, one.error[0] <= most, lacking, one.remedy))
+            text = f"p known to {two_digits(100 * most)} % in {where}"
+            value = f"{two_digits(100 * reached)} %{cause}"
+            found.append(Requirement(text, reached <= most, value, advice, needed))
+        for name, effect in unmeasured(accuracy.not_measured).items():
+            text = f"what moves stars by {two_digits(100 * most)} % is measured"
+            lacking = f"{name} not measured, {off_by(*effect.error)} at the usual size"
+            found.append(Requirement(text, effect.error[0] <= most, lacking, effect.remedy))
         if accuracy.hidden > 0:
             found.append(
                 Requirement(
@@ -75,24 +75,32 @@ def requirements(
                     needed=False,
                 )
             )
-    for one in () if calset is None else inspect(calset).findings:
+    for finding in () if calset is None else inspect(calset).findings:
         found.append(
-            Requirement("exposures and errors", False, one.what, one.advice, needed=one.severity == "fault")
+            Requirement(
+                "exposures and errors",
+                False,
+                finding.what,
+                finding.advice,
+                needed=finding.severity == "fault",
+            )
         )
     return tuple(found)
 
 
 def is_go(asked: Sequence[Requirement]) -> bool:
     """True if everything that is needed is met."""
-    return all(one.met for one in asked if one.needed)
+    return all(each.met for each in asked if each.needed)
 
 
 def requirement_rows(asked: Sequence[Requirement]) -> tuple[tuple[str, str, str], ...]:
     """A row for each requirement: ok, NO where it is needed, no where it is advice; what is asked, what was found."""
-    return tuple(("ok" if one.met else "NO" if one.needed else "no", one.what, one.found) for one in asked)
+    return tuple(
+        ("ok" if each.met else "NO" if each.needed else "no", each.what, each.found) for each in asked
+    )
 
 
 def requirement_advice(asked: Sequence[Requirement]) -> tuple[str, ...]:
     """Advice on requirements that are not met, what is needed first."""
-    ordered = sorted(asked, key=lambda one: not one.needed)
-    return tuple(f"{one.found}: {one.advice}" for one in ordered if not one.met)
+    ordered = sorted(asked, key=lambda each: not each.needed)
+    return tuple(f"{each.found}: {each.advice}" for each in ordered if not each.met)
