@@ -48,7 +48,7 @@ def test_a_set_becomes_arrays_and_comes_back(fitted):
 
 
 def test_help_is_no_dump(capsys):
-    for name in ("Model", "Run", "CalibrationSet", "refit"):
+    for name in ("Model", "Run", "CalibrationSet"):
         help(getattr(walop, name))
         text = capsys.readouterr().out
         assert max(map(len, text.splitlines())) < 400, name

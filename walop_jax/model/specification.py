@@ -50,7 +50,7 @@ class Model(Displayed):
     laws: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def display(self) -> Display:
-        """How many parameters, and those of them that are not terms of the throughput."""
+        """The number of parameters, and those of them that are not terms of the throughput."""
         effects = ", ".join(self.effect_names) or "none beyond the base model"
         counts = f"{len(self.parameters)} parameters, {len(self.free)} free"
         rows = tuple(

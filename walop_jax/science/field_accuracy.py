@@ -85,7 +85,7 @@ class FieldAccuracy:
 
     @property
     def shortfalls(self) -> tuple[Shortfall, ...]:
-        """What the calibration lacks for the goal, the worst first; empty: it is good enough."""
+        """Everything that the calibration lacks for the goal; empty: it is good enough."""
         if not self.trusted:
             return (
                 Shortfall("the calibration is not trusted", "walop-jax diagnose looks for what is missing"),
