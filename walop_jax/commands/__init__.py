@@ -27,6 +27,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
     },
     "Correct stars": {
         "matrix": "Say what the instrument matrix is at a field point, or at every point of a table.",
+        "gather": "Make one catalogue, a row a star, of those of the cameras.",
         "apply": "Turn the intensities of stars into Stokes parameters.",
     },
     "Check a calibration": {
@@ -37,6 +38,8 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
     "Many nights": {
         "epoch": "Fit new calibration sets and compare with an old calibration.",
         "watch": "Say when a calibration ceased to hold, from the stars of many nights.",
+        "affected": "Say which catalogues a new calibration changes, and by how much.",
+        "quality": "Add a row of quality numbers for each night to a table, and say which lie outside their limits.",
         "stack": "Fit many nights at once, each parameter under a law that says how it may change.",
     },
     "Plan and rehearse": {

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from walop_jax.simulation.truth import Template
 
 PLAN = Argument("Observing plan (TOML); default: the usual one of the instrument.", "[PLAN.toml]", Path)
+STARS = Option(
+    "Make a catalogue of so many stars in place of the set: of the same instrument.", "N", int, least=1
+)
 EFFECT = Option(
     "Effect to hide in the data; NAME=par:value,par:value for several parameters (a/b/c/d for one "
     "value per element), NAME alone where there is none to give. May be repeated.",
@@ -55,9 +58,10 @@ def simulate(
     like: Annotated[Simulated | FitResult | Calibration | Run | PathLike | None, LIKE] = None,
     night: Annotated[int | None, NIGHT] = None,
     truth: Annotated[PathLike | None, Option("Write the true parameters here.", "FILE.json", Path)] = None,
+    stars: Annotated[int | None, STARS] = None,
     noiseless: bool = False,
     catalogue_seed: int | None = None,
-) -> Outcome[Simulated]:
+) -> Outcome[Any]:
     """Make a calibration set of an instrument whose as-built values are drawn from their priors.
 
     The light path is the one that a fit uses; noise is that of photons and of the detectors (30 electrons). What is
@@ -66,10 +70,14 @@ def simulate(
     Nights of one instrument, to rehearse epoch, stack and watch on: --like TRUTH.json --night 10. Each night has
     noise and weather of its own, also with the same seed.
 
-    In Python: the set and the true instrument. `effect` may be a dict, {"hwp1_axis": 0.3}, or `Effect` objects; with a
-    plan, an `Instrument` as `instrument` is the true one, not drawn. `noiseless`: expected counts, with the errors that
-    they would have. The same plan, seed and effects give the same set, bit for bit. `like` may also be what `simulate`
-    has returned, or a fit. `catalogue_seed` draws the standards apart from the rest.
+    With `stars` it is a catalogue of the sky for `apply`, `gather` and `watch` (RA, DEC, BP_RP and all): the same plan,
+    seed and effects give the stars of the instrument that the set calibrates.
+
+    In Python: the set and the true instrument; with `stars` the catalogue, an astropy table. `effect` may be a dict,
+    {"hwp1_axis": 0.3}, or `Effect` objects; with a plan, an `Instrument` as `instrument` is the true one, not drawn.
+    `noiseless`: expected counts, with the errors that they would have. The same plan, seed and effects give the same
+    set, bit for bit. `like` may also be what `simulate` has returned, or a fit. `catalogue_seed` draws the standards
+    apart from the rest.
 
     >>> first = walop.simulate(walop.ObservingPlan(grid=4))  # doctest: +SKIP
     >>> calset, truth = walop.simulate(like=first, night=10, effect={"hwp1_axis": 0.3})  # doctest: +SKIP
@@ -79,8 +87,11 @@ def simulate(
     from walop_jax import Instrument, ObservingPlan
     from walop_jax.data.write import write_calibration_set
     from walop_jax.io.atomic import atomic_path, check_output
+    from walop_jax.io.plain_tables import astropy_table, write_table
     from walop_jax.model.instrument import nominal_instrument
+    from walop_jax.science.simulated_stars import simulated_stars
     from walop_jax.simulation.observing_plan import instrument_named, read_plan
+    from walop_jax.simulation.simulate import Simulated, true_instrument
     from walop_jax.simulation.simulate import simulate as simulated
     from walop_jax.simulation.truth import truth_document
 
@@ -106,47 +117,52 @@ def simulate(
         raise UsageError(str(error)) from None
     if truth is not None:
         check_output(truth, overwrite=job.overwrite)
+    drawn: dict[str, Any] = {"instrument": true, "effects": hidden, "catalogue_seed": catalogue_seed}
+    drawn["catalogue"] = None if template is None else template.catalogue
+    about: dict[str, Any] = {"output": output, "instrument": plan.name, "seed": job.seed, "truth": truth}
+    about["effects"] = [one.name for one in hidden]
     job.tell("following the light", "following")
-    made = simulated(
-        plan,
-        job.seed,
-        instrument=true,
-        effects=hidden,
-        noiseless=noiseless,
-        catalogue_seed=catalogue_seed,
-        catalogue=None if template is None else template.catalogue,
-        night=night,
-    )
+    made: Any
+    if stars is not None:
+        if "standard" not in plan.design.kinds:
+            raise UsageError(f"{plan.name} sees no stars", "stars")
+        sources, true = true_instrument(plan, job.seed, **drawn)
+        seen = simulated_stars(plan, true, stars, job.seed, night=night or 0, noiseless=noiseless)
+        made = astropy_table(seen.columns, {"INSTRUME": plan.name})
+        known = truth_document(plan, job.seed, sources, true) | {"stars": seen.document()}
+        about["stars"] = stars
+        text = f"{output}: {plan.name}, {stars} stars of the instrument of seed {job.seed}"
+        suggested, times = (f"walop-jax apply RUN {output} -o OUT.fits",), made["MJD"]
+    else:
+        made = simulated(plan, job.seed, noiseless=noiseless, night=night, **drawn)
+        calset, true = made
+        known = truth_document(plan, job.seed, calset.sources, true)
+        about |= {"exposures": len(calset.exposures), "points": len(calset.points)}
+        about["rows"] = calset.intensities.rows
+        text = f"{output}: {plan.name}, {about['exposures']} exposures of {about['points']} points"
+        fit = f"walop-jax refit {output} --instrument {file} -o RUN"
+        suggested = (fit,) if file is not None and plan.design.description else ()
+        times = calset.exposures.mjd
     job.begin("writing")
     with contextlib.ExitStack() as stack:
         if truth is not None:
             temporary = stack.enter_context(atomic_path(truth, overwrite=job.overwrite))
-            temporary.write_text(json_text(truth_document(plan, job.seed, made)), encoding="utf-8")
-        if output is not None:
+            temporary.write_text(json_text(known), encoding="utf-8")
+        if output is not None and isinstance(made, Simulated):
             write_calibration_set(output, made.calset, overwrite=job.overwrite)
-    document = {
-        "output": output,
-        "instrument": plan.name,
-        "seed": job.seed,
-        "exposures": len(made.calset.exposures),
-        "points": len(made.calset.points),
-        "rows": made.calset.intensities.rows,
-        "effects": [one.name for one in hidden],
-        "truth": truth,
-    }
-    text = f"{output}: {plan.name}, {document['exposures']} exposures of {document['points']} points; "
-    text += f"{'; '.join(map(_sized, made.truth.effects)) or 'nothing'} beyond the base model"
-    suggested = f"walop-jax refit {output} --instrument {file} -o RUN"
+        elif output is not None:
+            write_table(output, made, overwrite=job.overwrite)
+    text += f"; {'; '.join(map(_sized, true.effects)) or 'nothing'} beyond the base model"
     if template is not None:
-        mjd = np.nanmin(made.calset.exposures.mjd)
+        mjd = float(np.nanmin(times))
         text += f"; the night of {date_of(mjd)}"
-        document |= {"like": None if isinstance(like, tuple) else str(like), "night": night, "mjd": mjd}
+        about |= {"like": None if isinstance(like, tuple) else str(like), "night": night, "mjd": mjd}
     return Outcome(
         made,
-        document,
+        about,
         text,
         warnings=left_out_sentences(lost, like if isinstance(like, str | os.PathLike) else None),
-        next=(suggested,) if file is not None and plan.design.description else (),
+        next=suggested,
     )
 
 

@@ -115,21 +115,17 @@ def watch(
 
 def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[Catalogue], tuple[str, ...]]:
     """Catalogues with a time in every row, the number of the catalogue where none has any; what was left out."""
-    times_known = [np.isfinite(catalogue.time) for catalogue in catalogues]
-    if not any(map(np.any, times_known)):
+    has_time = [np.isfinite(catalogue.time) for catalogue in catalogues]
+    if not any(map(np.any, has_time)):
         numbered = enumerate(catalogues)
         return [dataclasses.replace(c, time=np.full(len(c), float(n))) for n, c in numbered], ()
     remarks = []
-    for number, timed in enumerate(times_known):
+    for number, timed in enumerate(has_time):
         if not timed.all():
             name = names[number] if number < len(names) else f"catalogue {number + 1}"
-            rows = (
-                "no row has a time"
-                if not timed.any()
-                else f"{np.sum(~timed)} of {len(timed)} rows have no time"
-            )
+            rows = f"{np.sum(~timed) if timed.any() else 'all'} of {len(timed)} rows have no time"
             remarks.append(f"{name}, MJD: {rows}, others do: left out, as nobody knows when they were taken")
-    return [c.of_rows(timed) for c, timed in zip(catalogues, times_known, strict=True) if timed.any()], tuple(
+    return [c.of_rows(timed) for c, timed in zip(catalogues, has_time, strict=True) if timed.any()], tuple(
         remarks
     )
 
@@ -241,11 +237,8 @@ class Watching:
             parameters = fitted[pool] if pool < len(fitted) else fitted.sum()
             local = beside_fitted(noise_scale(chi2[members], dof[members]), dof[members], float(parameters))
             mine, several = is_off(local, alarm), several or is_off(local, alarm)
-            variance = (
-                max(local.value, least) * (of_few(local, self.alarm) if fitted.any() else 1.0)
-                if mine
-                else common
-            )
+            larger = of_few(local, self.alarm) if fitted.any() else 1.0
+            variance = max(local.value, least) * larger if mine else common
             weight[members], share[members] = np.where(local.kept, 1.0 / variance, 0.0), local.share
         return weight / self.variance, share, overall, several
 

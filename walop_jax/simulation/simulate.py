@@ -201,20 +201,13 @@ def simulate(
     has noise and weather of its own, also with the same seed.
     """
     plan = plan if not night else dataclasses.replace(plan, mjd=plan.start + night)
-    build, stars, sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
+    sources, truth = true_instrument(
+        plan, seed, instrument=instrument, effects=effects, catalogue_seed=catalogue_seed, catalogue=catalogue
+    )
+    streams = np.random.SeedSequence(seed).spawn(4)[2:]
     if night:
-        sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence((seed, night)).spawn(2))
-    if catalogue_seed is not None:
-        stars = np.random.default_rng(np.random.SeedSequence(catalogue_seed).spawn(4)[1])
-    if catalogue is None or instrument is None:
-        sources, standards = _catalogue(plan, stars)
-    else:
-        sources, standards = _stars_of(plan, catalogue, instrument.standard)
-    if instrument is None:
-        nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
-        instrument = draw_instrument(make_model(plan.name, nominal), build)
-    active = in_order((*instrument.effects, *effects))
-    truth = jax.tree.map(array, dataclasses.replace(instrument.with_source(standards), effects=active))
+        streams = np.random.SeedSequence((seed, night)).spawn(2)
+    sky, noise = map(np.random.default_rng, streams)
     blank = _without_light(plan, sources, seed, len(truth.cameras))
     expected = _expected(blank, truth, fluxes(plan, None if steady else sky))
     detector = PhotonNoise(plan.read_noise)
@@ -229,6 +222,32 @@ def simulate(
     at = table.point, table.exposure
     measured = dataclasses.replace(table, counts=counts[at], sigma=sigma[at])
     return Simulated(dataclasses.replace(blank, intensities=measured), truth)
+
+
+def true_instrument(
+    plan: ObservingPlan,
+    seed: int = 0,
+    *,
+    instrument: Instrument | None = None,
+    effects: Sequence[Effect] = (),
+    catalogue_seed: int | None = None,
+    catalogue: Sources | None = None,
+) -> tuple[Sources, Instrument]:
+    """The catalogue of standards and the true instrument of `simulate`, by the same arguments."""
+    build, stars = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)[:2])
+    if catalogue_seed is not None:
+        stars = np.random.default_rng(np.random.SeedSequence(catalogue_seed).spawn(4)[1])
+    if catalogue is None or instrument is None:
+        sources, standards = _catalogue(plan, stars)
+    else:
+        sources, standards = _stars_of(plan, catalogue, instrument.standard)
+    if instrument is None:
+        nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
+        instrument = draw_instrument(make_model(plan.name, nominal), build)
+    active = in_order((*instrument.effects, *effects))
+    return sources, jax.tree.map(
+        array, dataclasses.replace(instrument.with_source(standards), effects=active)
+    )
 
 
 def _beyond_photons(sigma: Cube, expected: Cube, floor: float, rng: np.random.Generator) -> Cube | float:

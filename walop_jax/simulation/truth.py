@@ -71,19 +71,19 @@ class Template:
         return cls(simulated.truth, simulated.calset.sources)
 
 
-def truth_document(plan: ObservingPlan, seed: int, made: Simulated) -> dict[str, Any]:
+def truth_document(plan: ObservingPlan, seed: int, sources: Sources, truth: Instrument) -> dict[str, Any]:
     """Truth of a simulated set as plain data: plan, effects, catalogue, the true value of every parameter."""
-    units = {leaf.name: leaf.unit for leaf in leaves(made.truth)}
-    sources, description = made.calset.sources, plan.design.description
+    units = {leaf.name: leaf.unit for leaf in leaves(truth)}
+    description = plan.design.description
     return {
         "instrument": plan.name,
         **({"description": description} if description else {}),
         "seed": seed,
         "plan": plan.document(),
-        "effects": {effect.name: effect.choices() for effect in made.truth.effects},
+        "effects": {effect.name: effect.choices() for effect in truth.effects},
         "catalogue": {name: getattr(sources, name).tolist() for name in sorted(_CATALOGUE)},
         "parameters": {
-            name: {"value": value, "unit": units[name]} for name, value in truth_values(made.truth).items()
+            name: {"value": value, "unit": units[name]} for name, value in truth_values(truth).items()
         },
     }
 
