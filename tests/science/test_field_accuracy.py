@@ -63,7 +63,7 @@ def test_good_enough_for_a_goal():
     assert known.shortfalls == ()
     assert dict(known.facts())["good for 0.1 %"] == "yes: 0.020 % in 95 % of the field"
     strict = dataclasses.replace(known, goal=2e-4)
-    what = ["0.020 % in 95 % of the field, half of the goal is allowed"]
+    what = ["0.020 % in 95 % of the field, 0.010 % allowed"]
     what += ["a systematic error of 0.030 % of q or u could hide"]
     assert [one.what for one in strict.shortfalls] == what
     # Errors fall with the square root of the light.

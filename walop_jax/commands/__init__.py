@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 GROUPS: Mapping[str, Mapping[str, str]] = {
     "Begin": {
-        "demo": "Fit the small calibration set that comes with the package, and write the page about it.",
+        "demo": "Fit the small calibration set that comes with the package, write its page, and correct stars.",
         "docs": "Print a reference page, or the list of pages.",
     },
     "Calibrate": {

@@ -103,10 +103,10 @@ class FieldAccuracy:
                 )
             else:
                 light = two_digits((self.reached / most) ** 2)  # errors fall with its square root
-                advice = f"{light} times the light, over several nights; walop-jax plan says which exposures"
+                advice = f"{light} times the light; walop-jax plan RUN --goal {100 * most:.2g} says how long that takes"
             lacks.append(
                 Shortfall(
-                    f"{two_digits(100 * self.reached)} % in {self.judged}, half of the goal is allowed",
+                    f"{two_digits(100 * self.reached)} % in {self.judged}, {two_digits(100 * most)} % allowed",
                     advice,
                 )
             )
