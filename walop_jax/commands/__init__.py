@@ -50,6 +50,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
         "model": "Write the base model as a file.",
         "instrument": "Print and check an instrument.",
         "trace": "Follow the light of one source through the instrument.",
+        "standards": "List standard stars with band, errors, variability and source.",
         "import-zemax": "Make a calibration set (KIND flux) of the transmissions that an optical design program gives.",
     },
     "Credits and conformance": {

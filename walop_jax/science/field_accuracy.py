@@ -190,12 +190,9 @@ def judged(without_u: float) -> str:
     )
 
 
-def answered(result: FitResult, calibration: Calibration | None = None, goal: float = GOAL) -> FitResult:
-    """The fit, able to say how well stars are known with it; worked out when it is first asked.
-
-    Of a `calibration` that holds more than the fit (`Diagnosis.calibration`), with that.
-    """
-    return dataclasses.replace(result, answer=_Answer(result, calibration, goal))
+def answered(result: FitResult, goal: float = GOAL) -> FitResult:
+    """The fit, able to say how well stars are known with it; worked out when it is first asked."""
+    return dataclasses.replace(result, answer=_Answer(result, goal))
 
 
 @dataclasses.dataclass
@@ -203,7 +200,6 @@ class _Answer:
     """The accuracy of p of a fit, worked out once; a class, so that fits can be pickled."""
 
     result: FitResult
-    calibration: Calibration | None = None
     goal: float = GOAL
 
     def __call__(self) -> FieldAccuracy | None:
@@ -212,7 +208,7 @@ class _Answer:
     @functools.cached_property
     def known(self) -> FieldAccuracy | None:
         """See `field_accuracy`."""
-        return field_accuracy(self.calibration or Calibration.from_fit(self.result), goal=self.goal)
+        return field_accuracy(Calibration.from_fit(self.result), goal=self.goal)
 
 
 def field_accuracy(calibration: Calibration, size: int = SIZE, goal: float = GOAL) -> FieldAccuracy | None:
