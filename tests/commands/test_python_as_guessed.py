@@ -47,6 +47,17 @@ def test_a_set_becomes_arrays_and_comes_back(fitted):
     assert again.site == calset.site
 
 
+def test_sources_print_as_lines(fitted):
+    lines = repr(walop.cite(fitted.run)).splitlines()
+    assert lines[1].startswith("polariser: Goldstein")
+    assert len(lines) == len(walop.cite(fitted.run))
+
+
+def test_what_was_measured_stands_first(fitted):
+    states = [row[-1] for row in walop.read(fitted.run).display().rows if not row[0].startswith("standard.")]
+    assert states == sorted(states, key=lambda state: state == "prior only")
+
+
 def test_help_is_no_dump(capsys):
     for name in ("Model", "Run", "CalibrationSet"):
         help(getattr(walop, name))

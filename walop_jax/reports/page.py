@@ -149,8 +149,10 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
     trusted = bool(summary.get("trusted", summary["converged"]))
     good = trusted and (diagnosis is None or diagnosis["verdict"] != "unexplained")
     asked, go = _asked(run)
-    if goal is not None and trusted and (known := run.source.accuracy) is not None:
-        head = _with_goal(head, known)
+    answered = any(name.startswith("good for") for name, _ in head.facts)
+    if trusted and asked is not None and (goal is not None or not answered):
+        known = run.source.accuracy
+        head = head if known is None else _with_goal(head, known)
     missing, drawn = [*run.missing], _Drawn(run)
     origin = "" if run.product is None or not run.product.origin else f"; data from {run.product.origin}"
     sampled = run.product is not None and run.product.verdict.covariance_from == "posterior"
@@ -494,9 +496,19 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
         first="",
         doubts=[one for one in document.get("warnings", ()) if one not in head.notes],
         name=folder.resolve().name,
+        next=_AFTER.get(kind, ()),
         missing=missing,
     )
     return text, tuple(missing)
+
+
+_AFTER: Mapping[str, Sequence[tuple[str, str]]] = {
+    "limits": [("plan exposures that show more", "walop-jax plan RUN --minutes 10")],
+    "plan": [("rehearse it", "walop-jax simulate PLAN/plan.toml -o SET.fits")],
+    "epoch": [("fit all nights together", "walop-jax stack RUN NEW.fits -o SURVEY")],
+    "survey": [("correct stars", "walop-jax apply SURVEY STARS.fits -o OUT.fits")],
+}
+"""Next steps after what other commands have made: words and a command line."""
 
 
 def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: list[str]) -> list[Picture]:
