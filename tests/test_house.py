@@ -184,7 +184,7 @@ def test_the_core_is_reached_without_the_rest(entry):
 MOST_LINES = {
     "io": 1650,
     "instruments": 250,
-    "data": 5080,
+    "data": 5730,
     "sky": 450,
     "model": 9480,
     "likelihood": 3300,
@@ -193,12 +193,12 @@ MOST_LINES = {
     "calibration": 2850,
     "posterior": 2400,
     "science": 6090,
-    "diagnosis": 7860,
+    "diagnosis": 7900,
     "nights": 2800,
     "plans": 2350,
     "paper": 860,
     "reports": 3080,
-    "commands": 4600,
+    "commands": 4670,
 }
 """Lines of each room: raising one is a decision of its own."""
 

@@ -17,6 +17,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
         "docs": "Print a reference page, or the list of pages.",
     },
     "Calibrate": {
+        "exposures": "Make the table EXPOSURES of a calibration set from what an observatory writes down.",
         "inspect": "Say what is in calibration sets and what is wrong with them.",
         "refit": "Fit all field points of calibration sets jointly.",
         "clip": "Flag single intensities that lie far from a fit of all others.",
