@@ -151,7 +151,7 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
     asked, go = _asked(run)
     answered = any(name.startswith("good for") for name, _ in head.facts)
     if trusted and asked is not None and (goal is not None or not answered):
-        known = run.source.accuracy
+        known = _accuracy(run)
         head = head if known is None else _with_goal(head, known)
     missing, drawn = [*run.missing], _Drawn(run)
     origin = "" if run.product is None or not run.product.origin else f"; data from {run.product.origin}"
@@ -202,18 +202,24 @@ def _asked(run: RunContents) -> tuple[Display | None, bool]:
     if run.commissioning is not None and run.source.goal == GOAL:
         shown = display_of(run.commissioning, run.source.folder / COMMISSIONING)
         return shown, bool(run.commissioning["go"])
-    if run.product is None:
-        return None, True
-    try:
-        accuracy = run.source.accuracy
-    except (ValueError, OSError):  # its model cannot be rebuilt: said where its figures are missing
+    accuracy = _accuracy(run)
+    if run.product is None or accuracy is None:
         return None, True
     found = requirements(run.product.verdict, "", accuracy, None)
-    title = "Go: fit for use" if is_go(found) else "No go"
+    whole = all(each.met for each in found)
+    title = "No go" if not is_go(found) else "Go: fit for use" if whole else "Go, with reservations"
     advice = requirement_advice(found)
     return Display(title, head=("", "asked", "found"), rows=requirement_rows(found), notes=advice), is_go(
         found
     )
+
+
+def _accuracy(run: RunContents) -> FieldAccuracy | None:
+    """The error of p over the field; None where there is none: its figure, which is missing then, says why."""
+    try:
+        return None if run.product is None else run.source.accuracy
+    except (ValueError, OSError):
+        return None
 
 
 def _with_goal(head: Display, known: FieldAccuracy) -> Display:
