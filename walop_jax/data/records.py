@@ -399,6 +399,39 @@ class CalibrationSet(Displayed):
         }
         return Display(f"Calibration set of {self.instrument}", tuple(facts.items()), notes=self.remarks)
 
+    def to_arrays(self) -> dict[str, Any]:
+        """The set as arrays: `from_arrays(**calset.to_arrays())` is the same set; NaN where nothing was measured.
+
+        `counts` and `errors` (point, exposure, camera) are electrons, `x`, `y` and `angles` degrees. Of whole frames
+        give a part at a time: `intensities.block(start, stop)`.
+
+        >>> arrays = calset.to_arrays()
+        >>> arrays["counts"].shape == (len(calset.points), len(calset.exposures), calset.cameras)
+        True
+        """
+        block, e = self.intensities.block(0, len(self.points)), self.exposures
+        used = block.used[:, :, None]
+        others = {name.lower(): values for name, values in e.columns().items()}
+        for name in ("exposure", "kind", "clp_in", "clp_angle"):
+            others.pop(name, None)
+        return {
+            "counts": np.where(used, block.counts, np.nan),
+            "errors": np.where(used, block.sigma, np.nan),
+            "x": block.x,
+            "y": block.y,
+            "angles": np.where(e.clp_in, e.clp_angle, np.nan),
+            "kinds": e.kind,
+            "source": np.where(block.source >= 0, np.append(self.sources.source, -1)[block.source], -1),
+            **others,
+            "instrument": self.instrument,
+            "site": self.site,
+            "filters": dict(self.filters),
+            "sources": {f.name.upper(): getattr(self.sources, f.name) for f in dataclasses.fields(Sources)}
+            if len(self.sources)
+            else None,
+            "origin": self.origin,
+        }
+
     def to_table(self) -> Any:
         """The exposures as an astropy table, with the columns of EXPOSURES."""
         units = {"MJD": "d", "EXPTIME": "s", "TEMP": "Celsius", "HA": "h", "TEFF": "K"}
