@@ -12,6 +12,7 @@ from walop_jax.commands.demo import demo as demo
 from walop_jax.commands.diagnose import diagnose as diagnose
 from walop_jax.commands.docs import docs as docs
 from walop_jax.commands.epoch import epoch as epoch
+from walop_jax.commands.gather import gather as gather
 from walop_jax.commands.import_zemax import import_zemax as import_zemax
 from walop_jax.commands.inputs import read as read
 
@@ -53,6 +54,7 @@ from walop_jax.model.specification import with_effects as with_effects
 from walop_jax.posterior.result import Options as Options
 from walop_jax.posterior.result import arviz_of_fit as _to_arviz  # noqa: F401
 from walop_jax.posterior.run import Run as Run
+from walop_jax.science.common_table import check_common_table as check_common_table
 from walop_jax.simulation.observing_plan import ObservingPlan as ObservingPlan
 
 __version__: str

@@ -23,6 +23,7 @@ COMMANDS = {
     "report": "Write one HTML page about a run, figures inside.",
     "plot": "Draw a figure of a run, by name, as a file.",
     "matrix": "Say what the instrument matrix is at a field point, or at every point of a table.",
+    "gather": "Make one catalogue, a row a star, of those of the cameras.",
     "apply": "Turn the intensities of stars into Stokes parameters.",
     "compare": "Compare the method of Paper II, as it is published, with the joint fit.",
     "certify": "Check a calibration from its checksums to its physics and its accuracy.",
