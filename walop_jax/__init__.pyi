@@ -2,6 +2,7 @@
 
 from walop_jax.calibration.calibration import Calibration as Calibration
 from walop_jax.calibration.residual_map import residual_map as residual_map
+from walop_jax.commands.affected import affected as affected
 from walop_jax.commands.apply import apply as apply
 from walop_jax.commands.certify import certify as certify
 from walop_jax.commands.cite import cite as cite
@@ -25,6 +26,7 @@ from walop_jax.commands.matrix import matrix as matrix
 from walop_jax.commands.model import model as model
 from walop_jax.commands.plan import plan as plan
 from walop_jax.commands.plot import plot as plot
+from walop_jax.commands.quality import quality as quality
 from walop_jax.commands.refit import refit as refit
 from walop_jax.commands.report import report as report
 from walop_jax.commands.sample import sample as sample

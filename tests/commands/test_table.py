@@ -143,6 +143,10 @@ CASES = {
     "certify": Case(lambda g: (g.run,), lambda g, **k: walop.certify(g.run, **k), "RUN"),
     "epoch": Case(lambda g: (g.run, g.calset), lambda g, **k: walop.epoch(g.run, g.calset, **k), "RUN", True),
     "watch": Case(lambda g: (g.run, g.stars), lambda g, **k: walop.watch(g.run, g.stars, **k), "RUN", True),
+    "affected": Case(
+        lambda g: (g.run, g.run, g.stars), lambda g, **k: walop.affected(g.run, g.run, g.stars, **k), "", True
+    ),
+    "quality": Case(lambda g: (g.run,), lambda g, **k: walop.quality(g.run, **k), "q.ecsv", True),
     "model": Case(
         lambda g: (g.calset, "--effect", "clp_zero"),
         lambda g, **k: walop.model(g.calset, effect=["clp_zero"], **k),

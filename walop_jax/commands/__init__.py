@@ -29,6 +29,8 @@ COMMANDS = {
     "certify": "Check a calibration from its checksums to its physics and its accuracy.",
     "epoch": "Fit new calibration sets and compare with an old calibration.",
     "watch": "Say when a calibration ceased to hold, from the stars of many nights.",
+    "affected": "Say which catalogues a new calibration changes, and by how much.",
+    "quality": "Add a row of quality numbers for each night to a table, and say which lie outside their limits.",
     "stack": "Fit many nights at once, each parameter under a law that says how it may change.",
     "model": "Write the base model as a file.",
     "instrument": "Print and check an instrument.",

@@ -23,6 +23,7 @@ from walop_jax.commands.inputs import (
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
+    from walop_jax import Calibration
     from walop_jax.data.user_tables import InputTable
 
 CATALOGUE = Argument(
@@ -82,7 +83,6 @@ def apply(
     """
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.plain_tables import table_format
-    from walop_jax.nights.stacking import calibration_of_stars, is_survey, read_survey
     from walop_jax.posterior.draws import with_moments
     from walop_jax.science.apply import apply as apply_to_rows
     from walop_jax.science.catalogue import read_catalogue
@@ -97,10 +97,7 @@ def apply(
         table_format(output)
     job.begin("reading")
     table, said = _table_of(catalogue)
-    if is_survey(calibration):
-        held = calibration_of_stars(read_survey(calibration, catalogue_of(effects)), table, force=force)
-    else:
-        held = calibration_of(calibration, effects)
+    held = calibration_for(calibration, table, effects, force=force)
     instrument, limit = held.model.template.patched(), math.inf if saturation is None else saturation
     rows = read_catalogue(table, instrument, limit, always_in=held.always_in, never_in=held.never_in)
     job.tell("tabulating the analysis vectors", "tabulating")
@@ -160,6 +157,17 @@ def _common(made: Any) -> tuple[Any, Sequence[str]]:
 
     table, remarks = common_table(in_memory(made, "the result"))
     return table, (*remarks, *check_common_table(table))
+
+
+def calibration_for(
+    given: Any, stars: InputTable, effects: Effects = None, *, force: bool = False
+) -> Calibration:
+    """A calibration as `calibration_of` has it; of a survey that of the time of `stars`, of one night."""
+    from walop_jax.nights.stacking import calibration_of_stars, is_survey, read_survey
+
+    if is_survey(given):
+        return calibration_of_stars(read_survey(given, catalogue_of(effects)), stars, force=force)
+    return calibration_of(given, effects)
 
 
 def _counted(alone: bool) -> dict[Any, str]:

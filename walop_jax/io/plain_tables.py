@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Column as AstropyColumn
-from astropy.table import Table
+from astropy.table import Table, vstack
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
@@ -85,6 +85,11 @@ def _as_votable(table: Table) -> Any:
             TimeSys(ID="TIME", timescale=scale, refposition="TOPOCENTER", timeorigin=0.0)
         )
     return made
+
+
+def stacked(first: Any, second: Any) -> Any:
+    """The rows of two tables as one; what a row has no column for is masked."""
+    return vstack([first, second], metadata_conflicts="silent")
 
 
 def write_table(path: str | os.PathLike[str], table: Table, *, overwrite: bool = False) -> None:

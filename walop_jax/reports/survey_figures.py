@@ -19,6 +19,7 @@ from walop_jax.reports.style import (
     day_of,
     styled,
 )
+from walop_jax.science.quality import ERRORS, GAIN, OUTSIDE, Limits
 from walop_jax.science.watch_found import Watch
 
 MOST = 8  # parameters in a figure
@@ -104,6 +105,41 @@ def watch_figure(found: Watch) -> Figure:
     axes[0, 0].set_title("gain since the calibration; grey: steps that would not be seen", fontsize=FONT)
     if not calendar(axes[-1, 0], found.time):
         axes[-1, 0].set_xlabel("number of the exposure group", fontsize=FONT)
+    return figure
+
+
+PANELS: Mapping[str, tuple[tuple[str, ...], float, str]] = {
+    "ANGLE": (("ANGLE",), 1.0, "angle (deg)"),
+    "P_RATIO": (("P_RATIO",), 1.0, "p / catalogue"),
+    "ZERO_Q": (("ZERO_Q", "ZERO_U"), 100.0, "zero of q, u (%)"),
+    "CHI2DOF": (("CHI2DOF",), 1.0, "χ²/dof"),
+    "ACCURACY": (("ACCURACY",), 100.0, "error of p (%)"),
+}
+"""Panels of the quality numbers: columns, factor, label."""
+
+
+@styled
+def quality_figure(table: Any, limits: Limits) -> Figure:
+    """Quality numbers night by night, of all cameras last; grey: their limits, red: outside."""
+    gains = [name for name in table.colnames if name.startswith(f"{GAIN}_")]
+    panels = {**PANELS, GAIN: (tuple(gains), 1.0, "gain of cameras")}
+    figure, axes = PAGE.panels(6.4, 0.9 + 1.1 * len(panels), len(panels), 1, sharex=True, squeeze=False)
+    night = np.asarray(table["NIGHT"], float)
+    time = day_of(night)
+    for axis, (limited, (names, factor, label)) in zip(axes[:, 0], panels.items(), strict=True):
+        for name, marker in zip(names, "osD^v<>phx", strict=False):
+            values = factor * np.ma.filled(np.ma.asarray(table[name], float), np.nan)
+            error = factor * np.asarray(table[ERRORS[name]], float) if name in ERRORS else None
+            outside = np.array([name in str(entry).split() for entry in table[OUTSIDE]])
+            axis.errorbar(time, values, error, fmt=marker, ms=3, lw=0.8, color=AFTER, label=name)
+            axis.plot(time[outside], values[outside], marker, ms=5, color=BEFORE, zorder=5)
+        if limited in limits and limited != GAIN:
+            low, high = (factor * value for value in limits[limited])
+            axis.axhspan(low, high, color=QUIET, lw=0, zorder=0)
+        axis.set_ylabel(label, fontsize=SMALL)
+        if len(names) > 1:
+            axis.legend(ncol=len(names), fontsize=SMALL, frameon=False)
+    calendar(axes[-1, 0], night)
     return figure
 
 

@@ -104,9 +104,18 @@ def apply(
         watched += work.residuals(block, chosen)
         if progress is not None:
             progress(done, len(catalogue))
+    return work.together(_joined(parts), work.checked(watched, chosen))
+
+
+def results_of(calibration: Calibration, catalogue: Catalogue) -> Stars:
+    """Stokes parameters of all stars, each by itself: nothing that all of them say together is in the errors."""
+    work = _Application(AnalysisVectors(calibration), catalogue, force=True)
+    return _joined([work.block(rows).stars for _, rows in work.blocks()])
+
+
+def _joined(parts: list[Stars]) -> Stars:
     columns = [f.name for f in dataclasses.fields(Stars) if f.name != "check"]
-    stars = Stars(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))  # pyright: ignore[reportArgumentType]
-    return work.together(stars, work.checked(watched, chosen))
+    return Stars(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))  # pyright: ignore[reportArgumentType]
 
 
 def residuals_of(
