@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Job, Option, Outcome, Writers, command, text_file
+from walop_jax.commands.command import (
+    Job,
+    Option,
+    Outcome,
+    UsageError,
+    Writers,
+    command,
+    text_file,
+)
 from walop_jax.commands.inputs import (
     Effects,
-    Folder,
     InstrumentLike,
     ModelLike,
+    PathLike,
     Sets,
+    paths_of,
     set_and_model,
 )
 from walop_jax.io.names import DIAGNOSIS, FIGURE_DATA, MODEL, PRODUCT, SUMMARY
@@ -26,11 +36,19 @@ OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA, MODEL)
 
 
 MINUTES = Option(
-    "Minutes after which no further name is looked for (default: 20; 5 where the model is far from the data).",
+    "Minutes after which no further name is looked for (default: none; the search ends by itself).",
     "MINUTES",
     float,
     least=0.0,
 )
+
+
+WHY = Option(
+    "Answer why an effect, or a description, was not named by a diagnosis that has been made; give its RUN.",
+    "NAME",
+    str,
+)
+RUN = Option("Folder of the results.", "RUN", Path, "-o")
 
 
 @command(stages=("reading", "fitting", "scoring", "naming", "mapping"), writes=OUTPUTS, random=True)
@@ -39,10 +57,11 @@ def diagnose(
     data: Sets,
     model: ModelLike = None,
     *,
-    output: Folder = None,
+    output: Annotated[PathLike | None, RUN] = None,
     instrument: InstrumentLike = None,
     effects: Effects = None,
     minutes: Annotated[float | None, MINUTES] = None,
+    why: Annotated[str | None, WHY] = None,
 ) -> Outcome[Diagnosis]:
     """Say what is missing from the model, add it, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
 
@@ -52,33 +71,44 @@ def diagnose(
     `walop-jax report` draws its figures from RUN/diagnosis.fits. Exit code 3 where that calibration is not to be
     trusted, whatever was found.
 
-    In Python: a `Diagnosis`; `effects=(*walop.EFFECTS, MyEffect)` adds one of your own to those that may be named.
+    `--why NAME RUN` fits nothing: it says from RUN/diagnosis.json why NAME was not named, with the numbers.
+
+    In Python: a `Diagnosis`, whose `why(name)` gives that answer; `effects=(*walop.EFFECTS, MyEffect)` adds one of your
+    own to those that may be named.
 
     >>> walop.diagnose("night.fits", progress=print).verdict  # doctest: +SKIP
     """
-    from walop_jax.calibration.product import write_calibration
-    from walop_jax.calibration.summary import summary
-    from walop_jax.diagnosis.figure_data import figure_data, write_figure_data
-    from walop_jax.diagnosis.findings import document
     from walop_jax.diagnosis.workflow import diagnose as diagnosis_of
-    from walop_jax.fit.misfit import describe
-    from walop_jax.fit.model_file import render
-    from walop_jax.science.field_accuracy import answered
 
+    if why is not None:
+        return _why(why, data)
+    if job.typed and output is None:
+        raise UsageError("Missing option '--output' / '-o'.", "output")
     job.begin("reading")
     calset, chosen = set_and_model(data, model, instrument, effects, output=output)
     with job.repeated() as say:
         found = diagnosis_of(calset, chosen, seed=job.seed, minutes=minutes, progress=say)
+    return outcome_of(job, found, output)
 
-    product = found.calibration()
-    after = answered(found.after, product)
+
+def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[Diagnosis]:
+    """Outcome of a diagnosis: all that is printed and written of it."""
+    from walop_jax.calibration.product import write_calibration
+    from walop_jax.calibration.summary import summary
+    from walop_jax.diagnosis.figure_data import figure_data, write_figure_data
+    from walop_jax.diagnosis.findings import document
+    from walop_jax.fit.misfit import describe
+    from walop_jax.fit.model_file import render
+    from walop_jax.science.field_accuracy import answered
+
+    product, after = found.calibration(), answered(found.after)
     usable = after.trusted and found.verdict != "unexplained"
 
     def files() -> Writers:
         job.tell("mapping the field", "mapping")
         drawn_from = figure_data(found)
         misfit = None if after.explains_data else describe(after)
-        fitted = summary(after, seconds=job.seconds, misfit=misfit) | {"seed": job.seed}
+        fitted = summary(after, seconds=found.seconds, misfit=misfit) | {"seed": job.seed}
         return {
             PRODUCT: lambda path: write_calibration(path, product),
             SUMMARY: text_file(json_text(fitted | {"shown": after.display().document()})),
@@ -97,6 +127,28 @@ def diagnose(
         trusted=usable,
         next=(f"walop-jax report {output}", *[f"walop-jax apply {output} STARS.fits -o OUT.fits"] * usable),
     )
+
+
+def _why(name: str, data: Sets) -> Outcome[Any]:
+    """The answer of a run to why something was not named."""
+    from walop_jax.diagnosis.reasons import why
+    from walop_jax.io.run_folder import RunFolder
+
+    paths = paths_of(data)
+    if len(paths) != 1:
+        raise UsageError("give the folder of one diagnosis", "data")
+    run = RunFolder(Path(paths[0]))
+    run.wanted(DIAGNOSIS, "give the RUN of walop-jax diagnose")
+    answer = why(run.document(DIAGNOSIS, ("steps", "candidates")), name)
+    return Outcome(answer, {"name": name, "answer": answer.splitlines()}, answer)
+
+
+def write(found: Diagnosis, folder: PathLike, *, overwrite: bool = False) -> None:
+    """Write a diagnosis as the folder that the command makes."""
+    from walop_jax.io.folder import output_folder
+
+    with output_folder(folder, OUTPUTS, overwrite=overwrite) as out:
+        outcome_of(Job(), found, folder).save(out)
 
 
 def _with_answer(found: Diagnosis, after: FitResult) -> Display:

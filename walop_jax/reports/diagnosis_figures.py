@@ -16,9 +16,9 @@ from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
 from matplotlib.ticker import MaxNLocator
 
 from walop_jax.data.records import Points
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, PointMap, ResidualComparison, Table
 from walop_jax.diagnosis.limits_found import NO_LEVEL, DetectionLimits
-from walop_jax.diagnosis.policy import POLICY
 from walop_jax.fit.verdict import SUSPECT_SIGMA
 from walop_jax.reports.style import (
     AFTER,
@@ -262,7 +262,7 @@ def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
 
 
 _PIXELS = 121
-_STEPS = (0.0, 1.0, 2.0, POLICY.separation, 4.0, 5.0, 6.0)
+_STEPS = (0.0, 1.0, 2.0, thresholds.SEPARATION, 4.0, 5.0, 6.0)
 
 
 @styled
@@ -304,6 +304,6 @@ def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     axis.set_ylabel("effect present (at its detection limit)", fontsize=FONT)
     axis.set_xlabel("could be mistaken for", fontsize=FONT)
     colour_bar(
-        figure, shown, axis, f"separation (σ); below {POLICY.separation:g}: can be mistaken", shrink=0.7
+        figure, shown, axis, f"separation (σ); below {thresholds.SEPARATION:g}: can be mistaken", shrink=0.7
     )
     return figure
