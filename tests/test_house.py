@@ -188,7 +188,7 @@ MOST_LINES = {
     "sky": 450,
     "model": 9480,
     "likelihood": 3300,
-    "simulation": 1100,
+    "simulation": 1130,
     "fit": 2200,
     "calibration": 2850,
     "posterior": 2400,

@@ -268,7 +268,8 @@ class Sources:
     """Standard stars: catalogue `q`, `u` and their errors in the equatorial frame, `teff` in K (or NaN).
 
     `filter` is the band of a value, "" where the catalogue does not state it (None: nowhere). A star with values in
-    several bands has a row for each, with one number `source`; its first row stands for it wherever a star is meant.
+    several bands has a row for each, with one number `source`; its first row stands for it wherever a star is meant. A
+    row may be a field of stars, which differ from its `q`, `u` by `scatter` (rms of each).
     """
 
     source: Int[np.ndarray, " s"]
@@ -279,8 +280,11 @@ class Sources:
     u_err: Float[np.ndarray, " s"]
     teff: Float[np.ndarray, " s"]
     filter: Shaped[np.ndarray, " s"] = None  # pyright: ignore[reportAssignmentType]
+    scatter: Float[np.ndarray, " s"] = None  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self) -> None:
+        if self.scatter is None:
+            object.__setattr__(self, "scatter", np.zeros(len(self.source)))
         if self.filter is None:
             object.__setattr__(self, "filter", np.full(len(self.source), "", dtype="U1"))
 
@@ -294,10 +298,12 @@ class Sources:
         return first[number]
 
     def columns(self) -> dict[str, np.ndarray]:
-        """The columns of SOURCES; FILTER only where a band is stated."""
+        """The columns of SOURCES; FILTER and SCATTER only where there is any."""
         columns = {field.name.upper(): getattr(self, field.name) for field in dataclasses.fields(self)}
         if not (self.filter != "").any():
             del columns["FILTER"]
+        if not self.scatter.any():
+            del columns["SCATTER"]
         return columns
 
 
