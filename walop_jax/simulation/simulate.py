@@ -195,7 +195,9 @@ class PhotonNoise:
         Raises ValueError for expected counts that are negative or not finite.
         """
         if not (np.isfinite(expected).all() and np.all(expected >= 0.0)):
-            raise ValueError("expected counts must be finite and non-negative")
+            raise ValueError(
+                "expected counts must be finite and non-negative: an effect, or a prior, leaves no possible light"
+            )
         # Read noise first: how many random numbers a Poisson draw takes depends on what is expected.
         read = self.read_noise * rng.standard_normal(expected.shape)
         counts = rng.poisson(expected) + read
