@@ -13,6 +13,7 @@ from walop_jax.commands.demo import demo as demo
 from walop_jax.commands.diagnose import diagnose as diagnose
 from walop_jax.commands.docs import docs as docs
 from walop_jax.commands.epoch import epoch as epoch
+from walop_jax.commands.exposures import exposures as exposures
 from walop_jax.commands.gather import gather as gather
 from walop_jax.commands.import_zemax import import_zemax as import_zemax
 from walop_jax.commands.inputs import read as read
@@ -32,6 +33,7 @@ from walop_jax.commands.report import report as report
 from walop_jax.commands.sample import sample as sample
 from walop_jax.commands.simulate import simulate as simulate
 from walop_jax.commands.stack import stack as stack
+from walop_jax.commands.standards import standards as standards
 from walop_jax.commands.trace import trace as trace
 from walop_jax.commands.watch import watch as watch
 from walop_jax.data.calset import from_arrays as from_arrays
