@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from pathlib import Path
 from typing import ClassVar
@@ -11,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_run import SEED, SMALL
 
 import walop_jax
 from walop_jax.model import compiled as kept
@@ -19,7 +17,6 @@ from walop_jax.model.compiled import compiled
 from walop_jax.model.effects import Context, Described, Effect
 from walop_jax.model.effects.base import Scalar
 from walop_jax.model.parameters import param
-from walop_jax.simulation.simulate import simulate
 
 
 @pytest.fixture
@@ -30,10 +27,6 @@ def programs(tmp_path, monkeypatch) -> Path:
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     yield tmp_path / kept.FOLDER
     jax.config.update("jax_compilation_cache_dir", before)
-
-
-MOST_PROGRAMS = 10
-"""Programs of a fit with its verdict: each is traced and compiled, at first for a second or two."""
 
 
 def double(tree):
@@ -140,14 +133,3 @@ def test_every_program_has_a_name_of_its_own():
     names = [n for path in root.rglob("*.py") for n in re.findall(r'kept_as="(\w+)"', path.read_text())]
     assert len(names) > 10
     assert len(set(names)) == len(names)
-
-
-@pytest.mark.long
-def test_a_set_of_another_size_needs_no_program_of_its_own(programs):
-    """A fit with its verdict, of 25 points and of 36, in the same exposures."""
-    kinds = []
-    for grid in (5, 6):
-        walop_jax.refit(simulate(dataclasses.replace(SMALL, grid=grid), seed=SEED).calset)
-        kinds.append({path.name for path in programs.iterdir()})
-    assert 0 < len(kinds[0]) <= MOST_PROGRAMS
-    assert kinds[0] == kinds[1]
