@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import re
 
+import jax
 import numpy as np
 import pytest
 from quick import quick
@@ -33,6 +34,8 @@ from walop_jax.diagnosis.stated_conditions import (
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.fit.verdict import Hidden
+from walop_jax.model.instrument import nominal_instrument
+from walop_jax.model.planning import plan_for
 from walop_jax.model.specification import with_effects
 from walop_jax.simulation.simulate import effect_from_text, simulate
 
@@ -323,3 +326,16 @@ def test_the_error_at_the_limit_is_that_of_a_fit_that_is_misled():
 
     error = change_of_qu(matrix(misled), matrix(right))
     assert np.nanmax(error) == pytest.approx(limit.error_of_qu[1], rel=0.2)
+
+
+def test_a_set_with_another_colour_has_a_plan_of_the_same_shape():
+    """So its residuals need no program of their own."""
+    calset = simulate(SMALL, seed=SEED).calset
+    instrument = nominal_instrument(calset.instrument)
+    shapes = []
+    for kind in ("", *np.unique(calset.exposures.kind)):
+        teff = np.where(calset.exposures.kind == kind, 4000.0, calset.exposures.teff)
+        exposures = dataclasses.replace(calset.exposures, teff=teff)
+        plan = plan_for(instrument, exposures, calset.filters, calset.sources)
+        shapes.append((jax.tree.structure(plan), [np.shape(leaf) for leaf in jax.tree.leaves(plan)]))
+    assert all(one == shapes[0] for one in shapes)

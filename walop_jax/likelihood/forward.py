@@ -168,8 +168,9 @@ class Forward(eqx.Module):
 
     def chi2(self, values: Values | Instrument) -> Float[Array, ""]:
         """Sum of the squared residuals."""
-        part = jax.checkpoint(lambda data: jnp.sum(self._residuals(values, data) ** 2))
-        return jax.lax.scan(lambda total, data: (total + part(data), None), jnp.zeros(()), self.data)[0]
+        return engine.summed(
+            jax.checkpoint(lambda data: jnp.sum(self._residuals(values, data) ** 2)), self.data
+        )
 
     def log_likelihood(self, values: Values | Instrument) -> Float[Array, ""]:
         """−χ²/2 of the data."""
