@@ -1,4 +1,4 @@
-"""The optics of the sealed sets: those of `tests/oracle`, with a Mueller matrix near the identity somewhere in the train."""
+"""Optics of the sealed sets: those of `tests/oracle`, with a Mueller matrix near the identity in the train."""
 
 from __future__ import annotations
 
