@@ -35,6 +35,7 @@ SAID = {
     "Compare two nights": "HAS CHANGED",
     "My arrays": "Fit of WALOP-SOUTH",
     "How good would a plan be?": "M33_ERR",
+    "The quality of nights": "CHI2DOF",
 }
 
 
