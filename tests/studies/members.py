@@ -2,8 +2,8 @@
 
     PYTHONPATH=tests python tests/studies/members.py [--sets 18] [--seed 26112610]
 
-Sets of 64 field points by the oracle's optics (`sealed`); size 6 × 10⁻⁴ to 6 × 10⁻³ at 0.3°, growing with r². Nothing is
-searched for: the description is given, its class is worked out. Pulls are those of stars with p = 2 %, and of the
+Sets of 64 field points by the oracle's optics (`sealed`); size 6 × 10⁻⁴ to 6 × 10⁻³ at 0.3°, growing with r².
+Nothing is searched for: the description is given, its class is worked out. Pulls are those of stars with p = 2 %, and of the
 elements of the matrix, at 400 places.
 """
 
@@ -38,7 +38,7 @@ def judged(seed: int) -> sealed.Judged:
         "depolarisation", "behind collimator", size, np.diag([0.0, -1.0, -1.0, -1.0]),
         lambda x, y: (np.hypot(x, y) / 0.3) ** 2, np.ones_like, np.ones(1000), 1.0, np.zeros(4),
     )  # fmt: skip
-    with mock.patch.object(sealed, "draw", lambda rng, calset: hidden):
+    with mock.patch.object(sealed, "draw", return_value=hidden):
         one = sealed.sealed(2, seed, 8)
     base = base_model(one.calset)
     context = effect_context(base.template, one.calset.exposures)
