@@ -3,8 +3,8 @@
     PYTHONPATH=tests python tests/studies/members.py [--sets 18] [--seed 26112610]
 
 Sets of 64 field points by the oracle's optics (`sealed`); size 6 × 10⁻⁴ to 6 × 10⁻³ at 0.3°, growing with r².
-Nothing is searched for: the description is given, its class is worked out. Pulls are those of stars with p = 2 %, and of the
-elements of the matrix, at 400 places.
+Nothing is searched for: the description is given, its class is worked out. Pulls are those of stars with p = 2 %,
+and of the elements of the matrix, at 400 places.
 """
 
 from __future__ import annotations
