@@ -7,16 +7,23 @@ import class_scene
 import numpy as np
 import pytest
 from class_scene import TOLD
+from small_run import SMALL
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify
 from walop_jax.calibration.matrix import instrument_matrices
+from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import _with_ties, averaged, only_a_class
+from walop_jax.diagnosis.examination import examine
 from walop_jax.fit.model_file import base_model
+from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described
-from walop_jax.model.specification import with_effects
+from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.posterior.run import Run
+from walop_jax.simulation.simulate import simulate
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +89,22 @@ def test_a_class_of_one_changes_nothing(told):
     result, context, _ = told
     alone = Calibration.from_fit(result.judged())
     assert averaged(alone, (), context) is alone
+
+
+def test_what_was_added_is_in_its_class_once():
+    """A fit is no linear step: the same sentence by one step from nothing differs from it by more than its errors."""
+    own, other = "depolarisation of polariser * r2", "depolarisation behind collimator * r2"
+    calset = simulate(SMALL, seed=3, effects=[Described.saying([other], [6e-3])]).calset
+    context = effect_context(base_model(calset).template, calset.exposures)
+    model = with_effects(base_model(calset), [Described.saying([own], [5e-3])], context)
+    said = [
+        probe
+        for probe in grammar.sentences(model.template, calset.exposures, len(calset.points))
+        if probe.name in (own, other)
+    ]
+    state = examine(fit(Likelihood.of(calset, model)), (), np.random.default_rng(0), sentences=said)
+    (found,) = classes_of(state, context, {Described.name}, [own])
+    assert [member.name for member in found.members] == [own, other]
 
 
 def test_the_product_is_read_as_it_was_written(told, tmp_path):

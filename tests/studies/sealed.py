@@ -35,11 +35,13 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.stats import binomtest
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from oracle import forward  # noqa: E402
+from studies.sealed_optics import Hidden, vectors  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
@@ -58,79 +60,6 @@ WORSE = 1.2
 PLACES, TEFF, STAR_SECONDS, STAR_P = 400, 5772.0, 60.0, 0.02
 NODES = 24  # of the band: 10⁻⁹ of the whole table
 ELECTRONS = 1e6
-
-
-# ------------------------------------------------------------------------------------------------ the oracle's optics
-
-
-def full_mueller(jones: np.ndarray) -> np.ndarray:
-    """Mueller matrix (…, 4, 4) of a Jones matrix: ½ Tr(σ_i J σ_j J†), V = 2 Im(E_x* E_y)."""
-    sigma = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, -1j], [1j, 0]]])
-    return 0.5 * np.einsum("iab,...bc,jcd,...ad->...ij", sigma, jones, sigma, jones.conj()).real
-
-
-def halves(params: dict[str, Any], x: np.ndarray, y: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
-    """Mueller matrices (point, wavelength, half, 4, 4) of wedge and plate."""
-    k, each = forward.pupil_direction(params, x, y), []
-    for half, axis in ((1, 0.0), (2, np.radians(22.5))):
-        behind = forward.through_wedge(k, params[f"wedge_{half}"], wavelength)
-        thick = params[f"quartz_{half}"], params[f"mgf2_{half}"]
-        each.append(full_mueller(forward.plate_jones(behind, wavelength, *thick, axis)))
-    return np.stack(each, axis=2)
-
-
-class Hidden(NamedTuple):
-    """One thing that is hidden: where, how large, and its patterns; `text` says it in words."""
-
-    text: str
-    where: str
-    size: float
-    generator: np.ndarray
-    field: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    colour: Callable[[np.ndarray], np.ndarray]
-    law: np.ndarray
-    star: float
-    cameras: np.ndarray
-    gamma: float = 0.0
-
-
-def vectors(
-    params: dict[str, Any],
-    x: np.ndarray,
-    y: np.ndarray,
-    band: tuple[np.ndarray, np.ndarray],
-    one: Hidden | None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Analysis vectors (point, camera, 4) of the instrument, and what the hidden optics add to them at g = 1."""
-    wavelength, weight = band
-    arms, coll = halves(params, x, y, wavelength), forward.collimator(params, x, y)
-    efficiency = np.array([params["eta_1"], params["eta_2"]])
-    rows = np.zeros((4, 4))  # of the four cameras, of what is ahead of their analyser
-    rows[:, 0] = 0.5
-    rows[:, 1] = 0.5 * np.array([1, -1, 1, -1]) * np.repeat(efficiency, 2)
-    half = np.array([0, 0, 1, 1])
-    through = forward.camera_throughput(params, x, y)
-    plain = np.einsum("w,ki,pwkij,pjl->pkl", weight, rows, arms[:, :, half], coll, optimize=True)
-    added = np.zeros_like(plain)
-    if one is not None and one.where in ("behind polariser", "behind collimator", "half 1", "half 2"):
-        pattern = one.size * one.field(x, y)
-        spectral = weight * one.colour(wavelength)
-        a = one.generator
-        if one.where == "behind polariser":
-            chain = np.einsum(
-                "w,ki,pwkij,pjl,lm->pkm", spectral, rows, arms[:, :, half], coll, a, optimize=True
-            )
-        elif one.where == "behind collimator":
-            chain = np.einsum(
-                "w,ki,pwkij,jl,plm->pkm", spectral, rows, arms[:, :, half], a, coll, optimize=True
-            )
-        else:
-            chain = np.einsum(
-                "w,ki,ij,pwkjl,plm->pkm", spectral, rows, a, arms[:, :, half], coll, optimize=True
-            )
-            chain *= (half == int(one.where[-1]) - 1)[None, :, None]
-        added = pattern[:, None, None] * chain
-    return through[..., None] * plain, through[..., None] * added
 
 
 # ------------------------------------------------------------------------------------------------------- what is drawn
@@ -564,7 +493,10 @@ def table(found: list[Outcome]) -> str:
     """Rates, as they are asked for."""
 
     def rate(count: int, of: int) -> str:
-        return f"{count} of {of}" + (f" ({100 * count / of:.1f} %)" if of else "")
+        if not of:
+            return "0 of 0"
+        low, high = (float(limit) for limit in binomtest(count, of).proportion_ci(0.95))
+        return f"{count} of {of} ({100 * count / of:.1f} %; 95 %: {100 * low:.1f} to {100 * high:.1f} %)"
 
     products = [one for one in found if one.after is not None]
     rows = []

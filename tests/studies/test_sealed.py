@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from oracle import forward
-from studies.sealed import Hidden, full_mueller, generators, vectors
+from studies.sealed import generators
+from studies.sealed_optics import Hidden, full_mueller, vectors
 
 X, Y = np.array([0.0, 0.2, -0.13]), np.array([0.1, -0.22, 0.0])
 BAND = np.array([0.58, 0.66]), np.array([0.4, 0.6])

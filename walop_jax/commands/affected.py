@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.apply import calibration_for
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import Effects, PathLike, table_of
+from walop_jax.commands.inputs import Diagnosed, Effects, PathLike, table_of
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run
@@ -23,8 +23,8 @@ LIMIT = Option("Shift (standard errors) from which a result is made again (defau
 @command(stages=("reading", "tabulating"))
 def affected(
     job: Job,
-    old: Annotated[Calibration | FitResult | Run | PathLike, OLD],
-    new: Annotated[Calibration | FitResult | Run | PathLike, NEW],
+    old: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike, OLD],
+    new: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike, NEW],
     catalogues: Annotated[Any, CATALOGUES],
     *,
     limit: Annotated[float, LIMIT] = 0.5,

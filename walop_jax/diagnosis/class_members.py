@@ -137,7 +137,9 @@ class _Laid:
         """The class of what has the amplitudes `at`, without which the residuals change by `lost`."""
         step = _Step(self, at, lost)
         told = step.told(name, sums)
-        members = [told, *step.candidates(told.evidence)]
+        # What was added is a candidate as well: it is itself, not one more of the class.
+        others = (one for one in step.candidates(told.evidence) if _texts(one.sums) != _texts(sums))
+        members = [told, *others]
         members += [other for one in members if (other := step.in_other_kinds(one)) is not None]
         best = max(member.evidence for member in members)
         least = best - thresholds.IMPROBABLE
@@ -311,6 +313,11 @@ def _in_kind(sentence: Sentence, kind: str, other: str) -> Sentence:
     """A sentence about exposures of another KIND."""
     factors = tuple(f"kind {other}" if text == f"kind {kind}" else text for text in sentence.factors)
     return dataclasses.replace(sentence, factors=factors)
+
+
+def _texts(sums: Sequence[Sum]) -> set[str]:
+    """The sentences of some amplitudes."""
+    return {sentence.text for each in sums for _, sentence in each}
 
 
 def _width(each: Sum) -> float:
