@@ -82,6 +82,21 @@ def test_where_nothing_was_missing_it_says_so():
     assert "nothing was tried: of all patterns together p = 0.37" in why(quiet, "gain of O1 * x")
 
 
+def test_a_fit_without_evidence_is_told_without_a_number():
+    asked = {
+        "name": "ghost",
+        "evidence": None,
+        "p_value": 0.1,
+        "fitted": True,
+        "reason": "its fit did not converge",
+    }
+    rounds = [{"p_value": 1e-12, "added": "", "asked": [asked]}]
+    assert "round 1: no ln B fitted, p = 0.1: its fit did not converge" in why(
+        FOUND | {"rounds": rounds}, "ghost"
+    )
+    assert "the most probable" not in why(FOUND | {"rounds": rounds}, "gain of O1 * x")
+
+
 def test_what_was_added_and_is_gone_is_told():
     assert "taken out again: the final model does not need it" in why(FOUND | {"steps": []}, "clp_zero")
     part = {"parts": ["clp_zero (χ²/dof 69 → 24)"]}

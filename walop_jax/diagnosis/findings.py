@@ -542,7 +542,11 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "chi2_per_dof_before": diagnosis.before.chi2 / max(diagnosis.before.dof, 1),
         "chi2_per_dof_after": diagnosis.after.chi2 / max(diagnosis.after.dof, 1),
         "rounds": [
-            {"p_value": turn.p_value, "added": turn.added, "asked": [one._asdict() for one in turn.asked]}
+            {
+                "p_value": turn.p_value,
+                "added": turn.added,
+                "asked": [{**one._asdict(), "evidence": _number(one.evidence)} for one in turn.asked],
+            }
             for turn in diagnosis.rounds
         ],
         "not_scored": dict(diagnosis.not_scored),

@@ -76,7 +76,8 @@ def _of_the_rounds(found: Document, name: str) -> Iterator[str]:
             yield f"round {number}: not significant by itself, so not tried{added}"
             continue
         how = "fitted" if one["fitted"] else "by a linear step"
-        numbers = f"ln B = {one['evidence']:.4g} {how}, p {probability(one['p_value'])}"
+        worth = "no ln B" if one["evidence"] is None else f"ln B = {one['evidence']:.4g}"
+        numbers = f"{worth} {how}, p {probability(one['p_value'])}"
         yield f"round {number}: {numbers}: {one['reason'] or 'added'}{added if one['reason'] else ''}"
     if not rounds and name in known:
         yield f"nothing was tried: of all patterns together p {probability(found['p_value'])}, nothing is missing"
@@ -110,7 +111,8 @@ def _of_a_description(found: Document, name: str) -> Iterator[str]:
         "by itself, came behind all that are listed, or is one of a longer group or part of an effect"
     )
     for number, turn in enumerate(rounds, start=1):
-        best = max(turn["asked"], key=lambda one: one["evidence"], default=None)
+        some = [one for one in turn["asked"] if one["evidence"] is not None]
+        best = max(some, key=lambda one: one["evidence"], default=None)
         if best is not None:
             yield f"round {number}: the most probable was {best['name']} (ln B = {best['evidence']:.4g})"
 
