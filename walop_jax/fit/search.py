@@ -109,14 +109,14 @@ def _search(
     return FoundMinimum(minimum, model.full(minimum.x, first))
 
 
-def nearer(likelihood: Likelihood, values: Vector, distance: float, expand: Expand | None = None) -> Vector:
+def nearer(likelihood: Likelihood, values: Vector, distance: float) -> Vector:
     """Values that are no more than a distance (standard errors, all parameters together) from the minimum.
 
     They are `values` themselves where these are; the closest that a few steps reach where there is no such place.
-    `expand` takes the place of `Likelihood.expand`.
     """
-    how = {"maximum_steps": FIRST_STEPS, "tolerance": distance, "expand": expand}
-    return _search(likelihood, "closer to the data", values, 1.0, **how).values
+    return _search(
+        likelihood, "closer to the data", values, 1.0, maximum_steps=FIRST_STEPS, tolerance=distance
+    ).values
 
 
 def find_minimum(

@@ -14,9 +14,7 @@ Limits      first order. Where detectors are not linear their derivative stands 
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-import hashlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -41,7 +39,7 @@ from walop_jax.model.effects.optics import LARGEST_GAP
 from walop_jax.model.elements import WavePlate
 from walop_jax.model.elements.wave_plate import AirGap
 from walop_jax.model.instrument import Instrument, NoSuchPlaceError
-from walop_jax.model.plan import Plan, blank_exposures
+from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for
 from walop_jax.model.slots import LightSlopes, Slot, VectorSlopes
 from walop_jax.model.sources import ExposureArrays, Sight
@@ -118,7 +116,7 @@ _own = compiled(
 class _AtPoint(NamedTuple):
     """Quantities of a field point; sites are the point itself and, where ghosts are active, the opposite one."""
 
-    vectors: Any  # `VectorSlopes`, computed ahead of the others; leading axis: sites
+    vectors: VectorSlopes  # leading axis: sites
     light: LightSlopes
     share: Float[Array, "m e k"]  # of the counts at a site that a camera sees
     counts: Float[Array, "m e k"]  # for light of unit flux at the sites, ahead of ghosts
@@ -129,28 +127,18 @@ class _AtPoint(NamedTuple):
     along: Float[Array, "e k"]
 
 
-def _sites(instrument: Instrument, x: Array, y: Array) -> tuple[Array, Array]:
-    """A field point, and the opposite one where ghosts are active."""
-    sites = 2 if light.has_ghosts(instrument) else 1
-    return jnp.stack([x, -x][:sites]), jnp.stack([y, -y][:sites])
-
-
-def _vectors_at_point(instrument: Instrument, plan: Plan, x: Array, y: Array) -> VectorSlopes:
-    at = jax.vmap(slots.vector_slopes, (None, None, 0, 0))
-    return at(instrument, plan, *_sites(instrument, x, y))
-
-
-def _at_point(
-    instrument: Instrument, plan: Plan, point: PointData, rows: Float[Array, "m b k 4"]
-) -> _AtPoint:
+def _at_point(instrument: Instrument, plan: Plan, point: PointData) -> _AtPoint:
     assert point.opposite_sky is not None
     x, y = jnp.stack([point.x, -point.x]), jnp.stack([point.y, -point.y])
     sights = Sight(plan.exposures, jnp.stack([point.sky, point.opposite_sky]), point.source, x, y)
-    sites = len(rows)
+    sites = 2 if light.has_ghosts(instrument) else 1
+    vectors = jax.vmap(slots.vector_slopes, (None, None, 0, 0))(instrument, plan, x[:sites], y[:sites])
     lights = jax.vmap(slots.light_slopes, (None, Sight(None, 0, None, 0, 0)))(
         instrument, sights._replace(sky=sights.sky[:sites], x=x[:sites], y=y[:sites])
     )
-    counts = jax.vmap(lambda v, taken: jnp.einsum("eks,eks->ek", v[point.band], taken))(rows, lights.taken)
+    counts = jax.vmap(lambda v, taken: jnp.einsum("eks,eks->ek", v[point.band], taken))(
+        vectors.vectors, lights.taken
+    )
     if sites == 1:
         opposite = light.counts(
             instrument,
@@ -171,7 +159,7 @@ def _at_point(
     share, ghost = jnp.stack([one, seen])[:sites], Ghost(jnp.ones(unit.shape[1]))
     opposite = ghost.seen(point.source < 0, opposite)
     added = {stage: add(reported, plan.exposures) for stage, add in ADDED.items() if stage != "median"}
-    return _AtPoint(None, lights, share, counts, opposite, flux, flux * unit, added, along)
+    return _AtPoint(vectors, lights, share, counts, opposite, flux, flux * unit, added, along)
 
 
 def _fringes(
@@ -207,63 +195,25 @@ def _pushed(
     return jax.vmap(jax.vmap(at), (None, 0))(counts, change)
 
 
-_vectors_at = compiled(
-    jax.vmap(_vectors_at_point, (None, None, 0, 0)),
-    optimised_above=limits.SELDOM_OPTIMISED_ABOVE,
-    kept_as="vector_slopes",
-)
 _at_points = compiled(
-    jax.vmap(_at_point, (None, None, 0, 0)),
-    optimised_above=limits.SELDOM_OPTIMISED_ABOVE,
-    kept_as="responses",
+    jax.vmap(_at_point, (None, None, 0)), optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="responses"
 )
 _fringes_at = compiled(_fringes, optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="fringes")
 _visible = compiled(_visibilities, kept_as="visibilities")
 _detectors = compiled(_pushed, kept_as="detector_slopes")
 
 
-class SharedVectors:
-    """Slopes of analysis vectors that have been computed, by all that they depend on; those used last are kept."""
-
-    def __init__(self) -> None:
-        self._kept: dict[bytes, VectorSlopes] = {}
-
-    def at(self, optics: Instrument, settings: Plan, x: Array, y: Array) -> VectorSlopes:
-        """Those at field points (deg)."""
-        leaves, structure = jax.tree.flatten((optics, dataclasses.replace(settings, work=0), x, y))
-        known = hashlib.sha256(repr(structure).encode())
-        for leaf in map(np.asarray, leaves):
-            known.update(repr((leaf.shape, leaf.dtype)).encode() + leaf.tobytes())
-        found = self._kept.pop(known.digest(), None)
-        if found is None:
-            found = jax.tree.map(np.asarray, _vectors_at(optics, settings, x, y))
-        self._kept[known.digest()] = found
-        while sum(one.slopes.nbytes for one in self._kept.values()) > limits.SHARED_VECTORS:
-            self._kept.pop(next(iter(self._kept)))
-        return found
-
-
 # ----------------------------------------------------------------------------------------------------- columns
 
 
 class Columns:
-    """The columns of any changes at one set of values of the parameters of a likelihood.
+    """The columns of any changes at one set of values of the parameters of a likelihood."""
 
-    Likelihoods with the same optics, places and settings may have their slopes of analysis vectors in common.
-    """
-
-    def __init__(
-        self, likelihood: Likelihood, values: Vector, in_common: SharedVectors | None = None
-    ) -> None:
+    def __init__(self, likelihood: Likelihood, values: Vector) -> None:
         self.likelihood, self.values = likelihood, values
-        self.vectors_at = _vectors_at if in_common is None else in_common.at
         self.instrument = likelihood.model.instrument(values)
         self.plan = likelihood.plan
         self.patched = self.instrument.patched()
-        # Neither sources nor exposures: analysis vectors depend on the optics and the settings alone.
-        self.optics = dataclasses.replace(self.patched, sources=(), sky_films=())
-        none = {"exposures": blank_exposures(self.optics, 1), "band_of": np.zeros((1, 1), int)}
-        self.settings = dataclasses.replace(self.plan, **none)
         self.of_vectors, self.of_light = slots.vector_slots(self.patched), slots.light_slots(self.patched)
         self.exposures: ExposureArrays = jax.tree.map(np.asarray, self.plan.exposures)
         self.fringed = slots.fringe_places(self.patched)
@@ -347,9 +297,7 @@ class Columns:
             return self._responses[start]
         size = limits.RESPONSES_TOGETHER
         (data,) = self.reader.batches(start, start + size, size)
-        vectors = self.vectors_at(self.optics, self.settings, data.x, data.y)
-        found = _at_points(self.instrument, self.plan, data, vectors.vectors)
-        response = data, jax.tree.map(np.asarray, found._replace(vectors=vectors))
+        response = data, jax.tree.map(np.asarray, _at_points(self.instrument, self.plan, data))
         if len(self.likelihood.used) <= limits.RESPONSES_KEPT:
             self._responses[start] = response
         return response

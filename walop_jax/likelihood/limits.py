@@ -35,8 +35,6 @@ RESPONSES_TOGETHER = 32
 """Field points whose responses are computed together: one program serves sets of any size."""
 RESPONSES_KEPT = 1024
 """Largest number of field points whose responses are kept for further columns: 200 MB."""
-SHARED_VECTORS = 200_000_000
-"""Bytes of the slopes of analysis vectors that sets have in common: those of seven nights of 144 points."""
 RESPONSE_NUMBERS = 4_000_000
 """Numbers of responses that meet the exposures of some points together: 32 MB."""
 

@@ -29,9 +29,9 @@ from walop_jax.fit.model_file import SKY_AND_STARS, gauges, header_of
 from walop_jax.fit.search import nearer
 from walop_jax.io.errors import DataError, fail
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.columns import Columns, SharedVectors
+from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.inverses import pseudo_inverse
-from walop_jax.likelihood.likelihood import DataTerms, Likelihood, OpticsUsed, Posterior, used_rows
+from walop_jax.likelihood.likelihood import Likelihood, used_rows
 from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.effects.catalogue import applies
 from walop_jax.model.parameters import Parameter, leaves
@@ -46,7 +46,6 @@ MOST_SHAPES = (
     4  # of an effect whose shapes are all candidates: cameras and plates, not places and thicknesses
 )
 OWN = 3.0  # squared distance of a night from its own minimum, for each parameter, that two nights' noise may make
-LINEAR = 0.1  # of χ², by which a linear problem may be off where candidates follow a night
 SIDEREAL = 1.00273791  # sidereal hours in an hour
 CLOCK = (
     0.2,
@@ -183,7 +182,7 @@ def candidates_of(
 
 
 def with_candidates(
-    likelihood: Likelihood, values: Vector, candidates: Candidates, in_common: SharedVectors | None = None
+    likelihood: Likelihood, values: Vector, candidates: Candidates
 ) -> tuple[float, Vector, Float[np.ndarray, "_ _"]]:
     """χ², gradient and matrix of the data of a table in free parameters and candidates (0: cannot be computed)."""
     model = likelihood.model
@@ -201,7 +200,7 @@ def with_candidates(
     r, jacobian = np.concatenate(residuals), np.concatenate(slopes)
     if changes:
         cut = len(model.free)
-        columns = Columns(likelihood, values, in_common)
+        columns = Columns(likelihood, values)
         there = [k for k, change in enumerate(changes) if change and columns.has(change)]
         added = np.zeros((len(r), len(changes)))
         added[:, there] = columns.of([changes[k] for k in there])
@@ -234,108 +233,61 @@ def night_equations(
     number: int | None = None,
     own: bool = False,
     sets: int = 1,
-    in_common: SharedVectors | None = None,
 ) -> list[Night]:
     """The nights of a set, linearised at values of the parameters: a full vector, or by name (others: start values).
 
     `changes` are the candidates (None: `candidates_of` each night), `number` the only night that is asked for. Nights
-    whose `own` minimum is farther from the values than noise explains are linearised closer to it; their candidates
-    follow them there (`with_candidates_of`) if the residuals are linear on the way. `sets` is how many such sets come,
-    `in_common` what their columns have in common. Of sets too large for a table of derivatives no candidates are kept.
-    Raises `DataError` as `split` does.
+    whose `own` minimum is farther from the values than noise explains are linearised closer to it. `sets` is
+    how many such sets come. Of sets too large for a table of derivatives no candidates are kept. Raises `DataError` as
+    `split` does.
     """
     if isinstance(values, Mapping):
         values = np.array([values.get(p.name, p.start) for p in model.parameters])
-    found, identity = [], data_hash(calset)
+    source = source_of(calset)
+    found = []
     for evening, some in split(calset):
         if number not in (None, evening):
             continue
-        passes = _Passes(Likelihood.of(some, model, sets=sets))
-        there = passes.nearer(values) if own else values
-        if passes.likelihood.layout.large:
-            night = _night(passes, identity, evening, there)
+        likelihood, there = Likelihood.of(some, model, sets=sets), values
+        if own:
+            there = nearer(likelihood, values, np.sqrt(OWN * len(model.free)))
+        if likelihood.layout.large:
+            terms, _ = likelihood.data_terms(there)
+            select = model.selection()
+            chi2, gradient, matrix = terms.data, select.T @ terms.gradient, select.T @ terms.matrix @ select
+            known, census = {}, terms.census
         else:
             known = candidates_of(model, some.exposures, model.catalogue) if changes is None else changes
-            first = values if there is not values and passes.linear(values, there) else there
-            terms = with_candidates(passes.likelihood, first, known, in_common)
-            night = _night(passes, identity, evening, first, known, terms)
-            if first is not there:
-                night = with_candidates_of(_night(passes, identity, evening, there), night)
-        found.append(night)
+            chi2, gradient, matrix = with_candidates(likelihood, there, known)
+            census = likelihood.census
+        e = some.exposures
+        found.append(
+            Night(
+                instrument=model.name,
+                model=model_hash(model),
+                number=evening,
+                begin=float(e.mjd.min()),
+                end=float(e.mjd.max()),
+                mjd=float(e.mjd.mean()),
+                filters=tuple(np.unique(e.filter).tolist()),
+                source=source,
+                sha256=data_hash(calset),
+                n_data=census.n_data,
+                dof=round(float(census.rows @ likelihood.data_per_row)),
+                chi2=chi2,
+                parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in known.values())),
+                candidates=len(known),
+                reference=np.concatenate(
+                    [
+                        there[model.free],
+                        [0.0 if change else there[model.index(name)] for name, (_, change) in known.items()],
+                    ]
+                ),
+                gradient=gradient,
+                matrix=matrix,
+            )
+        )
     return found
-
-
-@dataclasses.dataclass
-class _Passes:
-    """Passes over the data of a night."""
-
-    likelihood: Likelihood
-    _seen: dict[bytes, tuple[DataTerms, OpticsUsed]] = dataclasses.field(default_factory=dict)
-
-    def terms(self, values: Vector, near: Posterior | None = None) -> tuple[DataTerms, OpticsUsed]:
-        """Terms of the data, as `Likelihood.data_terms`."""
-        key = values.tobytes()
-        if key not in self._seen:
-            self._seen[key] = self.likelihood.data_terms(values, near)
-        return self._seen[key]
-
-    def nearer(self, values: Vector) -> Vector:
-        """`values`, or others closer to the minimum where that is farther than noise explains."""
-
-        def expand(there: Vector, noise_scale: float, near: Posterior | None) -> Posterior:
-            terms, optics = self.terms(there, near)
-            return self.likelihood.posterior(there, terms, noise_scale, optics)
-
-        distance = float(np.sqrt(OWN * len(self.likelihood.model.free)))
-        found = nearer(self.likelihood, values, distance, expand)
-        return values if np.array_equal(found, values) else found
-
-    def linear(self, values: Vector, there: Vector) -> bool:
-        """True if χ² at the one place is what the expansion at the other predicts, nearly."""
-        (first, _), (last, _) = self.terms(values), self.terms(there)
-        step = there - values
-        predicted = first.data + step @ (2.0 * first.gradient + first.matrix @ step)
-        return bool(abs(last.data - predicted) < LINEAR)
-
-
-def _night(
-    passes: _Passes,
-    identity: str,
-    number: int,
-    values: Vector,
-    candidates: Candidates | None = None,
-    terms: tuple[float, Vector, Float[np.ndarray, "_ _"]] | None = None,
-) -> Night:
-    """A night from its terms in free parameters and candidates; without candidates from those of a pass."""
-    likelihood, known = passes.likelihood, candidates or {}
-    model, calset = likelihood.model, likelihood.calset
-    if terms is None:
-        each, _ = passes.terms(values)
-        select, census = model.selection(), each.census
-        terms = each.data, select.T @ each.gradient, select.T @ each.matrix @ select
-    else:
-        census = likelihood.census
-    e = calset.exposures
-    at_neutral = [0.0 if change else values[model.index(name)] for name, (_, change) in known.items()]
-    return Night(
-        instrument=model.name,
-        model=model_hash(model),
-        number=number,
-        begin=float(e.mjd.min()),
-        end=float(e.mjd.max()),
-        mjd=float(e.mjd.mean()),
-        filters=tuple(np.unique(e.filter).tolist()),
-        source=source_of(calset),
-        sha256=identity,
-        n_data=census.n_data,
-        dof=round(float(census.rows @ likelihood.data_per_row)),
-        chi2=terms[0],
-        parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in known.values())),
-        candidates=len(known),
-        reference=np.concatenate([values[model.free], at_neutral]),
-        gradient=terms[1],
-        matrix=terms[2],
-    )
 
 
 def with_candidates_of(night: Night, before: Night) -> Night:

@@ -29,7 +29,6 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.model_file import model_like
 from walop_jax.io.code import files_of_users, run_file
 from walop_jax.io.errors import DataError, fail
-from walop_jax.likelihood.columns import SharedVectors
 from walop_jax.model.specification import Model
 from walop_jax.nights.equations import (
     Candidates,
@@ -89,7 +88,6 @@ class Maker:
     folder: Path | None
     count: int = 1
     """Number of sets: programs for many are optimised."""
-    _in_common: SharedVectors = dataclasses.field(default_factory=SharedVectors)
     _candidates: dict[tuple[str, ...], Candidates] = dataclasses.field(default_factory=dict)
     _sets: dict[str, tuple[CalibrationSet, Model]] = dataclasses.field(default_factory=dict)
 
@@ -115,9 +113,7 @@ class Maker:
         table = calset.intensities
         measured = sketch(calset, table) if isinstance(table, TableIntensities) else frozenset[int]()
         try:
-            nights = night_equations(
-                calset, model, values, candidates, own=True, sets=self.count, in_common=self._in_common
-            )
+            nights = night_equations(calset, model, values, candidates, own=True, sets=self.count)
         except DataError as error:
             return Made([], source_of(calset), measured, error)
         if place is not None:
@@ -133,9 +129,7 @@ class Maker:
         if not task.candidates:  # a gauge stays where its column was made
             cut = len(night.names) - night.candidates
             values |= dict(zip(night.names[cut:], night.reference[cut:].tolist(), strict=True))
-        (made,) = night_equations(
-            calset, model, values, candidates, number=night.number, sets=self.count, in_common=self._in_common
-        )
+        (made,) = night_equations(calset, model, values, candidates, number=night.number, sets=self.count)
         return Made([with_candidates_of(made, night)])
 
     def _set_and_model(self, data: Data) -> tuple[CalibrationSet, Model]:
