@@ -208,7 +208,7 @@ def test_calibration():
 
 
 def test_tables_and_catalogues():
-    from walop_jax.science.catalogue import POINT_COLUMNS
+    from walop_jax.science.field_points import POINT_COLUMNS
 
     assert unexplained(set(POINT_COLUMNS), section("files", "Tables of field points")) == []
     catalogues = section("files", "Catalogues")

@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.table import Table
+from camera_files import ascii_head, four
 from quick import quick
 from small_run import SEED, SMALL
 
+import walop_jax as walop
 from walop_jax.commands.docs import pages
 from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.refit import refit
@@ -50,6 +52,7 @@ def folder(tmp_path_factory) -> Path:
     write_calibration(path / "RUN" / "calibration.fits", Calibration.from_fit(refit(calset).judged()))
     x, y = np.random.default_rng(0).uniform(-0.25, 0.25, (2, 30))
     Table({"X": x, "Y": y}).write(path / "stars.csv")
+    four(walop.simulate(SMALL, seed=SEED, stars=60), path, ascii_head)
     clp = np.flatnonzero(calset.exposures.kind == "clp")
     block = calset.intensities.block(0, len(calset.points))
     points = np.flatnonzero(block.used[:, clp].all(axis=1))
@@ -60,8 +63,8 @@ def folder(tmp_path_factory) -> Path:
     return path
 
 
-def test_there_are_eight_of_at_most_six_lines():
-    assert len(SCRIPTS) == 8
+def test_there_are_nine_of_at_most_six_lines():
+    assert len(SCRIPTS) == 9
     for title, script in SCRIPTS.items():
         lines = [line for line in script.splitlines() if line.strip()]
         assert 0 < len(lines) <= MOST_LINES, title
@@ -75,3 +78,5 @@ def test_it_runs(title, folder, monkeypatch, capsys):
     assert SAID.get(title, "") in capsys.readouterr().out
     if title == "The matrix at my stars":
         assert len(Table.read(folder / "matrix.fits")) == 30
+    if title == "From SExtractor to a table for others":
+        assert walop.check_common_table(folder / "stars.fits") == ()

@@ -2,6 +2,7 @@
 
 from walop_jax.calibration.calibration import Calibration as Calibration
 from walop_jax.calibration.residual_map import residual_map as residual_map
+from walop_jax.commands.affected import affected as affected
 from walop_jax.commands.apply import apply as apply
 from walop_jax.commands.certify import certify as certify
 from walop_jax.commands.cite import cite as cite
@@ -12,6 +13,7 @@ from walop_jax.commands.demo import demo as demo
 from walop_jax.commands.diagnose import diagnose as diagnose
 from walop_jax.commands.docs import docs as docs
 from walop_jax.commands.epoch import epoch as epoch
+from walop_jax.commands.gather import gather as gather
 from walop_jax.commands.import_zemax import import_zemax as import_zemax
 from walop_jax.commands.inputs import read as read
 
@@ -24,6 +26,7 @@ from walop_jax.commands.matrix import matrix as matrix
 from walop_jax.commands.model import model as model
 from walop_jax.commands.plan import plan as plan
 from walop_jax.commands.plot import plot as plot
+from walop_jax.commands.quality import quality as quality
 from walop_jax.commands.refit import refit as refit
 from walop_jax.commands.report import report as report
 from walop_jax.commands.sample import sample as sample
@@ -53,6 +56,7 @@ from walop_jax.model.specification import with_effects as with_effects
 from walop_jax.posterior.result import Options as Options
 from walop_jax.posterior.result import arviz_of_fit as _to_arviz  # noqa: F401
 from walop_jax.posterior.run import Run as Run
+from walop_jax.science.common_table import check_common_table as check_common_table
 from walop_jax.simulation.observing_plan import ObservingPlan as ObservingPlan
 
 __version__: str

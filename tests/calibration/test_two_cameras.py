@@ -29,7 +29,8 @@ from walop_jax.model.planning import plan_for, plan_for_settings
 from walop_jax.model.specification import Model, make_model
 from walop_jax.model.trace import Sightline, trace
 from walop_jax.science.apply import apply
-from walop_jax.science.catalogue import field_points, read_catalogue
+from walop_jax.science.catalogue import read_catalogue
+from walop_jax.science.field_points import field_points
 from walop_jax.science.star_errors import determinant
 
 TEXT = """

@@ -17,7 +17,7 @@ from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.specification import effect_context, with_effects
-from walop_jax.science.catalogue import field_points
+from walop_jax.science.field_points import field_points
 
 from .conftest import FittedSet
 

@@ -11,7 +11,7 @@ from walop_jax.data.user_tables import extended, read_input_table
 from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import write_table
 from walop_jax.model.instrument import nominal_instrument
-from walop_jax.science.catalogue import field_points
+from walop_jax.science.field_points import field_points
 
 SOUTH = nominal_instrument("WALOP-SOUTH")
 

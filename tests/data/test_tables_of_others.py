@@ -19,7 +19,8 @@ from walop_jax.data.calset import from_arrays
 from walop_jax.data.user_tables import extended, in_memory, read_input_table
 from walop_jax.io.errors import DataError
 from walop_jax.model.instrument import nominal_instrument
-from walop_jax.science.catalogue import field_points, read_catalogue
+from walop_jax.science.catalogue import read_catalogue
+from walop_jax.science.field_points import field_points
 
 SOUTH = nominal_instrument("WALOP-SOUTH")
 ROWS = 5

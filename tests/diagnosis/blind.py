@@ -25,14 +25,13 @@ import numpy as np
 from linear_judge import Linear
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.examination import Evidence, Examination, examine
 from walop_jax.diagnosis.hypotheses import Probe, Ranked, probes, said_by
-from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import ScoreSpace, separations
-from walop_jax.diagnosis.search import search
+from walop_jax.diagnosis.search import State, search
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.flux import project_flux
@@ -338,8 +337,10 @@ class Blind:
         added: list[str] = []
         classes: list[frozenset[str]] = []
         first: Ranked | None = None
-        for trial, before, left in search(last, Cached(self._spaces, scene.removed), POLICY):
-            last, item = left, trial.item
+        judge = Cached(self._spaces, scene.removed)
+        last = search(State(last), judge).evidence
+        for trial, before in judge.adoptions:
+            item = trial.item
             assert item is not None
             first, name = first or item, item.effect.name
             named.append(name)
@@ -348,7 +349,7 @@ class Blind:
                 said.append(item.probe.name)
             told = {*trial.rivals, *trial.nameless, *before.close(item)}
             classes.append(frozenset(told - {name, item.probe.name}))
-        missing = last.alarm or len(said) > POLICY.most_sentences
+        missing = last.alarm or len(said) > thresholds.MOST_SENTENCES
         kind = "unexplained" if missing else "effect_found" if named else "consistent"
         verdict = Verdict(kind, tuple(named), tuple(classes), tuple(said), added=tuple(added))
         if first is None:
@@ -364,19 +365,20 @@ class Cached(Linear):
 
     def __init__(self, spaces: Spaces, removed: tuple[str, ...]) -> None:
         self.spaces, self.removed = spaces, removed
-        self.added: tuple[str, ...] = ()
+        self.adoptions: list[tuple[Trial, Evidence]] = []
 
-    def adopted(self, state: Evidence, trial: Trial) -> Evidence:
+    def adopted(self, state: State, trial: Trial) -> State:
         """As `Linear`, with the space of another scene where it went the same way."""
         item = trial.item
         assert item is not None
-        self.added = (*self.added, item.probe.name)
-        way = self.removed, self.added
-        after = state.joined(item, self.spaces.get(way))
+        self.adoptions.append((trial, state.evidence))
+        steps = (*state.steps, trial)
+        way = self.removed, tuple(step.item.probe.name for step in steps if step.item is not None)
+        after = state.evidence.joined(item, self.spaces.get(way))
         if len(self.spaces) > KEPT:
             self.spaces.clear()
         self.spaces[way] = after.space
-        return after
+        return dataclasses.replace(state, evidence=after, steps=steps)
 
 
 def study(

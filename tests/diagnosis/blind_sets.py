@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates, probes
-from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
@@ -137,7 +137,7 @@ def report(entries: list[dict[str, Any]]) -> dict[str, Any]:
             continue
         told = set(e["named"][:1]) | set(e["classes"][0] if e["classes"] else [])
         found, ratio = e["verdict"] == "effect_found", f"SNR {e['ratio']:g}"
-        rates[f"detected, {ratio}"].append(e["p"] < POLICY.alarm)
+        rates[f"detected, {ratio}"].append(e["p"] < thresholds.ALARM)
         rates[f"top-1, {ratio}"].append(e["named"][:1] == [e["truth"]])
         rates[f"truth named or in its class, {ratio}"].append(e["truth"] in told)
         rates[f"exactly the truth, {ratio}"].append(found and e["named"] == [e["truth"]])

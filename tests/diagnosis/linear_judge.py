@@ -2,36 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+import dataclasses
+from collections.abc import Mapping, Sequence
 
 from walop_jax.diagnosis.exact import Trial
+from walop_jax.diagnosis.examination import Evidence
+from walop_jax.diagnosis.findings import Choice
+from walop_jax.diagnosis.search import State
 
 
 class Linear:
-    """Judge of trials by their linear steps; nothing is held out and no time runs. `workflow.Refit` fits instead."""
+    """Judge of trials by their linear steps; nothing is held out and no time runs. `refits.Refits` fits instead."""
 
-    def time_left(self) -> bool:
-        """True if another trial may begin."""
-        return True
+    def over(self, fits: int) -> str:
+        """Nothing: linear steps cost nothing."""
+        return ""
 
-    def fitted(self, state: Any, trial: Trial) -> Trial | None:
-        """A linear trial as the judge finds it; None where nothing comes of it."""
+    def fitted(self, evidence: Evidence, trial: Trial) -> Trial:
+        """A linear trial as it is."""
         return trial
 
-    def others(self, state: Any) -> Iterator[Trial]:
-        """Trials of what has no linear step."""
-        return iter(())
+    def others(self, state: State) -> tuple[Sequence[Trial], Mapping[str, Choice]]:
+        """No trials of what has no linear step."""
+        return (), {}
 
     def decided(self, trials: list[Trial]) -> list[Trial]:
         """Trials, best first, with those of even odds in their order."""
         return trials
 
-    def confirmed(self, state: Any, trial: Trial) -> bool:
-        """True, for want of data that took no part in a trial: a score space has no rows."""
-        return True
+    def confronted(self, evidence: Evidence, trial: Trial) -> Trial:
+        """The trial as it is: a score space has no rows that could have been left out."""
+        return trial
 
-    def adopted(self, state: Any, trial: Trial) -> Any:
-        """The evidence of what is left once a trial has joined the model."""
+    def adopted(self, state: State, trial: Trial) -> State:
+        """The state with the evidence of what is left once a trial has joined the model."""
         assert trial.item is not None
-        return state.joined(trial.item)
+        evidence = state.evidence.joined(trial.item)
+        return dataclasses.replace(state, evidence=evidence, steps=(*state.steps, trial))

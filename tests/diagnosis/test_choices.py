@@ -9,7 +9,6 @@ from scenes import PLAN
 
 from walop_jax.diagnosis.descriptions import other_descriptions
 from walop_jax.diagnosis.findings import Choice, document
-from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import FitResult, fit
@@ -90,8 +89,7 @@ def fitted(plan, change: str, seed: int = 5) -> FitResult:
 def best_of(result: FitResult) -> Choice | None:
     """The change that gains most in χ²."""
     context = effect_context(result.model.template, result.calset.exposures)
-    tried: dict[str, Choice] = {}
-    trials = other_descriptions(result, context, POLICY, lambda: True, lambda text: None, tried)
+    trials, tried = other_descriptions(result, context, lambda: True, lambda text: None)
     assert all(trial.instance.change in tried for trial in trials)
     fitted_ones = [one for one in tried.values() if np.isfinite(one.better_by)]
     return max(fitted_ones, key=lambda one: one.better_by, default=None)

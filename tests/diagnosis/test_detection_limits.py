@@ -11,6 +11,7 @@ from score_draws import alarms, noise_scores
 from small_run import SEED, SMALL, small_fit
 
 from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.detection_limits import (
     PROBABILITY,
     DetectionLimits,
@@ -18,7 +19,6 @@ from walop_jax.diagnosis.detection_limits import (
 )
 from walop_jax.diagnosis.examination import Examination, examine
 from walop_jax.diagnosis.hypotheses import probes
-from walop_jax.diagnosis.policy import ALARM
 from walop_jax.diagnosis.score import effective_trials, local_p
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.model.effects import effect_by_name
@@ -63,7 +63,7 @@ def test_the_alarm_is_raised_with_the_stated_probability(found, examination):
     """Scores drawn with each effect at its limit: 99 % of the draws raise the alarm, at 90 % of it clearly fewer."""
     space = examination.space
     trials = effective_trials(space.smallest_p(np.random.default_rng(2)))
-    threshold = np.log(local_p(ALARM, trials))
+    threshold = np.log(local_p(thresholds.ALARM, trials))
     places, draws = space.places(), 2000
     noise = noise_scores(space, np.random.default_rng(3), draws)
     checked = 0

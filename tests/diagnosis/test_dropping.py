@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 from scenes import PLAN
 
-from walop_jax.diagnosis import workflow
-from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.examination import Examination
+from walop_jax.diagnosis import leftover, thresholds
+from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.figure_data import figure_data
-from walop_jax.diagnosis.findings import Unexplained
-from walop_jax.diagnosis.policy import POLICY
+from walop_jax.diagnosis.refits import Refits
+from walop_jax.diagnosis.search import State
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.refit import FitResult, fit
+from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import FreeForm, effect_by_name
+from walop_jax.model.effects import Context, FreeForm, effect_by_name
 from walop_jax.model.specification import model_without
 from walop_jax.simulation.simulate import simulate
 
@@ -51,7 +50,7 @@ def lead_from_the_first_fit_to_the_last(found):
 @pytest.fixture(scope="module")
 def strong():
     """An encoder error of 3°, thirty times the usual: a zero point is named first."""
-    found, told = diagnosed([dataclasses.replace(WOBBLE(), amplitude=3.0)], (ZERO, WOBBLE))
+    found, told = diagnosed([WOBBLE.of(PLAN.context(), amplitude=3.0)], (ZERO, WOBBLE))
     assert "added clp_zero; scoring what is left" in told
     assert "clp_zero is no longer needed" in told
     return found
@@ -81,44 +80,29 @@ def test_a_dropped_effect_is_one_of_those_not_found(strong):
     assert "clp_zero" in strong.steps[0].separation
 
 
-class Rehearsal(workflow.Refit):
-    """A diagnosis with parts played by dummies: something is missing as long as a name stands that is not needed."""
+def test_what_has_no_name_is_asked_of_the_model_without_needless_names(monkeypatch):
+    """Something is missing as long as a name stands that is not needed."""
+    result = SimpleNamespace(explains_data=True, chi2=1.0, dof=1, noise_scale=1.0)
 
-    def __init__(self):
-        self.fit = Mock(spec=FitResult, explains_data=True, chi2=1.0, dof=1, noise_scale=1.0)
-        self.steps, self.said, self.policy = [SimpleNamespace(effect="name")], [], POLICY
-        self.tell = lambda text: None
+    def state(*steps):
+        evidence = SimpleNamespace(alarm=bool(steps), result=result)
+        return State(evidence, steps)
 
-    def examined(self, earlier=None):
-        state = Mock(spec=Examination, alarm=bool(self.steps), design=Mock(spec=Design))
-        state.table = SimpleNamespace(p_global=float(not self.steps), noise_scale=1.0)
-        return state
-
-    def _drop_what_is_not_needed(self):
-        dropped, self.steps = bool(self.steps), []
-        return dropped
-
-    def _unexplained(self, state):
-        return Unexplained(state.table.p_global, "", ())
+    monkeypatch.setattr(leftover, "prune", lambda first, last, judge: state())
+    last, remainder = leftover.concluded(state(), state(Trial(ZERO, 1.0, 1.0, noise=False)), Mock(Refits))
+    assert (last.steps, remainder) == ((), None)
 
 
-def test_what_has_no_name_is_asked_of_the_model_without_needless_names():
-    judge = Rehearsal()
-    first = judge.examined()
-    state, nameless = judge.conclusion(first, first)
-    assert (nameless, judge.steps, state.table.p_global) == (None, [], 1.0)
-
-
-def test_when_time_is_over_nothing_further_is_tried():
-    judge = Rehearsal()
-    judge.until, judge.ended = 0.0, False
-    assert not judge.time_left()
-    assert judge.ended
+def test_when_time_or_fits_are_over_nothing_further_is_tried():
+    how = (Context(), (), (), (), (), np.random.default_rng(0), lambda text: None)
+    assert Refits(*how, minutes=0.0).over(0) == "0 minutes"
+    assert Refits(*how).over(thresholds.MOST_FITS) == f"{thresholds.MOST_FITS} fits"
+    assert Refits(*how).over(0) == ""
 
 
 @pytest.mark.long
 def test_after_a_drop_several_steps_follow_one_another():
-    effects = [dataclasses.replace(WOBBLE(), amplitude=3.0), dataclasses.replace(LEAKAGE(), share=1e-3)]
+    effects = [WOBBLE.of(PLAN.context(), amplitude=3.0), LEAKAGE.of(PLAN.context(), share=1e-3)]
     found, told = diagnosed(effects, (ZERO, WOBBLE, LEAKAGE))
     assert "clp_zero is no longer needed" in told
     assert [step.effect for step in found.steps] == ["clp_wobble", "camera_leakage"]
@@ -152,17 +136,11 @@ def test_what_has_no_name_is_told_without_a_name_that_could_stand_in_for_it():
 @pytest.mark.parametrize(("left", "part"), [(24.0, True), (1.4, False)])
 def test_a_name_that_leaves_the_data_as_unexplained_is_told_as_a_part_and_taken_out(left, part):
     """χ²/dof 69 → 24 with the name is a part of what is missing; 69 → 1.4 is the cause of most of it."""
-    told, gone = [], []
-    step = SimpleNamespace(effect="flexure", chi2_before=6900.0, chi2_after=100.0 * left)
-    state = SimpleNamespace(
-        steps=[step],
-        policy=POLICY,
-        tell=told.append,
-        _without=gone.append,
-        fit=SimpleNamespace(chi2=100.0 * left, dof=100),
-    )
-    first = Mock(Examination, dof=100, result=SimpleNamespace(chi2=6900.0, dof=100))
-    said = workflow.Refit._parts(state, first)  # pyright: ignore[reportArgumentType]
-    assert said == (("flexure (χ²/dof 69 → 24)",) if part else ())
-    assert gone == (["flexure"] if part else [])
-    assert told == (["flexure explains a part only: not added"] if part else [])
+    compared = {"chi2_before": 6900.0, "chi2_after": 100.0 * left}
+    step = Trial(effect_by_name("flexure"), 1.0, 1.0, noise=False, compared=compared)
+
+    def state(chi2, *steps):
+        return State(SimpleNamespace(dof=100, result=SimpleNamespace(chi2=chi2, dof=100)), steps)
+
+    told = leftover._parts(state(6900.0), state(100.0 * left, step))
+    assert told == ({"flexure": "flexure (χ²/dof 69 → 24)"} if part else {})

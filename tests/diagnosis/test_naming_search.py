@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from linear_judge import Linear
 
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.hypotheses import Probe
-from walop_jax.diagnosis.policy import POLICY
 from walop_jax.diagnosis.score import Projector, ScoreSpace
-from walop_jax.diagnosis.search import search
+from walop_jax.diagnosis.search import State, search
 from walop_jax.model.effects import Context, effect_by_name
 
 ROWS, PATTERN = 400, "a pattern without a name"
@@ -51,7 +51,7 @@ class Counting(Linear):
     def __init__(self, surprise=None):
         self.fits, self.surprise = [], surprise or {}
 
-    def fitted(self, state, trial):
+    def fitted(self, evidence, trial):
         self.fits.append(trial.effect.name)
         more = self.surprise.get(trial.effect.name, 0.0)
         noise = trial.noise if not self.surprise else False
@@ -59,7 +59,7 @@ class Counting(Linear):
 
 
 def names(state, judge):
-    return [trial.effect.name for trial, _, _ in search(state, judge, POLICY)]
+    return [trial.effect.name for trial in search(State(state), judge).steps]
 
 
 def test_nothing_is_tried_where_nothing_is_missing():
@@ -78,7 +78,7 @@ def test_a_fit_that_disagrees_with_its_linear_step_lets_the_next_rival_be_fitted
     """The leader turns out worse than thought by as much as the rival turns out better."""
     judge = Counting({"clp_zero": -surprise, "rotator_zero": surprise})
     assert names(evidence([14.0]), judge)[0] == expected
-    assert ("rotator_zero" in judge.fits) == (surprise > POLICY.linear_good)
+    assert ("rotator_zero" in judge.fits) == (surprise > thresholds.LINEAR_GOOD)
 
 
 def test_two_effects_are_found_one_after_the_other():
@@ -89,6 +89,6 @@ def test_what_a_pattern_explains_better_is_not_given_a_name():
     assert names(evidence([0.0, 0.0, 4.0, 30.0]), Linear()) in ([], ["lens_birefringence"])
 
 
-def test_the_search_ends_with_its_policy():
-    short = dataclasses.replace(POLICY, most_steps=1)
-    assert len(list(search(evidence([25.0, 0.0, 20.0]), Linear(), short))) == 1
+def test_the_search_ends_after_the_steps_that_it_has(monkeypatch):
+    monkeypatch.setattr(thresholds, "MOST_STEPS", 1)
+    assert len(names(evidence([25.0, 0.0, 20.0]), Linear())) == 1

@@ -24,12 +24,13 @@ def test_a_sample_of_a_large_set_is_looked_at(monkeypatch):
     calset = simulate(PLAN, seed=4).calset
     monkeypatch.setattr(limits, "DIAGNOSED_ROWS", 40 * len(calset.exposures))
 
-    def looked_at(some, *_, **__):
+    def looked_at(likelihood):
+        some = likelihood.calset
         assert len(some.points) == 40
         assert set(some.points.point) < set(calset.points.point)
         raise SeenError
 
-    monkeypatch.setattr(workflow.Refit, "of", looked_at)
+    monkeypatch.setattr(workflow, "fit", looked_at)
     with pytest.raises(SeenError):
         diagnose(calset)
 

@@ -18,10 +18,10 @@ from walop_jax.calibration.matrix import first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import stated_conditions as conditions
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.detection_limits import condition_limits
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
-from walop_jax.diagnosis.policy import POLICY, PROBABILITY
 from walop_jax.diagnosis.readings import with_places
 from walop_jax.diagnosis.stated_conditions import (
     Singles,
@@ -181,7 +181,7 @@ def test_a_number_that_would_be_impossible_is_no_rival():
     assert instead_of_names(wrong, right) == ""
 
 
-def test_a_name_that_explains_a_fit_far_off_is_kept():
+def test_a_name_that_explains_a_fit_far_off_is_kept(monkeypatch):
     """Wollaston prisms turned by 0.3°: χ² in multiplied errors is not compared with χ² in those that are stated."""
     turn = effect_from_text("wollaston_axis=0.3", SMALL.context())
     calset = simulate(SMALL, seed=SEED, effects=[turn]).calset
@@ -189,8 +189,8 @@ def test_a_name_that_explains_a_fit_far_off_is_kept():
     named = refit(calset, with_effects(wrong.model, [turn.kind.neutral(SMALL.context())], SMALL.context()))
     assert wrong.noise_scale > 2.0
     assert named.noise_scale == 1.0
-    every = dataclasses.replace(POLICY, alarm=np.inf)
-    assert instead_of_names(wrong, named, every) == ""
+    monkeypatch.setattr(thresholds, "ALARM", np.inf)
+    assert instead_of_names(wrong, named) == ""
 
 
 def test_scale_and_angle_are_sums_of_both_coordinates():
@@ -267,7 +267,7 @@ def test_at_its_limit_a_number_is_found_as_often_as_promised():
             continue
         left = design.projector(column)
         along = left @ design.projector(noise) / np.linalg.norm(left)
-        for share, expected in ((1.0, PROBABILITY), (0.5, 0.5)):
+        for share, expected in ((1.0, thresholds.PROBABILITY), (0.5, 0.5)):
             size = share * limit.detected * np.linalg.norm(left)
             found = np.mean((along + size) ** 2 > stats.chi2.isf(least, 1))
             if share == 1.0:

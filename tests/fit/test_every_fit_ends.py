@@ -10,7 +10,7 @@ from small_run import SEED, SMALL
 
 from walop_jax.data.records import Position
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.diagnosis.policy import POLICY
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import refit
@@ -94,11 +94,11 @@ def test_good_data_take_one_search(passes):
     assert passes[0] == result.minimum.steps <= 10
 
 
-def test_a_diagnosis_of_data_far_off_has_less_time():
+def test_a_diagnosis_of_data_far_off_has_fewer_fits(monkeypatch):
     calset = with_random_intensities(simulate(SMALL, seed=SEED).calset, np.random.default_rng(1))
-    at_once = dataclasses.replace(POLICY, minutes_far_off=0.0)
-    found = diagnose(calset, policy=at_once, as_written=True)
+    monkeypatch.setattr(thresholds, "MOST_FITS_FAR_OFF", 0)
+    found = diagnose(calset, as_written=True)
     assert found.before.noise_scale > 1.0
     assert found.steps == ()
     assert found.verdict == "unexplained"
-    assert "the search ended after 0 minutes" in found.caution
+    assert "the search ended after 0 fits" in found.caution

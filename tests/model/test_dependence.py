@@ -141,8 +141,9 @@ def check_jacobian(*effects: Effect) -> tuple[list[str], np.ndarray]:
 # Effects are looked at in company: what one of them asks for must not hide what another one needs.
 GROUPS = {
     "sky and polariser": (
-        "moon_multiple_scattering", "moon_patch", "rotator_zero", "standard_outlier", "telescope_polarisation",
-        "clp_zero", "clp_wobble", "clp_extinction", "clp_ellipticity",
+        "moon_multiple_scattering", "moon_patch", "rotator_zero", "standard_outlier", "standard_colour",
+        "standard_drift", "standard_angles", "telescope_polarisation", "clp_zero", "clp_wobble", "clp_extinction",
+        "clp_ellipticity",
     ),
     "lenses and calibration plate": (
         "lens_birefringence", "upstream_retarder", "chwp_in_beam", "chwp_axis", "chwp_thickness",

@@ -13,11 +13,14 @@ from walop_jax.data.settings import builtin_filter
 from walop_jax.data.units import Place
 from walop_jax.fit.model_file import base_model
 from walop_jax.io.errors import DataError
+from walop_jax.likelihood.columns import columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import light
+from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.planning import plan_for
 from walop_jax.model.sources import Sight, Standards, mean_over_band
+from walop_jax.model.specification import effect_context
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate
 
@@ -150,6 +153,22 @@ def test_the_slope_inside_a_band_is_in_the_counts():
     without = flat[:, 0] + flat[:, 1:3] @ qu
     assert np.abs(without - exact).max() > 1e-5 * exact.max()
     assert np.abs(modelled - exact).max() < 0.1 * np.abs(without - exact).max()
+
+
+@pytest.mark.parametrize("name", ["standard_colour", "standard_drift", "standard_angles"])
+def test_columns_of_what_standards_may_do(name):
+    """Columns from slots against the derivative of the whole light path, for stars with a colour in two filters."""
+    run = simulate(BOTH, seed=3)
+    model = base_model(run.calset, throughput_degree=1)
+    context = effect_context(model.template, run.calset.exposures)
+    effect = effect_by_name(name).probes(context)[1 if name != "standard_angles" else 0][0]
+    likelihood, values = Likelihood.of(run.calset, model), model.start
+    changes = effect.first_order(model.template)
+    found = columns(likelihood, values, changes)
+    exact = own_columns(likelihood, values, (effect,))
+    assert np.abs(exact).max() > 0.0
+    # A star's slope inside a band is left out of the columns.
+    np.testing.assert_allclose(found, exact, atol=2e-3 * np.abs(exact).max())
 
 
 def test_two_files_with_a_value_each():

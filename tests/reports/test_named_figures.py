@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import matplotlib.figure
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from own_instrument import OWN
 from small_run import SEED, SMALL
 
@@ -30,7 +31,7 @@ from walop_jax.reports.named import FIGURES, draw, possible
 from walop_jax.reports.paper_figures import retardance_figure, retardance_wavelength_figure
 from walop_jax.reports.posterior_figures import informed
 from walop_jax.reports.run import FigureSource
-from walop_jax.reports.style import element_kind
+from walop_jax.reports.style import Canvas, element_kind
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -56,6 +57,28 @@ def test_figures_are_drawn(source, name):
     assert any(axis.has_data() for axis in axes)
 
 
+@pytest.mark.parametrize("name", [name for name in FIGURES if name not in WITHOUT])
+def test_figures_in_a_column_of_print(source, name):
+    """89 mm wide as in journals: type of 7 pt, nothing cut off, no titles on each other, maps with one frame."""
+    figure = draw(name, dataclasses.replace(source, canvas=Canvas(width=89.0 / 25.4)))
+    assert_fits_in_print(figure, 89.0)
+    frames = {(axis.get_xlim(), axis.get_ylim()) for axis in figure.axes if axis.get_aspect() == 1.0}
+    assert len(frames) <= 1
+
+
+def assert_fits_in_print(figure, millimetres):
+    figure.draw_without_rendering()
+    assert figure.get_figwidth() * 25.4 == pytest.approx(millimetres)
+    written = [text for text in figure.findobj(Text) if text.get_visible() and len(text.get_text()) > 1]
+    assert {text.get_fontsize() for text in written} == {7.0}
+    canvas = figure.bbox
+    for axis in figure.axes:
+        box = axis.get_tightbbox()
+        assert min(box.x0 - canvas.x0, canvas.x1 - box.x1, box.y0 - canvas.y0, canvas.y1 - box.y1) > -2.0
+    titles = [axis.title.get_window_extent() for axis in figure.axes if axis.get_title()]
+    assert not any(a.overlaps(b) for i, a in enumerate(titles) for b in titles[:i])
+
+
 @pytest.mark.parametrize("name", WITHOUT)
 def test_what_a_run_lacks_is_said(source, name):
     with pytest.raises(DataError, match=r"has no posterior|holds no (map|limits|diagnosis)"):
@@ -74,6 +97,7 @@ def test_figures_of_a_diagnosis(tmp_path):
     assert [*possible(run)] == [*OF_A_DIAGNOSIS]
     for name in OF_A_DIAGNOSIS:
         assert draw(name, run).axes[0].has_data()
+        assert_fits_in_print(draw(name, dataclasses.replace(run, canvas=Canvas(width=89.0 / 25.4))), 89.0)
     rows = [axis.get_ylabel().splitlines()[:-2] for axis in draw("effect", run).axes[:12:4]]
     assert rows == [["without", "clp_wobble"], ["clp_wobble"], ["with", "clp_wobble"]]
     whole = draw("effect", dataclasses.replace(run, step=0))

@@ -153,7 +153,7 @@ def test_dates_that_are_there_stay_and_what_has_none_is_left_out_by_name(vectors
     assert kept[1].star.tolist() == [0, 1]
     assert kept[1].points.y.tolist() == [0.01, 0.02]
     assert len(kept[1].points.settings) == len(kept[1].counts) == 2
-    assert remarks[0].startswith("b.csv, MJD: no row has a time")
+    assert remarks[0].startswith("b.csv, MJD: all of ")
     assert remarks[1].startswith("c.fits, MJD: 1 of 3 rows have no time")
     # Where none has, each is a group of its own, in their order.
     kept, remarks = dated([given[1], given[1]], [])

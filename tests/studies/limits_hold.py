@@ -31,7 +31,7 @@ from score_draws import alarms, noise_scores  # noqa: E402
 
 from walop_jax.calibration.accuracy import change_of_qu  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
-from walop_jax.diagnosis import grammar  # noqa: E402
+from walop_jax.diagnosis import grammar, thresholds  # noqa: E402
 from walop_jax.diagnosis.detection_limits import (  # noqa: E402
     PROBABILITY,
     _columns,
@@ -39,7 +39,6 @@ from walop_jax.diagnosis.detection_limits import (  # noqa: E402
 )
 from walop_jax.diagnosis.examination import Examination, examine  # noqa: E402
 from walop_jax.diagnosis.hypotheses import Probe, probes  # noqa: E402
-from walop_jax.diagnosis.policy import POLICY  # noqa: E402
 from walop_jax.diagnosis.score import separations  # noqa: E402
 from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 from walop_jax.model.effects import EFFECTS  # noqa: E402
@@ -80,9 +79,9 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
     said = grammar.beside_names(said, EFFECTS, context, template)[0]
     names = examine(result, every, np.random.default_rng(0))
     whole = examine(result, every, np.random.default_rng(0), None, said)
-    p = names.table.local(POLICY.alarm)
+    p = names.table.local(thresholds.ALARM)
     space, full, rng = whole.space, whole.bare, np.random.default_rng(1)
-    noise, threshold = noise_scores(space, rng, draws), np.log(whole.table.local(POLICY.alarm))
+    noise, threshold = noise_scores(space, rng, draws), np.log(whole.table.local(thresholds.ALARM))
     noise_in_full = noise_scores(full, rng, named)
     places = full.places()
     found: dict[str, dict[str, float]] = {}
@@ -101,7 +100,7 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
                 square = float(estimate @ full.gram[at, at] @ estimate)
                 apart = names.nearest(separations(full, full.gram[:, at] @ estimate, square))
                 del apart[probe.effect.name]
-                alone += min(apart.values()) > POLICY.separation
+                alone += min(apart.values()) > thresholds.SEPARATION
             return alone / len(noise_in_full)
 
         found[probe.effect.name] = {"found": amplitude_at(detected, limit.detected)}
@@ -124,7 +123,7 @@ def sets(seed: int, most: int) -> Iterator[tuple[str, float]]:
     calset = reference.calset
     every = list(probes(EFFECTS, effect_context(reference.model.template, calset.exposures)))
     names = examine(reference, every, np.random.default_rng(0))
-    p = names.table.local(POLICY.alarm)
+    p = names.table.local(thresholds.ALARM)
     without = refit(simulate(PLAN, seed=seed, instrument=truth).calset)
     start = matrices_of(without.model.instrument(without.values), calset)
     bare = matrices_of(truth, calset)

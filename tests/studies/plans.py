@@ -35,8 +35,8 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 import walop_jax as walop  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
 from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
+from walop_jax.diagnosis import thresholds  # noqa: E402
 from walop_jax.diagnosis.exact import try_effect  # noqa: E402
-from walop_jax.diagnosis.policy import POLICY  # noqa: E402
 from walop_jax.fit.model_file import base_model  # noqa: E402
 from walop_jax.fit.refit import refit  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
@@ -450,7 +450,7 @@ def named(found: Candidates, standard, plan: ObservingPlan, pair: tuple[str, str
         base_model(simulated.calset, whole.design, throughput_degree=whole.throughput_degree),
     )
     own, rival = (try_effect(base, effect, context).evidence for effect in effects)
-    return bool(own - rival > POLICY.improbable)
+    return bool(own - rival > thresholds.IMPROBABLE)
 
 
 def diagnosed() -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, command_of
+from walop_jax.commands.gather import gather
 from walop_jax.commands.inputs import (
     Effects,
     Posterior,
@@ -21,8 +22,17 @@ from walop_jax.commands.inputs import (
 )
 from walop_jax.io.errors import errors_naming
 
+if TYPE_CHECKING:
+    from walop_jax import Calibration
+    from walop_jax.data.user_tables import InputTable
+
 CATALOGUE = Argument(
-    "Table with X, Y, N, N_ERR; in CSV N0, … N0_ERR, … or O1, … O1_ERR, …", "CATALOGUE", Path
+    "Table with X, Y, N, N_ERR (in CSV N0, … N0_ERR, … or O1, … O1_ERR, …), or those of the cameras, as for gather.",
+    "CATALOGUE...",
+    list[Path],
+)
+COMMON = Option(
+    "Write the common table of stellar polarisation (Panopoulou et al. 2025), with Galactic q, u."
 )
 DEBIAS = Option("Estimator of P_DEBIASED: Plaszczynski et al. 2014, or Wardle and Kronberg 1974.", "MAS|WK")
 SATURATION = Option("Counts from here on are not used (FLAG 256).", "ELECTRONS", float)
@@ -43,14 +53,15 @@ def apply(
     posterior: Posterior = None,
     effects: Effects = None,
     force: Annotated[bool, FORCE] = False,
+    common: Annotated[bool, COMMON] = False,
 ) -> Outcome[Any]:
     """Turn the intensities of stars into Stokes parameters: Q, U, P, EVPA and their errors.
 
-    X and Y in degrees, N and N_ERR (one value per camera) in electrons; optional ID, TEFF, ROTATOR, FILTER, TEMP, HA,
-    N_FLAG (or FLAG, or O1_FLAG, …; any bit: not used), and CHWP_ANGLE, CHWP_IN or those of any other moving element.
-    Rows of one ID (and filter) are one star: they are combined, wherever the moving elements stand, and all hold the
-    same result. With ROTATOR the results are on the sky. Two cameras see one combination of q and u: a star needs
-    several settings.
+    X and Y in degrees, N and N_ERR (one value per camera) in electrons; optional ID, TEFF and TEFF_ERR (or BP_RP, of
+    Gaia), ROTATOR, FILTER, TEMP, HA, N_FLAG (or FLAG, or O1_FLAG, …; any bit: not used), and CHWP_ANGLE, CHWP_IN or
+    those of any other moving element. Rows of one ID (and filter) are one star; without ID those of one SOURCE_ID, or
+    at one RA and DEC: they are combined, wherever the moving elements stand, and all hold the same result. With ROTATOR
+    the results are on the sky. Two cameras see one combination of q and u: a star needs several settings.
 
     Errors hold photon noise and calibration; Q_COLOUR and U_COLOUR say what ignoring TEFF does, Q_HIDDEN and U_HIDDEN
     what a single mistake would do that the data of the calibration could not show (beside Q_ERR and U_ERR). FLAG: 16 a
@@ -63,14 +74,15 @@ def apply(
 
     Of a SURVEY (walop-jax stack) the calibration at the MJD of the stars is taken: those of one night in a catalogue.
 
-    In Python: an astropy table; `catalogue` is a path, an astropy table, or columns by name.
+    The catalogues of the cameras may be given as they are: they are made one as `walop-jax gather` does.
+
+    In Python: an astropy table; `catalogue` is a path, an astropy table, columns by name, or the paths of all cameras.
 
     >>> star = {"X": [0.1], "Y": [0.0], "N": [[51e4, 49e4, 50e4, 48e4]], "N_ERR": [[714.0, 700.0, 707.0, 693.0]]}
     >>> walop.apply(result, star)["P", "P_ERR", "EVPA"]  # doctest: +SKIP
     """
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.plain_tables import table_format
-    from walop_jax.nights.stacking import calibration_of_stars, is_survey, read_survey
     from walop_jax.posterior.draws import with_moments
     from walop_jax.science.apply import apply as apply_to_rows
     from walop_jax.science.catalogue import read_catalogue
@@ -84,11 +96,8 @@ def apply(
     if output is not None:
         table_format(output)
     job.begin("reading")
-    table = table_of(catalogue, {})
-    if is_survey(calibration):
-        held = calibration_of_stars(read_survey(calibration, catalogue_of(effects)), table, force=force)
-    else:
-        held = calibration_of(calibration, effects)
+    table, said = _table_of(catalogue)
+    held = calibration_for(calibration, table, effects, force=force)
     instrument, limit = held.model.template.patched(), math.inf if saturation is None else saturation
     rows = read_catalogue(table, instrument, limit, always_in=held.always_in, never_in=held.never_in)
     job.tell("tabulating the analysis vectors", "tabulating")
@@ -114,7 +123,8 @@ def apply(
         header(held.content_hash(), debias, on_the_sky, stars.check),
         output,
         counted=_counted(alone),
-        warnings=[*doubts, *_about_noise(rows.counts, rows.sigma), *_about_places(rows, stars.flag)],
+        warnings=[*said, *doubts, *_about_noise(rows.counts, rows.sigma), *_about_places(rows, stars.flag)],
+        remade=_common if common else None,
         extra={
             "stars": len(stars.qu),
             "seconds": job.seconds,
@@ -126,7 +136,38 @@ def apply(
     text = f"{output}: {table.rows} rows, {len(stars.qu)} stars, {job.seconds:.1f} s{_errors(columns)}"
     if crossed:
         text += f"; {crossed} in zones of high cross-talk (FLAG 16)"
-    return dataclasses.replace(outcome, text=text)
+    return dataclasses.replace(outcome, text=text, next=(f"topcat {output}",) if common else ())
+
+
+def _table_of(catalogue: Any) -> tuple[InputTable, Sequence[str]]:
+    """The table of a catalogue, of those of the cameras as one, with remarks on how they were made one."""
+    several = isinstance(catalogue, list | tuple)
+    if not several or len(catalogue) == 1:
+        return table_of(catalogue[0] if several else catalogue, {}), ()
+    from walop_jax.data.user_tables import in_memory
+
+    gathered = command_of(gather).run(Job(), {"catalogues": catalogue})
+    return in_memory(gathered.value, ", ".join(map(str, catalogue))), gathered.warnings
+
+
+def _common(made: Any) -> tuple[Any, Sequence[str]]:
+    """The common table of what `apply` makes, and remarks: its faults, if it has any, among them."""
+    from walop_jax.data.user_tables import in_memory
+    from walop_jax.science.common_table import check_common_table, common_table
+
+    table, remarks = common_table(in_memory(made, "the result"))
+    return table, (*remarks, *check_common_table(table))
+
+
+def calibration_for(
+    given: Any, stars: InputTable, effects: Effects = None, *, force: bool = False
+) -> Calibration:
+    """A calibration as `calibration_of` has it; of a survey that of the time of `stars`, of one night."""
+    from walop_jax.nights.stacking import calibration_of_stars, is_survey, read_survey
+
+    if is_survey(given):
+        return calibration_of_stars(read_survey(given, catalogue_of(effects)), stars, force=force)
+    return calibration_of(given, effects)
 
 
 def _counted(alone: bool) -> dict[Any, str]:

@@ -65,7 +65,7 @@ def compare(
     from walop_jax.io.plain_tables import astropy_table, write_table
     from walop_jax.paper.comparison import compare as comparison_of
     from walop_jax.reports import paper_figures
-    from walop_jax.science.catalogue import true_matrices
+    from walop_jax.science.field_points import true_matrices
     from walop_jax.science.star_errors import Truth
 
     if output is not None and (calibration is not None or isinstance(truth, Truth)):

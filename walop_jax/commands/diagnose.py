@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Job, Option, Outcome, Writers, command, text_file
+from walop_jax.commands.command import (
+    Job,
+    Option,
+    Outcome,
+    PathLike,
+    UsageError,
+    Writers,
+    command,
+    text_file,
+)
 from walop_jax.commands.inputs import (
     Effects,
-    Folder,
     InstrumentLike,
     ModelLike,
     Sets,
+    paths_of,
     set_and_model,
 )
 from walop_jax.io.names import DIAGNOSIS, FIGURE_DATA, MODEL, PRODUCT, SUMMARY
@@ -26,11 +36,19 @@ OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA, MODEL)
 
 
 MINUTES = Option(
-    "Minutes after which no further name is looked for (default: 20; 5 where the model is far from the data).",
+    "Minutes after which no further name is looked for (default: none; the search ends by itself).",
     "MINUTES",
     float,
     least=0.0,
 )
+
+
+WHY = Option(
+    "Answer why an effect, or a description, was not named by a diagnosis that has been made; give its RUN.",
+    "NAME",
+    str,
+)
+RUN = Option("Folder of the results.", "RUN", Path, "-o")
 
 
 @command(stages=("reading", "fitting", "scoring", "naming", "mapping"), writes=OUTPUTS, random=True)
@@ -39,11 +57,12 @@ def diagnose(
     data: Sets,
     model: ModelLike = None,
     *,
-    output: Folder = None,
+    output: Annotated[PathLike | None, RUN] = None,
     instrument: InstrumentLike = None,
     effects: Effects = None,
     minutes: Annotated[float | None, MINUTES] = None,
-) -> Outcome[Diagnosis]:
+    why: Annotated[str | None, WHY] = None,
+) -> Outcome[Diagnosis | str]:
     """Say what is missing from the model, add it, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
 
     The verdict is consistent, effect_found or unexplained. Effects that the data cannot tell apart are listed
@@ -52,7 +71,10 @@ def diagnose(
     `walop-jax report` draws its figures from RUN/diagnosis.fits. Exit code 3 where that calibration is not to be
     trusted, whatever was found.
 
-    In Python: a `Diagnosis`; `effects=(*walop.EFFECTS, MyEffect)` adds one of your own to those that may be named.
+    `--why NAME RUN` fits nothing: it says from RUN/diagnosis.json why NAME was not named, with the numbers.
+
+    In Python: a `Diagnosis`, whose `why(name)` gives that answer; `effects=(*walop.EFFECTS, MyEffect)` adds one of your
+    own to those that may be named.
 
     >>> walop.diagnose("night.fits", progress=print).verdict  # doctest: +SKIP
     """
@@ -65,6 +87,10 @@ def diagnose(
     from walop_jax.fit.model_file import render
     from walop_jax.science.field_accuracy import answered
 
+    if why is not None:
+        return _why(why, data)
+    if job.typed and output is None:
+        raise UsageError("Missing option '--output' / '-o'.", "output")
     job.begin("reading")
     calset, chosen = set_and_model(data, model, instrument, effects, output=output)
     with job.repeated() as say:
@@ -97,6 +123,20 @@ def diagnose(
         trusted=usable,
         next=(f"walop-jax report {output}", *[f"walop-jax apply {output} STARS.fits -o OUT.fits"] * usable),
     )
+
+
+def _why(name: str, data: Sets) -> Outcome[Diagnosis | str]:
+    """The answer of a run to why something was not named."""
+    from walop_jax.diagnosis.reasons import why
+    from walop_jax.io.run_folder import RunFolder
+
+    paths = paths_of(data)
+    if len(paths) != 1:
+        raise UsageError("give the folder of one diagnosis", "data")
+    run = RunFolder(Path(paths[0]))
+    run.wanted(DIAGNOSIS, "give the RUN of walop-jax diagnose")
+    answer = why(run.document(DIAGNOSIS, ("steps", "candidates")), name)
+    return Outcome(answer, {"name": name, "answer": answer.splitlines()}, answer)
 
 
 def _with_answer(found: Diagnosis, after: FitResult) -> Display:

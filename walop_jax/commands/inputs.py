@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import reprlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -332,17 +332,19 @@ def table_outcome(
     counted: Mapping[Quality, str],
     warnings: Sequence[str] = (),
     extra: Mapping[str, Any] | None = None,
+    remade: Callable[[Any], tuple[Any, Sequence[str]]] | None = None,
 ) -> Outcome[Any]:
     """A table with what a calibration adds to it, written if it has an output.
 
     The bits of FLAG that are `counted` have a warning each, unless it is empty; `extra` goes into the document. Columns
-    of the table that are not used or are replaced are named.
+    of the table that are not used or are replaced are named. `remade` makes another table of that, with remarks.
     """
     from walop_jax.data.user_tables import extended
     from walop_jax.io.plain_tables import write_table
 
     lost = held.left_behind
     made = extended(table, columns, {**cards, **left_out_cards(lost)})
+    made, others = (made, ()) if remade is None else remade(made)
     if output is not None:
         write_table(output, made, overwrite=job.overwrite)
     counts = {bit: int((columns["FLAG"][0] & bit > 0).sum()) for bit in sorted(counted)}
@@ -364,6 +366,6 @@ def table_outcome(
         warnings=(
             *held.warnings,
             *left_out_sentences(lost, held.path),
-            *(f"{table.path}: {sentence}" for sentence in (*remarks, *warnings, *about)),
+            *(f"{table.path}: {sentence}" for sentence in (*remarks, *others, *warnings, *about)),
         ),
     )

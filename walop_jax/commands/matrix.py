@@ -66,7 +66,7 @@ def matrix(
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.plain_tables import table_format
     from walop_jax.posterior.draws import with_draws
-    from walop_jax.science.catalogue import field_points
+    from walop_jax.science.field_points import field_points
 
     if (points is None) == (x is None):
         raise UsageError("give either x and y, or a table of points", "points")

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
 from walop_jax.commands.inputs import DataOf, Effects, PathLike, catalogue_of
 from walop_jax.io.errors import fail
 
@@ -22,6 +22,9 @@ NAME = Argument("The figure.", "[NAME]", str)
 FILE = Option("File to write: .pdf, .png, .svg (default: NAME.png).", "FILE", Path, "-o")
 STEP = Option("Effect of a diagnosis (effect, signature); 0: starting and final model.", least=0)
 PARAMETERS = Option("Coefficients of a corner or trace plot, by name.", "A,B,…", str)
+WIDTH = Option(
+    "Width in print, with type of 7 pt: column (89 mm), page (183 mm), or in mm.", "column|page|MM", str
+)
 
 
 @command(writes=())
@@ -35,6 +38,7 @@ def plot(
     x: Annotated[float, Option("Field point of transmission and modulation, X (deg).")] = 0.0,
     y: Annotated[float, Option("The same, Y (deg).")] = 0.0,
     step: Annotated[int, STEP] = 1,
+    width: Annotated[float | str | None, WIDTH] = None,
     data: DataOf = None,
     effects: Effects = None,
     ax: Any = None,
@@ -48,8 +52,8 @@ def plot(
 
     In Python: the matplotlib figure, of a run or of a fit, calibration, diagnosis or posterior in memory, written if
     `output` is given; without a name, what each figure shows, by name. `figsize` (inches) is its size; with `ax` it is
-    drawn there (one of several panels in a subfigure that takes the room of these axes). `reference` holds values by
-    name that a corner plot marks.
+    drawn there (one of several panels in a subfigure that takes the room of these axes). `width` is that in print (mm,
+    "column" or "page"): panels are arranged for it. `reference` holds values by name that a corner plot marks.
     Raises `DataError`, with the nearest names, for a figure that does not exist and for what the run lacks.
 
     >>> walop.plot()["modulation"]
@@ -92,9 +96,24 @@ def plot(
         place=(x, y),
         step=step,
         reference=reference,
-        canvas=Canvas(ax, figsize),
+        canvas=Canvas(ax, figsize, _inches(width)),
     )
     figure = draw(name, source)
     if path is not None:
-        save_figure(path, figure, overwrite=job.overwrite)
+        save_figure(path, figure, overwrite=job.overwrite, exact=width is not None)
     return Outcome(figure, {"figure": name, "output": str(path)}, str(path))
+
+
+def _inches(width: float | str | None) -> float | None:
+    """A width in inches."""
+    from walop_jax.reports.style import WIDTHS
+
+    if width is None:
+        return None
+    try:
+        millimetres = WIDTHS[width] if width in WIDTHS else float(width)
+    except ValueError:
+        millimetres = 0.0
+    if not 30.0 <= millimetres <= 1000.0:
+        raise UsageError(f"{width!r} is no width; give {', '.join(WIDTHS)}, or 30 to 1000 mm", "width")
+    return millimetres / 25.4

@@ -9,21 +9,41 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import Effects, InstrumentLike, PathLike, SetFile, catalogue_of, design_of
-from walop_jax.io.text import json_text, parse_toml, read_text, rounded
+from walop_jax.commands.inputs import (
+    Effects,
+    InstrumentLike,
+    PathLike,
+    SetFile,
+    calibration_of,
+    catalogue_of,
+    design_of,
+    left_out_sentences,
+)
+from walop_jax.io.text import date_of, json_text, parse_toml, read_text, rounded
 
 if TYPE_CHECKING:
-    from walop_jax import Effect, Instrument, ObservingPlan
+    from walop_jax import Calibration, Effect, FitResult, ObservingPlan, Run
     from walop_jax.model.effects import EffectKind
     from walop_jax.simulation.simulate import Simulated
+    from walop_jax.simulation.truth import Template
 
 PLAN = Argument("Observing plan (TOML); default: the usual one of the instrument.", "[PLAN.toml]", Path)
+STARS = Option(
+    "Make a catalogue of so many stars in place of the set: of the same instrument.", "N", int, least=1
+)
 EFFECT = Option(
     "Effect to hide in the data; NAME=par:value,par:value for several parameters (a/b/c/d for one "
     "value per element), NAME alone where there is none to give. May be repeated.",
     "NAME=VALUE",
     list[str],
 )
+LIKE = Option(
+    "Another night of the same instrument: a run as fitted, or the truth of a simulated set. Instrument and catalogue "
+    "are those; --effect changes the instrument, --seed draws weather and noise.",
+    "RUN|TRUTH.json",
+    Path,
+)
+NIGHT = Option("Number of the night: days after the date of the plan.", "N", int, least=0)
 
 
 @command(stages=("following", "writing"), writes="file", random=True)
@@ -35,28 +55,45 @@ def simulate(
     instrument: InstrumentLike = None,
     effect: Annotated[str | Sequence[str | Effect] | Mapping[str, Any] | None, EFFECT] = None,
     effects: Effects = None,
+    like: Annotated[Simulated | FitResult | Calibration | Run | PathLike | None, LIKE] = None,
+    night: Annotated[int | None, NIGHT] = None,
     truth: Annotated[PathLike | None, Option("Write the true parameters here.", "FILE.json", Path)] = None,
+    stars: Annotated[int | None, STARS] = None,
     noiseless: bool = False,
     catalogue_seed: int | None = None,
-) -> Outcome[Simulated]:
+) -> Outcome[Any]:
     """Make a calibration set of an instrument whose as-built values are drawn from their priors.
 
     The light path is the one that a fit uses; noise is that of photons and of the detectors (30 electrons). What is
     observed is said by a plan file (see walop-jax docs files): field points, angles, Moon patches, standards, filters.
 
-    In Python: the set and the true instrument. `effect` may be a dict, {"hwp1_axis": 0.3}, or `Effect` objects; with a
-    plan, an `Instrument` as `instrument` is the true one, not drawn. `noiseless`: expected counts, with the errors that
-    they would have. The same plan, seed and effects give the same set, bit for bit. `catalogue_seed` draws the
-    standards apart from the rest: nights of one survey have theirs in common.
+    Nights of one instrument, to rehearse epoch, stack and watch on: --like TRUTH.json --night 10. Each night has
+    noise and weather of its own, also with the same seed.
 
-    >>> calset, truth = walop.simulate(walop.ObservingPlan(grid=4), effect={"hwp1_axis": 0.3})  # doctest: +SKIP
+    With `stars` it is a catalogue of the sky for `apply`, `gather` and `watch` (RA, DEC, BP_RP and all): the same plan,
+    seed and effects give the stars of the instrument that the set calibrates.
+
+    In Python: the set and the true instrument; with `stars` the catalogue, an astropy table. `effect` may be a dict,
+    {"hwp1_axis": 0.3}, or `Effect` objects; with a plan, an `Instrument` as `instrument` is the true one, not drawn.
+    `noiseless`: expected counts, with the errors that they would have. The same plan, seed and effects give the same
+    set, bit for bit. `like` may also be what `simulate` has returned, or a fit. `catalogue_seed` draws the standards
+    apart from the rest.
+
+    >>> first = walop.simulate(walop.ObservingPlan(grid=4))  # doctest: +SKIP
+    >>> calset, truth = walop.simulate(like=first, night=10, effect={"hwp1_axis": 0.3})  # doctest: +SKIP
     """
+    import numpy as np
+
     from walop_jax import Instrument, ObservingPlan
     from walop_jax.data.write import write_calibration_set
     from walop_jax.io.atomic import atomic_path, check_output
+    from walop_jax.io.plain_tables import astropy_table, write_table
     from walop_jax.model.instrument import nominal_instrument
+    from walop_jax.science.simulated_stars import simulated_stars
     from walop_jax.simulation.observing_plan import instrument_named, read_plan
+    from walop_jax.simulation.simulate import Simulated, true_instrument
     from walop_jax.simulation.simulate import simulate as simulated
+    from walop_jax.simulation.truth import truth_document
 
     true = instrument if isinstance(instrument, Instrument) and plan is not None else None
     file = instrument
@@ -64,42 +101,82 @@ def simulate(
         file = file or instrument_named(parse_toml(read_text(plan)), Path(plan).parent)
         plan = read_plan(plan, None if true else instrument)  # pyright: ignore[reportArgumentType]
     try:
+        template, catalogue = None, catalogue_of(effects)
+        if like is not None:
+            if instrument is not None or catalogue_seed is not None:
+                raise ValueError(
+                    "like says which instrument and catalogue: leave out instrument and catalogue_seed"
+                )
+            template = _template(like, catalogue)
+            plan = template.planned(plan)
         plan = plan or ObservingPlan.usual(design_of(instrument) or nominal_instrument())
-        hidden = _hidden(effect, plan, catalogue_of(effects))
+        hidden, lost = _hidden(effect, plan, catalogue), ()
+        if template is not None:
+            true, lost = template.instrument_of(plan, hidden)
     except ValueError as error:
         raise UsageError(str(error)) from None
     if truth is not None:
         check_output(truth, overwrite=job.overwrite)
+    drawn: dict[str, Any] = {"instrument": true, "effects": hidden, "catalogue_seed": catalogue_seed}
+    drawn["catalogue"] = None if template is None else template.catalogue
+    about: dict[str, Any] = {"output": output, "instrument": plan.name, "seed": job.seed, "truth": truth}
+    about["effects"] = [one.name for one in hidden]
     job.tell("following the light", "following")
-    made = simulated(
-        plan,
-        job.seed,
-        instrument=true,
-        effects=hidden,
-        noiseless=noiseless,
-        catalogue_seed=catalogue_seed,
-    )
+    made: Any
+    if stars is not None:
+        if "standard" not in plan.design.kinds:
+            raise UsageError(f"{plan.name} sees no stars", "stars")
+        sources, true = true_instrument(plan, job.seed, **drawn)
+        seen = simulated_stars(plan, true, stars, job.seed, night=night or 0, noiseless=noiseless)
+        made = astropy_table(seen.columns, {"INSTRUME": plan.name})
+        known = truth_document(plan, job.seed, sources, true) | {"stars": seen.document()}
+        about["stars"] = stars
+        text = f"{output}: {plan.name}, {stars} stars of the instrument of seed {job.seed}"
+        suggested, times = (f"walop-jax apply RUN {output} -o OUT.fits",), made["MJD"]
+    else:
+        made = simulated(plan, job.seed, noiseless=noiseless, night=night, **drawn)
+        calset, true = made
+        known = truth_document(plan, job.seed, calset.sources, true)
+        about |= {"exposures": len(calset.exposures), "points": len(calset.points)}
+        about["rows"] = calset.intensities.rows
+        text = f"{output}: {plan.name}, {about['exposures']} exposures of {about['points']} points"
+        fit = f"walop-jax refit {output} --instrument {file} -o RUN"
+        suggested = (fit,) if file is not None and plan.design.description else ()
+        times = calset.exposures.mjd
     job.begin("writing")
     with contextlib.ExitStack() as stack:
         if truth is not None:
             temporary = stack.enter_context(atomic_path(truth, overwrite=job.overwrite))
-            temporary.write_text(json_text(truth_document(plan, job.seed, made.truth)), encoding="utf-8")
-        if output is not None:
+            temporary.write_text(json_text(known), encoding="utf-8")
+        if output is not None and isinstance(made, Simulated):
             write_calibration_set(output, made.calset, overwrite=job.overwrite)
-    document = {
-        "output": output,
-        "instrument": plan.name,
-        "seed": job.seed,
-        "exposures": len(made.calset.exposures),
-        "points": len(made.calset.points),
-        "rows": made.calset.intensities.rows,
-        "effects": [one.name for one in hidden],
-        "truth": truth,
-    }
-    text = f"{output}: {plan.name}, {document['exposures']} exposures of {document['points']} points; "
-    text += f"{'; '.join(map(_sized, hidden)) or 'nothing'} beyond the base model"
-    suggested = f"walop-jax refit {output} --instrument {file} -o RUN"
-    return Outcome(made, document, text, next=(suggested,) if plan.design.description else ())
+        elif output is not None:
+            write_table(output, made, overwrite=job.overwrite)
+    text += f"; {'; '.join(map(_sized, true.effects)) or 'nothing'} beyond the base model"
+    if template is not None:
+        mjd = float(np.nanmin(times))
+        text += f"; the night of {date_of(mjd)}"
+        about |= {"like": None if isinstance(like, tuple) else str(like), "night": night, "mjd": mjd}
+    return Outcome(
+        made,
+        about,
+        text,
+        warnings=left_out_sentences(lost, like if isinstance(like, str | os.PathLike) else None),
+        next=suggested,
+    )
+
+
+def _template(like: Any, catalogue: Sequence[EffectKind]) -> Template:
+    """The instrument and the catalogue of another night. Raises `DataError` for a file that has none."""
+    from walop_jax.simulation.simulate import Simulated
+    from walop_jax.simulation.truth import Template, read_truth
+
+    if isinstance(like, Simulated):
+        return Template.of(like)
+    if isinstance(like, str | os.PathLike) and Path(like).suffix == ".json":
+        return read_truth(like, catalogue)
+    held = calibration_of(like, catalogue)
+    return Template(held.model.instrument(held.values), held.sources)
 
 
 def _hidden(given: Any, plan: ObservingPlan, catalogue: Sequence[EffectKind]) -> list[Effect]:
@@ -138,20 +215,3 @@ def _sized(effect: Effect) -> str:
         for name, declared in effect.declarations().items()
     ]
     return f"{effect.name}={', '.join(numbers)}" if numbers else effect.name
-
-
-def truth_document(plan: ObservingPlan, seed: int, instrument: Instrument) -> dict[str, Any]:
-    """Truth of a simulated set as plain data: the plan, the effects, the true value of every parameter."""
-    from walop_jax.model.parameters import leaves
-    from walop_jax.simulation.simulate import truth_values
-
-    units = {leaf.name: leaf.unit for leaf in leaves(instrument)}
-    return {
-        "instrument": plan.name,
-        "seed": seed,
-        "plan": plan.document(),
-        "effects": {effect.name: effect.choices() for effect in instrument.effects},
-        "parameters": {
-            name: {"value": value, "unit": units[name]} for name, value in truth_values(instrument).items()
-        },
-    }

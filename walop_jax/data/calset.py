@@ -24,7 +24,9 @@ from walop_jax.data.checks import (
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import (
+    CALIBRATION_PLATE,
     KINDS,
+    POLARISER,
     CalibrationSet,
     Compression,
     Exposures,
@@ -114,7 +116,8 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         if name in hdus:
             columns = column_names(hdus[name], place)
             if primary["CALVERS"] == 1:  # CLP and CHWP alone move there, whatever other columns are called
-                columns = [column for column in columns if column in schema.TABLES[name]]
+                own = {*schema.TABLES[name], *(f"{prefix}_TURN" for prefix in (POLARISER, CALIBRATION_PLATE))}
+                columns = [column for column in columns if column in own]
             rules = table_rules(name, columns, place)
             tables[name], more = read_table(hdus[name], rules, place)
             remarks += more

@@ -9,8 +9,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import KINDS, WAVELENGTHS, Exposures, FilterCurve, Points, Site, Sources
-from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, check
+from walop_jax.data.records import (
+    KINDS,
+    POLARISER,
+    WAVELENGTHS,
+    Exposures,
+    FilterCurve,
+    Points,
+    Site,
+    Sources,
+)
+from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, TURN, check
 from walop_jax.data.settings import BUILTIN_FILTERS, PHOTOMETRIC_BANDS, single_wavelength
 from walop_jax.data.units import Place
 from walop_jax.instruments.description import described, shipped
@@ -173,11 +182,22 @@ def make_exposures(
         place.refuse(inside & ~np.isfinite(angle), what, f"{prefix}_ANGLE", advice)
         # Out of the beam an element has no angle, whatever the header remembers.
         table[f"{prefix}_ANGLE"] = np.where(inside, angle, np.nan)
+    turning = {p: np.abs(table[f"{p}_TURN"]) * table[f"{p}_IN"] > 0 for p in moving if f"{p}_TURN" in table}
+    if POLARISER in turning:
+        advice = "take it at several angles; only elements behind it may turn during an exposure"
+        place.refuse(turning[POLARISER], "is not 0", f"{POLARISER}_TURN", advice)
+    several = np.sum([*turning.values(), np.zeros(len(kind))], axis=0) > 1
+    what, advice = (
+        "another element turns as well",
+        "one at a time: their angles go together, which is not stated",
+    )
+    place.refuse(several, what, " and ".join(f"{p}_TURN" for p in turning), advice)
     angles = np.unique(table["CLP_ANGLE"][clp_in])
     if like_radians(angles):
         what = f"all {len(angles)} different angles lie between {angles[0]:g} and {angles[-1]:g}"
         raise place.fail(what, "CLP_ANGLE", "angles are in degrees: are these radians?")
-    check(table, {**EXPOSURES, **{f"{prefix}_ANGLE": EXPOSURES["CLP_ANGLE"] for prefix in moving}}, place)
+    angles_of = {f"{prefix}_ANGLE": EXPOSURES["CLP_ANGLE"] for prefix in moving}
+    check(table, {**EXPOSURES, **angles_of, **{f"{prefix}_TURN": TURN for prefix in turning}}, place)
 
     moon, standard = (kind == "moon") & ~clp_in, (kind == "standard") & ~clp_in
     for name in ("MJD", "RA", "DEC", "ROTATOR"):

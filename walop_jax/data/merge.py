@@ -218,7 +218,12 @@ def _join_exposures(sets: tuple[CalibrationSet, ...]) -> tuple[Exposures, list[s
             names = ", ".join(f"{prefix}_ANGLE" for prefix in absent)
             remarks.append(f"{_name(entry)} [EXPOSURES] {names}: column missing; taken as out of the beam")
         parts.append(e.placed(**absent).columns())
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    names = dict.fromkeys(name for part in parts for name in part)
+    still = [np.zeros(len(part["EXPOSURE"])) for part in parts]  # of a column <P>_TURN that a part has not
+    columns = {
+        name: np.concatenate([part.get(name, zero) for part, zero in zip(parts, still, strict=True)])
+        for name in names
+    }
     return Exposures.from_columns(columns | {"EXPOSURE": ids}), remarks
 
 

@@ -105,17 +105,25 @@ class FilterCurve:
 class Position:
     """State of a moving element in every exposure: in the beam or not, and at what angle.
 
-    `angle` is the encoder reading in degrees, NaN where the element is out.
+    `angle` is the encoder reading in degrees at mid-exposure, NaN where the element is out; `turn` is the angle by
+    which it turns during the exposure, evenly in time (deg; 0, or None for all: it stands still).
     """
 
     inside: Bool[np.ndarray, " e"]
     angle: Float[np.ndarray, " e"]
+    turn: Any = None
+
+    def __post_init__(self) -> None:
+        turn = (
+            np.zeros(len(self.inside)) if self.turn is None else np.where(self.inside, np.abs(self.turn), 0.0)
+        )
+        object.__setattr__(self, "turn", turn)
 
     def __len__(self) -> int:
         return len(self.inside)
 
     def __getitem__(self, rows: slice | Int[np.ndarray, " r"] | Bool[np.ndarray, " e"]) -> Position:
-        return Position(self.inside[rows], self.angle[rows])
+        return Position(self.inside[rows], self.angle[rows], self.turn[rows])
 
     @classmethod
     def at(cls, angles: Iterable[float | None]) -> Position:
@@ -221,6 +229,8 @@ class Exposures:
         columns = {name.upper(): values for name, values in self._plain().items()}
         for prefix, entry in self.positions.items():
             columns |= {f"{prefix}_IN": entry.inside, f"{prefix}_ANGLE": entry.angle}
+            if entry.turn.any():
+                columns[f"{prefix}_TURN"] = entry.turn
         return columns
 
     @classmethod
@@ -230,7 +240,10 @@ class Exposures:
         prefixes = [name.removesuffix("_IN") for name in columns if name.endswith("_IN")]
         return cls(
             **{name.lower(): columns[name] for name in plain},
-            positions={p: Position(columns[f"{p}_IN"], columns[f"{p}_ANGLE"]) for p in prefixes},
+            positions={
+                p: Position(columns[f"{p}_IN"], columns[f"{p}_ANGLE"], columns.get(f"{p}_TURN"))
+                for p in prefixes
+            },
         )
 
     def _plain(self) -> dict[str, np.ndarray]:

@@ -98,6 +98,7 @@ def _number(unit: str, *rules: Rule) -> Column:
 
 _TEFF = _number("K", _OF_A_SOURCE)
 _ANGLE = _number("deg", within(36000.0, "encoder readings are in degrees: are these steps?"))
+TURN = Column("float", "deg", 0.0, rules=(finite("0 where the element stands still"),), remarked=False)
 EXPOSURES: Mapping[str, Column] = {
     "EXPOSURE": _IDENTIFIER,
     "KIND": Column("str"),
@@ -183,6 +184,8 @@ def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]
         rules[angle] = dataclasses.replace(_ANGLE, remarked=there)
     for name in columns:
         prefix, _, last = name.rpartition("_")
+        if last == "TURN" and f"{prefix}_ANGLE" in columns:
+            rules[name] = TURN
         if last not in ("IN", "ANGLE") or name == last or name in rules:
             continue
         if not PREFIX.fullmatch(prefix):

@@ -73,6 +73,7 @@ class Settings:
 
     Filter name; colour temperature of the source (K; NaN: flat photon spectrum); temperature of the instrument
     (Celsius); hour angle (h); `positions` of the moving elements behind the polariser by column prefix (deg; NaN: out).
+    `turns` holds by how much those turn during the exposure that do not stand still (deg, about that angle).
     An element that is not there is out. Raises ValueError for columns of different lengths.
 
     >>> walop.Settings.default(2).at(CHWP=22.5).positions
@@ -84,9 +85,10 @@ class Settings:
     temperature: Float[np.ndarray, " n"]
     hour_angle: Float[np.ndarray, " n"]
     positions: Mapping[str, Float[np.ndarray, " n"]] = dataclasses.field(default_factory=dict)
+    turns: Mapping[str, Float[np.ndarray, " n"]] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        lengths = {len(values) for values in (*self._plain(), *self.positions.values())}
+        lengths = {len(values) for values in (*self._plain(), *self.positions.values(), *self.turns.values())}
         if len(lengths) > 1:
             raise ValueError(
                 f"columns of {' and '.join(map(str, sorted(lengths)))} rows in one table of settings"
@@ -116,6 +118,7 @@ class Settings:
             temperature=np.where(np.isfinite(exposures.temp), exposures.temp, TEMPERATURE),
             hour_angle=np.nan_to_num(exposures.ha),
             positions={p: np.where(entry.inside, entry.angle, np.nan) for p, entry in positions.items()},
+            turns={p: entry.turn for p, entry in positions.items() if entry.turn.any()},
         )
 
     def at(self, **positions: float | Float[np.ndarray, " n"] | None) -> Settings:
@@ -136,10 +139,14 @@ class Settings:
             temperature=self.temperature[rows],
             hour_angle=self.hour_angle[rows],
             positions={prefix: angle[rows] for prefix, angle in self.positions.items()},
+            turns={prefix: turn[rows] for prefix, turn in self.turns.items()},
         )
 
     def _plain(self) -> tuple[np.ndarray, ...]:
         return self.filter, self.teff, self.temperature, self.hour_angle
+
+    def _moved(self) -> tuple[np.ndarray, ...]:
+        return *self.positions.values(), *self.turns.values()
 
     def position(self, prefix: str) -> Float[np.ndarray, " n"]:
         """Angle of a moving element (deg; NaN: out)."""
@@ -164,15 +171,15 @@ class Settings:
 
         Only these decide how a computation is laid out; the rest are numbers that go into it.
         """
-        return self._grouped([self.filter, *self.positions.values()])
+        return self._grouped([self.filter, *self._moved()])
 
     def optics(self) -> list[tuple[Settings, Int[np.ndarray, " r"]]]:
         """One setting for each that makes the optics differ, colour of the source apart, and the rows that have it."""
-        return self._grouped([self.filter, *self.positions.values(), self.temperature, self.hour_angle])
+        return self._grouped([self.filter, *self._moved(), self.temperature, self.hour_angle])
 
     def distinct(self) -> list[tuple[Settings, Int[np.ndarray, " r"]]]:
         """One setting for each that differs in anything, and the rows that have it."""
-        return self._grouped([*self._plain(), *self.positions.values()])
+        return self._grouped([*self._plain(), *self._moved()])
 
     def _grouped(self, columns: list[np.ndarray]) -> list[tuple[Settings, Int[np.ndarray, " r"]]]:
         number = np.zeros(len(self), int)

@@ -20,6 +20,8 @@ from walop_jax.io.text import check_input, some, unpacking
 
 _PACKED = (".gz", ".bz2", ".xz")
 _ALSO = {".tsv": "ascii.csv", ".txt": "ascii.csv", ".dat": "ascii.csv", ".xml": "votable"}
+_SEXTRACTOR = b"#   1 "
+"""The begin of a text (ASCII_HEAD) of SExtractor: its first column, by number."""
 _SEPARATORS = (",", ";", "\t", "|")
 _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
 _CLASSES = bytes.maketrans(b'123456789,;\t|\n" ', b"ddddddddd" + b"s" * 7)  # digits and what separates cells
@@ -38,14 +40,20 @@ def read_table_file(path: Path, needed: Collection[str]) -> tuple[Path, Any, tup
     """
     path, extension = _extension_of(path)
     path = check_input(path)
+    from astropy.table import Table  # imported here: it takes a third of a second
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if _begins(path, b"SIMPLE  ="):  # whatever its name is
                 return path, *_from_fits(path, extension, needed)
+            if _begins(path, _SEXTRACTOR):
+                return path, _astropy_table(_content(path)[0].decode(), "ascii.sextractor"), ()
             kind = "" if path.suffix.lower() == ".zip" else _format(path)
             if kind == "fits":
                 return path, *_from_fits(path, extension, needed)
+            if kind == "parquet":
+                return path, Table.read(path, format=kind), ()
             content, inside = _content(path)
             kind = kind or _format(Path(inside))
             if kind == "ascii.csv":
@@ -53,6 +61,9 @@ def read_table_file(path: Path, needed: Collection[str]) -> tuple[Path, Any, tup
             return path, _astropy_table(content, kind), ()
     except DataError:
         raise
+    except ImportError as error:
+        what = f"needs {error.name or 'a library'}, which is not installed"
+        raise fail(what, file=path, advice="pip install 'walop-jax[parquet]'") from error
     except UNREADABLE as error:
         what = f"cannot be read as a table: {one_line(error)}"
         raise fail(what, file=path, advice="write it again") from error

@@ -85,6 +85,8 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
     except (ValueError, TypeError) as error:
         raise place.fail(f"the unit {unit!r} is not known", name, f"use {wanted or 'no unit'}") from error
     target = units.Unit(wanted)
+    if given == target:
+        return values  # no arithmetic: what was written comes back bit for bit
     if _is_logarithmic(given):
         advice = f"give the column in {wanted or 'fractions'}"
         if wanted == "electron":
@@ -93,8 +95,6 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
                 "N_ERR = 0.921 N · error of m; 10^d of dex"
             )
         raise place.fail(f"is logarithmic ({unit.strip()})", name, advice)
-    if given == target:
-        return values  # no arithmetic: what was written comes back bit for bit
     if wanted == "h" and given.is_equivalent(units.deg):
         target = units.hourangle
     try:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import os
+import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,22 @@ from walop_jax.io.text import in_ascii, some
 
 _LISTED = 12  # columns, in a message
 _LIKE = 0.7  # of names, for "did you mean"
+_COLOUR = re.compile(
+    r"T_?EFF|TEMPERATURE|COLOU?R|BP.?RP|SP(EC(TRAL)?)?_?TYPE|(?<![A-Z])[UBVRIGZYJHK]([-_]|_M_)[UBVRIGZYJHK](?![A-Z])"
+)
+"""Names, in capitals, of columns that say which colour a star has."""
+
+OF_STARS: Mapping[str, tuple[str, str]] = {
+    "SOURCE_ID": ("", "source identifier, of Gaia"),
+    "BP_RP": ("mag", "colour of Gaia"),
+    "BP_RP_ERR": ("mag", "standard error of BP_RP"),
+    "TEFF": ("K", "colour temperature"),
+    "TEFF_ERR": ("K", "standard error of TEFF"),
+    "PHOT_G_MEAN_MAG": ("mag", "magnitude G of Gaia"),
+    "PARALLAX": ("mas", "parallax"),
+    "PARALLAX_ERROR": ("mas", "standard error of PARALLAX"),
+}
+"""Columns about the stars themselves, with unit and description: they go with a star into every result."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +83,9 @@ class InputTable:
         if gone := [name for name in replaced if name not in self.used]:
             sentences.append(f"{_columns(gone)} replaced by the result")
         if unused:
-            sentences.append(f"{_columns(unused)} not used{_hints(unused, self.lacking)}")
+            lacking = self.lacking - {"TEFF"} if "BP_RP" in self.used else self.lacking
+            about = some(hints(unused, lacking), 3, "; ")
+            sentences.append(f"{_columns(unused)} not used{f' ({about})' if about else ''}")
         return tuple(sentences)
 
     def new_name(self, name: str) -> str:
@@ -81,15 +100,17 @@ def _columns(names: Sequence[str]) -> str:
     return f"column{'s' if len(names) > 1 else ''} {', '.join(names)} {'are' if len(names) > 1 else 'is'}"
 
 
-def _hints(names: Sequence[str], lacking: Collection[str]) -> str:
-    """Names that columns that are not used may have been meant to have."""
-    hints = []
+def hints(names: Sequence[str], lacking: Collection[str], *, unsure: bool = True) -> list[str]:
+    """Names that columns that are not used may have been meant to have: colours, flags, and (`unsure`) those alike."""
+    colours, others = [], []
     for name in names:
-        if "FLAG" in name and "N_FLAG" in lacking:
-            hints.append(f"{name}: flags are read from N_FLAG or FLAG, any bit means not used")
-        elif like := difflib.get_close_matches(name, sorted(lacking), n=1, cutoff=_LIKE):
-            hints.append(f"{name}: did you mean {like[0]}?")
-    return f" ({some(hints, 3, '; ')})" if hints else ""
+        if "TEFF" in lacking and _COLOUR.search(name):
+            colours.append(f"{name}: the colour of a star is read from TEFF (K) or BP_RP (mag, of Gaia)")
+        elif "FLAG" in name and "N_FLAG" in lacking:
+            others.append(f"{name}: flags are read from N_FLAG or FLAG, any bit means not used")
+        elif unsure and (like := difflib.get_close_matches(name, sorted(lacking), n=1, cutoff=_LIKE)):
+            others.append(f"{name}: did you mean {like[0]}?")
+    return [*colours, *others]
 
 
 def read_input_table(path: str | os.PathLike[str], needed: Collection[str] = ("X", "Y")) -> InputTable:

@@ -1,7 +1,7 @@
 """The class of what a diagnosis has added: all that these data cannot tell from it, with what each does to stars.
 
 Additions    effects with a name, and groups of sentences. Of each the members of its class are all candidates that, in
-             its place, are not improbable (`Policy.improbable`), by one linear step (`class_average`). They are as
+             its place, are not improbable (`thresholds.IMPROBABLE`), by one linear step (`class_average`). They are as
              probable beforehand: that somebody has thought of a name for one does not make it true.
 Kinds        What is found in exposures of one KIND is a difference between that KIND and all others: which of the two
              is wrong no residual can say. "In all other kinds, with the other sign" is a member, as probable.
@@ -24,6 +24,7 @@ from jaxtyping import Float, Int
 
 from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_average import distinct, moved, probabilities
 from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum
 from walop_jax.diagnosis.exact import signature
@@ -139,7 +140,7 @@ class _Laid:
         members = [told, *step.candidates(told.evidence)]
         members += [other for one in members if (other := step.in_other_kinds(one)) is not None]
         best = max(member.evidence for member in members)
-        least = best - self.state.policy.improbable
+        least = best - thresholds.IMPROBABLE
         members = [told, *(member for member in members[1:] if member.evidence > least)]
         changes = np.stack([member.change for member in members])
         evidence = np.array([np.inf, *(member.evidence for member in members[1:])])
@@ -218,7 +219,7 @@ class _Step:
                 evidence = max(evidence, told)
             found.append((evidence, probe, gram[at, at], scores[at]))
         found.sort(key=lambda one: -one[0])
-        least = max(told, found[0][0] if found else told) - state.policy.improbable
+        least = max(told, found[0][0] if found else told) - thresholds.IMPROBABLE
         chosen = []
         for evidence, probe, square, along_residual in found[:MOST_ASKED]:
             if evidence <= least:
@@ -250,7 +251,7 @@ class _Step:
         widths = np.array([_width(each) for each in sums])
         evidence = log_bayes(square, along, widths) / self.laid.state.floor**2
         # The same difference, seen from the other side: as probable, however its throughputs are known.
-        alike = max(self.laid.state.policy.even_odds, LINEAR * abs(member.evidence))
+        alike = max(thresholds.EVEN_ODDS, LINEAR * abs(member.evidence))
         evidence = member.evidence if abs(evidence - member.evidence) < alike else evidence
         name = "; ".join(sentence.text for each in sums for _, sentence in each)
         return self._member(name, evidence, sums, column, square, along, widths)

@@ -19,8 +19,8 @@ from jaxtyping import Float, Int
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.thresholds import GOAL
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_average import known_apart_from, mixture
-from walop_jax.diagnosis.policy import POLICY
 from walop_jax.io.text import some, two_digits
 from walop_jax.model.effects import Context, Described
 from walop_jax.model.effects.change import Change as Sentence
@@ -151,7 +151,7 @@ def _positive(matrix: Matrix) -> Matrix:
 def only_a_class(classes: Sequence[ClassOf]) -> Iterator[str]:
     """A sentence on each class whose members differ by so much that nothing of it may be trusted."""
     for one in classes:
-        apart = one.spread > min(GOAL, max(one.stated, POLICY.negligible))
+        apart = one.spread > min(GOAL, max(one.stated, thresholds.NEGLIGIBLE))
         if not (apart or one.off > FAR):
             continue
         names = some([f"{m.name} ({100 * m.probability:.0f} %)" for m in one.members[1:]], _SHOWN)

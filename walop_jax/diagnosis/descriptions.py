@@ -17,10 +17,10 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import Trial, try_model
 from walop_jax.diagnosis.findings import Choice
-from walop_jax.diagnosis.policy import Policy
 from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
@@ -48,14 +48,12 @@ def described_otherwise(model: Model, sentence: str, context: Context) -> Model:
 def other_descriptions(
     result: FitResult,
     context: Context,
-    policy: Policy,
-    going_on: Callable[[], bool],
+    fits: Callable[[], bool],
     tell: Callable[[str], None],
-    tried: dict[str, Choice],
     *,
     all_of_them: bool = True,
-) -> Iterator[Trial]:
-    """Changes of the description of a fit: all are screened, the best of them fitted. `tried` takes what is found."""
+) -> tuple[list[Trial], dict[str, Choice]]:
+    """Changes of the description of a fit, by name: all are compared, the best of them fitted while `fits` allows."""
     template = dataclasses.replace(result.model.template, effects=())
     if OtherDescription.name in result.model.effect_names:
         template = result.model.template.effect(OtherDescription.name).patch(template)
@@ -63,15 +61,15 @@ def other_descriptions(
     # What is turned, exchanged or left out changes the light by per cents: nothing of that kind is a small misfit.
     sentences = tuple(alternatives(template)) if all_of_them else curves
     tell(f"comparing {len(sentences)} other descriptions")
-    asked = itertools.takewhile(lambda _: going_on(), sentences)
+    asked = itertools.takewhile(lambda _: fits(), sentences)
     found = sorted(_screened(result, asked, context), key=lambda one: one[0].left)
-    tried |= {choice.change: choice for choice, _, _ in found}
-    promising = [one for one in found if one[1] > policy.least_gain][: policy.descriptions_fitted]
+    compared, trials = {choice.change: choice for choice, _, _ in found}, []
+    promising = [one for one in found if one[1] > thresholds.LEAST_GAIN][: thresholds.DESCRIPTIONS_FITTED]
     chosen = {choice.change for choice, _, _ in promising}
     rest = [one for one in found if one[0].change in curves and one[0].change not in chosen]
     for choice, _, start in (*promising, *rest):
-        if not going_on():
-            return
+        if not fits():
+            break
         tell(f"trying another description: {choice.change}")
         model = described_otherwise(result.model, choice.change, context)
         try:
@@ -80,8 +78,9 @@ def other_descriptions(
             continue
         assert trial.fit is not None
         gain = (result.posterior.objective - trial.fit.posterior.objective) * result.noise_scale**2
-        tried[choice.change] = dataclasses.replace(choice, better_by=float(gain))
-        yield trial
+        compared[choice.change] = dataclasses.replace(choice, better_by=float(gain))
+        trials.append(trial)
+    return trials, compared
 
 
 def _screened(

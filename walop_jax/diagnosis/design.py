@@ -43,7 +43,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.polynomial.legendre import legvander
 
 from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, CalibrationSet, Exposures
-from walop_jax.diagnosis.policy import RINGS
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import cut, states
@@ -178,7 +178,7 @@ def number_of_columns(calset: CalibrationSet, instrument: Instrument) -> int:
     """Number of columns of all strata together, or a few more."""
     e, cameras = calset.exposures, len(instrument.cameras)
     turning = 1 + len(instrument.patched().moving())
-    of_camera = 2 * len(legendre.terms(SMOOTH)) + len(legendre.terms(FINE)) + len(RINGS)
+    of_camera = 2 * len(legendre.terms(SMOOTH)) + len(legendre.terms(FINE)) + len(thresholds.RINGS)
     of_camera += 6 * len(HARMONICS) * turning + 3  # time, temperature, flux
     of_camera += 5 * (len(np.unique(e.kind)) - 1) + 3 * (len(np.unique(e.filter)) - 1)
     for prefix in instrument.patched().moving():
@@ -206,7 +206,9 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
     smooth = legendre.basis(points.x, points.y, SMOOTH, scale)
     fine = legendre.basis(points.x, points.y, FINE, scale)[:, smooth.shape[1] :]
     square = points.x**2 + points.y**2
-    rings = legvander(2.0 * square / max(float(square.max()), 1e-300) - 1.0, RINGS[-1])[:, RINGS]
+    rings = legvander(2.0 * square / max(float(square.max()), 1e-300) - 1.0, thresholds.RINGS[-1])[
+        :, thresholds.RINGS
+    ]
     stokes = measured.likelihood.stokes(measured.values)
     for k, camera in enumerate(names):
         for i, element in ((1, "q"), (2, "u")):

@@ -4,11 +4,11 @@ Everything is linear algebra on the columns of the score test (`score`), at a fi
 
 Detected    An effect of amplitude ε has the statistic T ~ χ'²_k(λ) with λ = ε² G (G the Gram element of its column
             behind the projection). The alarm is raised where the smallest p of all candidates undercuts p*, which noise
-            does with probability `Policy.alarm`; ε is that for which T does so with probability `PROBABILITY`.
+            does with probability `thresholds.ALARM`; ε is that for which T does so with `thresholds.PROBABILITY`.
 Named       A rival that does its best to follow the effect stays √S ε from it (`score.separations`). The effect is
-            named alone where the amplitude found, ε ± 1/√G, leaves every rival `Policy.separation` or more away with
-            probability `PROBABILITY`: ε ≥ d/√S + z/√G with d that separation; below it is told with those for which
-            it may be taken.
+            named alone where the amplitude found, ε ± 1/√G, leaves every rival `thresholds.SEPARATION` or more away
+            with `thresholds.PROBABILITY`: ε ≥ d/√S + z/√G with d that separation; below it is told with those for
+            which it may be taken.
 Protection  A calibration without the effect takes up a part of it: δθ = (JᵀJ)⁻¹JᵀC ε. Stars are seen through
             m + ε ∂m/∂ε and calibrated with m + δθ ∂m/∂θ; the difference at the amplitude that is just detected is the
             largest error of q and u that the effect can make without being noticed. On the map each effect has a
@@ -20,7 +20,7 @@ Conditions  A number c that the set states of itself and that is wrong by h is f
             δθ ∂m/∂θ − h ∂m/∂c; the second term is there only where they are seen under the same condition (a filter).
 
 Symbols     J, C derivatives of the whitened residuals with respect to parameters and amplitude; m instrument matrix;
-            z the normal quantile of `PROBABILITY`.
+            z the normal quantile of `thresholds.PROBABILITY`.
 Sources     Baarda 1968 (reliability: what a test finds, and what an error that it misses does to the result); Teunissen
             2018, J. Geod. 92, 59 (detection, identification, adaptation); Atkinson & Fedorov 1975, Biometrika 62, 57.
 Limits      One effect at a time, to first order in its amplitude, for the shapes that the search starts from.
@@ -39,13 +39,13 @@ from walop_jax.calibration.accuracy import change_of_qu
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import could_hide, hidden_errors
 from walop_jax.calibration.matrix import effect_slopes, first_setting, matrix_slopes
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import Examination, examine, most_points
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.hypotheses import Probe, applicable, fringes_of
 from walop_jax.diagnosis.hypotheses import probes as all_probes
 from walop_jax.diagnosis.limits_found import ConditionLimit, DetectionLimit, DetectionLimits, over_field
-from walop_jax.diagnosis.policy import ALARM, POLICY, PROBABILITY
 from walop_jax.diagnosis.score import ScoreSpace, local_p, noncentrality, separations
 from walop_jax.diagnosis.stated_conditions import STEP, Singles, condition_scores
 from walop_jax.diagnosis.trust import sampled
@@ -86,7 +86,7 @@ def detection_limits(
     )
     tell(Stage("differentiating every effect", "differentiating"))
     examination = examine(result, wanted, np.random.default_rng(seed))
-    p = examination.table.local(POLICY.alarm)
+    p = examination.table.local(thresholds.ALARM)
     tell(Stage("comparing the effects", "comparing"))
     rivals = examination.bare.subset([probe.name for probe in examination.probes])
     columns = [c for probe in examination.probes for c in _columns(examination, rivals, probe, p)]
@@ -121,7 +121,7 @@ def _columns(examination: Examination, rivals: ScoreSpace, probe: Probe, p: floa
     for number, place in enumerate(range(at.start, at.stop)):
         if not alive[place]:
             continue
-        detected = float(np.sqrt(noncentrality(p, rank, PROBABILITY) / space.gram[place, place]))
+        detected = float(np.sqrt(noncentrality(p, rank, thresholds.PROBABILITY) / space.gram[place, place]))
         own = rivals.gram[:, first + number]
         square = float(own[first + number])
         apart = examination.nearest(separations(rivals, own, square))
@@ -131,7 +131,8 @@ def _columns(examination: Examination, rivals: ScoreSpace, probe: Probe, p: floa
         if nearest <= np.sqrt(_ABSORBED * square):
             named = np.inf
         elif np.isfinite(nearest):
-            named = max(detected, POLICY.separation / nearest + special.ndtri(PROBABILITY) / np.sqrt(square))
+            surely = special.ndtri(thresholds.PROBABILITY) / np.sqrt(square)
+            named = max(detected, thresholds.SEPARATION / nearest + surely)
         others = {name: value * detected for name, value in apart.items()}
         found.append(_Column(probe, number, probe.parameters[number], detected, float(named), others))
     return found
@@ -216,7 +217,7 @@ def _collected(
                 detected=(min(c.detected for c in mine), max(c.detected for c in mine)),
                 named=max(c.named for c in mine),
                 taken_for=tuple(
-                    name for name in sorted(near, key=near.__getitem__) if near[name] < POLICY.separation
+                    name for name in sorted(near, key=near.__getitem__) if near[name] < thresholds.SEPARATION
                 ),
                 error_of_qu=over_field(errors[members]),
             )
@@ -273,7 +274,7 @@ def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
     columns = np.column_stack([one.column for one in scored])
     taken_up = design.taken_up(design.projector.basis.T @ columns)
     off = slopes @ (result.model.selection() @ taken_up)
-    least = noncentrality(local_p(ALARM, tried), 1, PROBABILITY)
+    least = noncentrality(local_p(thresholds.ALARM, tried), 1, thresholds.PROBABILITY)
     found = []
     for number, (stated, score, _, square) in enumerate(scored):
         slope = off[..., number]

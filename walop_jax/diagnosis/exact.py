@@ -8,18 +8,18 @@ Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.hypotheses import Ranked, said_by
-from walop_jax.diagnosis.policy import Policy
 from walop_jax.diagnosis.score import SCALES, log_bayes
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Context, Described, Effect, EffectKind
+from walop_jax.model.effects import Context, Described, Effect, EffectKind, OtherDescription
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import Model, model_without, with_effects
 
@@ -30,7 +30,10 @@ class Trial:
 
     `item` is its linear step, `linear` the evidence of that (NaN where there was none). `fit` is None until it has been
     fitted. `alternatives` are other shapes of the effect that do as well, in words. `rivals` are effects of nearly its
-    evidence, or of which a part would do, `nameless` sentences that are not improbable beside it.
+    evidence, or of which a part would do, `nameless` sentences that are not improbable beside it. `predicts` is False
+    where its linear step does not predict what it has not seen, `compared` holds what two fits say of it
+    (`predictions.before_and_after`), `against` the KINDs of exposures that speak against it, `refused` the reason for
+    which it was not added, `said` the groups of sentences that were added one after the other.
     """
 
     effect: EffectKind
@@ -43,6 +46,20 @@ class Trial:
     alternatives: tuple[str, ...] = ()
     rivals: tuple[str, ...] = ()
     nameless: tuple[str, ...] = ()
+    predicts: bool = True
+    compared: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    against: str = ""
+    refused: str = ""
+    said: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Its name: of what has none the descriptions, of another description of the instrument the change."""
+        if self.item is not None:
+            return self.item.name
+        if self.effect is OtherDescription and self.fit is not None:
+            return self.instance.change  # type: ignore[attr-defined]
+        return self.effect.name
 
     @property
     def instance(self) -> Effect:
@@ -130,7 +147,7 @@ def try_model(
     return Trial(effect, bayes, result.chi2, result.explains_data, fit=result)
 
 
-def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int, policy: Policy) -> Trial:
+def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int) -> Trial:
     """Refit an effect from the amplitudes of its linear steps at the shapes that may be best, and keep the best."""
     places = ((item.probe, item.score), *item.others)
     trials = [
@@ -138,8 +155,8 @@ def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int, pol
         for probe, score in places
     ]
     best = max(trials, key=lambda t: t.evidence if _converged(t) else -np.inf)
-    alike = [t for t in trials if _converged(t) and t.evidence > best.evidence - policy.even_odds]
-    told = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best, policy.separation))
+    alike = [t for t in trials if _converged(t) and t.evidence > best.evidence - thresholds.EVEN_ODDS]
+    told = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best, thresholds.SEPARATION))
     return dataclasses.replace(best, alternatives=tuple(told))
 
 

@@ -7,8 +7,8 @@ Two steps     A sentence may hold a part of two effects at once, and alone be mo
               sentence anything. Where two names are the more probable, the sentence does not come before them.
 Separation    The change D of the residuals that a candidate makes at its amplitudes, projected off the other
               parameters, is fitted by each rival; the length of what the rival cannot follow is the separation in
-              standard deviations (Atkinson & Fedorov 1975, Biometrika 62, 57). Below `Policy.separation` the data
-              cannot tell the two apart, nor when their evidence differs by less than `Policy.improbable`.
+              standard deviations (Atkinson & Fedorov 1975, Biometrika 62, 57). Below `thresholds.SEPARATION` the data
+              cannot tell the two apart, nor when their evidence differs by less than `thresholds.IMPROBABLE`.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from jaxtyping import Float
 from scipy import special
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Design, number_of_columns, strata
 from walop_jax.diagnosis.hypotheses import Probe, Ranked, all_candidates, said_by
-from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import (
     Candidate,
     Projector,
@@ -50,14 +50,14 @@ Matrix = Float[np.ndarray, "_ _"]
 Parts = Sequence[tuple[Probe, Collection[EffectKind]]]
 
 
-def rank(table: ScoreTable, probes: Sequence[Probe], policy: Policy = POLICY) -> list[Ranked]:
+def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
     """Effects by evidence, best first; alternative shapes share the prior of their effect."""
     by_effect: dict[EffectKind, list[tuple[Probe, Score]]] = {}
     for probe in probes:
         by_effect.setdefault(probe.effect, []).append((probe, table[probe.name]))
     ranked = []
     for effect, shapes in by_effect.items():
-        alive = [(p, s) for p, s in shapes if s.testable and follow_physics(p, s, policy)]
+        alive = [(p, s) for p, s in shapes if s.testable and follow_physics(p, s)]
         if not alive:
             continue
         alive.sort(key=lambda item: -item[1].log_bayes)
@@ -65,30 +65,30 @@ def rank(table: ScoreTable, probes: Sequence[Probe], policy: Policy = POLICY) ->
         mean = float(np.logaddexp.reduce([s.log_bayes for _, s in alive]) - np.log(len(shapes)))
         others = [
             item
-            for item in alive[1 : policy.most_shapes]
-            if item[1].log_bayes > best - max(policy.within, 0.2 * best)
+            for item in alive[1 : thresholds.MOST_SHAPES]
+            if item[1].log_bayes > best - max(thresholds.WITHIN, 0.2 * best)
         ]
         ranked.append(Ranked(effect, probe, score, mean, tuple(others)))
     return sorted(ranked, key=lambda item: -item.log_bayes)
 
 
-def leaders(ranked: Sequence[Ranked], policy: Policy = POLICY) -> list[Ranked]:
+def leaders(ranked: Sequence[Ranked]) -> list[Ranked]:
     """Candidates whose linear evidence is too close to the best to leave them out."""
     if not ranked:
         return []
-    best, reach = ranked[0].log_bayes, policy.within
-    if best > policy.linear_below:
-        reach = max(reach, policy.linear_share * best)
-    return [item for item in ranked[: policy.most_leaders] if item.log_bayes > best - reach]
+    best, reach = ranked[0].log_bayes, thresholds.WITHIN
+    if best > thresholds.LINEAR_BELOW:
+        reach = max(reach, thresholds.LINEAR_SHARE * best)
+    return [item for item in ranked[: thresholds.MOST_LEADERS] if item.log_bayes > best - reach]
 
 
-def follow_physics(probe: Probe, score: Score, policy: Policy = POLICY) -> bool:
-    """True if a linear step leaves one-sided amplitudes on their side, within `Policy.separation`."""
+def follow_physics(probe: Probe, score: Score) -> bool:
+    """True if a linear step leaves one-sided amplitudes on their side, within `thresholds.SEPARATION`."""
     sigma = np.sqrt(np.clip(np.diag(score.covariance), 0.0, None))
-    return bool(np.all((score.amplitudes >= -policy.separation * sigma)[probe.one_sided]))
+    return bool(np.all((score.amplitudes >= -thresholds.SEPARATION * sigma)[probe.one_sided]))
 
 
-def shortest(item: Ranked, most: int = POLICY.most_together) -> Described:
+def shortest(item: Ranked, most: int = thresholds.MOST_TOGETHER) -> Described:
     """The sentences of a group that are worth their length, with the amplitudes of a linear step."""
     information = np.linalg.pinv(item.score.covariance, hermitian=True)
     scores, widths = information @ item.score.amplitudes, item.probe.widths
@@ -105,7 +105,6 @@ def name_first(
     names: Sequence[Ranked],
     sentence: Ranked,
     joined: Callable[[Ranked], Evidence],
-    policy: Policy = POLICY,
 ) -> bool:
     """True if significant `names` come before a more probable sentence; `joined` is `Evidence.joined`.
 
@@ -121,7 +120,7 @@ def name_first(
         return False
     left = joined(sentence)
     least = worth(sentence, [*left.ranked[:1], *left.told[:1]], len(left.ranked))
-    for name in leaders(names, policy):
+    for name in leaders(names):
         behind = joined(name)
         if name is names[0] and left.alarm and not behind.alarm:
             return True
@@ -154,12 +153,11 @@ class Evidence:
     chi2: float
     dof: int
     scale: float = 1.0
-    policy: Policy = POLICY
 
     @cached_property
     def ranked(self) -> list[Ranked]:
         """Effects in order of evidence."""
-        return rank(self.table, self.probes, self.policy)
+        return rank(self.table, self.probes)
 
     @cached_property
     def told(self) -> list[Ranked]:
@@ -174,31 +172,31 @@ class Evidence:
     @cached_property
     def significant(self) -> list[Ranked]:
         """Effects that are significant by themselves, best evidence first."""
-        return [r for r in self.ranked if self.table.corrected(r.score) < self.policy.alarm]
+        return [r for r in self.ranked if self.table.corrected(r.score) < thresholds.ALARM]
 
     @cached_property
     def significant_sentences(self) -> list[Ranked]:
         """Sentences that are significant by themselves, best evidence first."""
-        return [r for r in self.told if self.table.corrected(r.score) < self.policy.alarm]
+        return [r for r in self.told if self.table.corrected(r.score) < thresholds.ALARM]
 
     @property
     def alarm(self) -> bool:
         """True if anything is missing at all."""
-        return self.table.p_global < self.policy.alarm
+        return self.table.p_global < thresholds.ALARM
 
     @property
     def poor(self) -> bool:
         """True if so much is missing that what cannot be differentiated is worth trying."""
-        return self.chi2 > self.policy.poor_fit * self.dof
+        return self.chi2 > thresholds.POOR_FIT * self.dof
 
     @property
     def floor(self) -> float:
         """Scatter behind everything that was looked for, in standard deviations of the data as stated; 1 or more.
 
-        Above `Policy.floor` no candidate explains the data to within N_ERR. Evidence and separations then count in this
-        unit: in that of photons everything would be certain.
+        Above `thresholds.FLOOR` no candidate explains the data to within N_ERR. Evidence and separations then count in
+        this unit: in that of photons everything would be certain.
         """
-        return self.table.noise_scale if self.table.noise_scale > self.policy.floor else 1.0
+        return self.table.noise_scale if self.table.noise_scale > thresholds.FLOOR else 1.0
 
     @cached_property
     def _pattern_scores(self) -> list[Score]:
@@ -223,8 +221,8 @@ class Evidence:
         """Patterns that are needed, and the scores of everything with those as nuisances."""
         space, scores, square = self.space, self.scores, self.square
         names, table, needed = list(self.patterns), self.table, []
-        while len(needed) < self.policy.most_patterns:
-            left = [s for s in map(table.__getitem__, names) if s.testable and self._p(s) < self.policy.alarm]
+        while len(needed) < thresholds.MOST_PATTERNS:
+            left = [s for s in map(table.__getitem__, names) if s.testable and self._p(s) < thresholds.ALARM]
             if not left:
                 break
             best = max(left, key=lambda s: s.log_bayes)
@@ -244,50 +242,23 @@ class Evidence:
 
         It is more probable than any of them, or is significant beside those that are needed.
         """
-        if evidence > self.best_pattern - self.policy.even_odds:
+        if evidence > self.best_pattern - thresholds.EVEN_ODDS:
             return True
         table = self._beside_patterns[1]
         return any(
-            self._p(table[probe.name]) < self.policy.alarm for probe in probes if table[probe.name].testable
+            self._p(table[probe.name]) < thresholds.ALARM for probe in probes if table[probe.name].testable
         )
 
-    def _followed(self, item: Ranked) -> float:
+    def followed(self, item: Ranked) -> float:
         """Evidence of further sentences behind one: a pattern of many numbers may hold several at once."""
         gain, state = 0.0, self
-        for _ in range(1, self.policy.most_together):
+        for _ in range(1, thresholds.MOST_TOGETHER):
             state = state.joined(item)
             if not state.significant_sentences:
                 break
             item = state.significant_sentences[0]
             gain += item.log_bayes
         return gain
-
-    def is_worth_telling(
-        self, effect: EffectKind, evidence: float, left: float, *, noise: bool, item: Ranked | None = None
-    ) -> bool:
-        """True if an addition explains a good part of what is missing, and patterns without a name do not do better.
-
-        `left` is its χ², `noise` says whether that is what noise alone would leave, `item` is its linear step.
-        """
-        evidence /= self.floor**2
-        if evidence <= self.evidence_needed:
-            return False
-        missing = self.chi2 - self.dof
-        least = self.policy.least_share * missing
-        # Of a poor fit the final model is asked (`Policy.part`): what is missing there may be many things.
-        if not (self.poor or effect is Described):
-            surely = missing - 2.0 * np.sqrt(2.0 * self.dof)
-            least = max(least, self.policy.least_share_of_name * surely)
-        if self.chi2 - left < least:
-            return False
-        # What is left is noise, and was not before: a pattern can only say the same with more numbers.
-        if noise and not explains(self.chi2, self.dof):
-            return True
-        probes = [probe for probe in self.probes if probe.effect is effect]
-        if self.stands(probes, evidence) if probes or effect is Described else True:
-            return True
-        more = self._followed(item) if effect is Described and item is not None else 0.0
-        return more > 0.0 and self.stands(probes, evidence + more / self.floor**2)
 
     def joined(self, item: Ranked, known: ScoreSpace | None = None) -> Evidence:
         """The evidence once a candidate has joined the base, by a linear step; `known` is the space of that."""
@@ -313,7 +284,7 @@ class Evidence:
         names, found = self.significant, self.significant_sentences
         if names:
             found = [item for item in found if item.log_bayes > names[0].log_bayes]
-        return [] if found and name_first(names, found[0], self.joined, self.policy) else found
+        return [] if found and name_first(names, found[0], self.joined) else found
 
     # ------------------------------------------------------------------------------- what cannot be told apart
 
@@ -335,7 +306,7 @@ class Evidence:
         """Effects that could follow what a candidate would explain, by linear steps; the nearest first."""
         apart = self.nearest(self.apart(item))
         apart.pop(item.effect.name, None)
-        close = {name: s for name, s in apart.items() if s < self.policy.separation * self.floor}
+        close = {name: s for name, s in apart.items() if s < thresholds.SEPARATION * self.floor}
         return tuple(sorted(close, key=close.__getitem__))
 
     def nameless(self, item: Ranked, own: Collection[str] = ()) -> tuple[str, ...]:
@@ -343,17 +314,17 @@ class Evidence:
 
         The most probable come first; `own` are its equivalent sentences.
         """
-        least, apart = max(0.0, item.log_bayes - self.policy.improbable), self.apart(item)
-        length, limit = len(item.score.amplitudes), self.policy.separation * self.floor
+        least, apart = max(0.0, item.log_bayes - thresholds.IMPROBABLE), self.apart(item)
+        length, limit = len(item.score.amplitudes), thresholds.SEPARATION * self.floor
         alike = {p.name for p in self.sentences if len(p.widths) <= length and apart[p.name] < limit}
         others = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
         others = [r for r in others if r.probe is not item.probe and not set(own) & set(said_by(r.probe))]
-        return tuple(r.probe.name for r in others[: self.policy.most_classes])
+        return tuple(r.probe.name for r in others[: thresholds.MOST_CLASSES])
 
     def held_in_part(self, item: Ranked) -> tuple[str, ...]:
         """Effects of which a part, by itself, is not improbable beside a candidate; parts share the prior of theirs."""
         count = Counter(effect for _, effects in self.parts for effect in effects)
-        least = max(0.0, item.log_bayes - self.policy.improbable)
+        least = max(0.0, item.log_bayes - thresholds.IMPROBABLE)
         return tuple(
             dict.fromkeys(
                 effect.name
@@ -367,7 +338,7 @@ class Evidence:
 
     def classes(self) -> Iterator[dict[str, Any]]:
         """Rows of a file: effects that could follow what each significant one would explain, by linear steps."""
-        for item in self.significant[: self.policy.most_classes]:
+        for item in self.significant[: thresholds.MOST_CLASSES]:
             if close := self.close(item):
                 effect = item.effect
                 yield {"effect": effect.name, "equivalent": close, "separated_by": effect.separated_by}
@@ -386,7 +357,7 @@ class Evidence:
             value, sigma = float(item.score.amplitudes[0]), float(np.sqrt(item.score.covariance[0, 0]))
             unit = item.effect.numbers()[names[0]].unit
             one_sided = names[0] in item.effect.one_sided
-            below = upper_limit(value, sigma, one_sided=one_sided, probability=self.policy.limit)
+            below = upper_limit(value, sigma, one_sided=one_sided, probability=thresholds.LIMIT)
             yield {
                 "effect": item.effect.name, "parameter": names[0], "unit": unit,
                 "value": value, "sigma": sigma, "below_95": below,
@@ -398,7 +369,9 @@ def explains(chi2: float, dof: float) -> bool:
     return bool(dof > 0 and chi2 - dof < SUSPECT_SIGMA * np.sqrt(2.0 * dof))
 
 
-def upper_limit(value: float, sigma: float, *, one_sided: bool, probability: float = POLICY.limit) -> float:
+def upper_limit(
+    value: float, sigma: float, *, one_sided: bool, probability: float = thresholds.LIMIT
+) -> float:
     """Size that an amplitude stays below with a probability, for a flat prior (positive when one-sided)."""
     if one_sided:
         below_zero = special.ndtr(-value / sigma)
@@ -467,7 +440,7 @@ class Examination(Evidence):
     def is_like(self, design: Design) -> bool:
         """True if another fit expects so nearly the same counts that its columns may serve again."""
         ours, theirs = self.design.measured.model, design.measured.model
-        return bool(np.linalg.norm(ours - theirs) < self.policy.same_counts * np.linalg.norm(ours))
+        return bool(np.linalg.norm(ours - theirs) < thresholds.SAME_COUNTS * np.linalg.norm(ours))
 
 
 def examine(
@@ -477,7 +450,6 @@ def examine(
     earlier: Examination | None = None,
     sentences: Sequence[Probe] = (),
     parts: Parts = (),
-    policy: Policy = POLICY,
 ) -> Examination:
     """Score effects that a model has not, sentences, `parts` (`grammar.beside_names`) and patterns against a fit.
 
@@ -521,7 +493,7 @@ def examine(
     r = design.projector(design.residual)
     space, scores, square, common_mode = bare, design.products(columns, r), float(r @ r), np.zeros(0)
     if SINGLE_EXPOSURES in names:
-        common_mode = _common_mode(bare, design, policy.common_mode)
+        common_mode = _common_mode(bare, design, thresholds.COMMON_MODE)
         space, reduce = bare.with_base([SINGLE_EXPOSURES], common_mode)
         scores, square = reduce(scores, square)
     return Examination(
@@ -536,7 +508,6 @@ def examine(
         chi2=result.chi2,
         dof=result.dof,
         scale=result.noise_scale,
-        policy=policy,
         result=result,
         design=design,
         named=named,

@@ -12,9 +12,10 @@ from jaxtyping import Float, Int
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import Exposures
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_product import ClassOf, averaged
 from walop_jax.diagnosis.design import Design, positions_of
-from walop_jax.diagnosis.policy import POLICY, Policy
+from walop_jax.diagnosis.reasons import why
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
@@ -196,7 +197,6 @@ class Step:
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
     told: tuple[tuple[Change, float, float], ...] = ()
     nameless: tuple[str, ...] = ()
-    negligible_below: float = POLICY.negligible
     residual_before: Cube = dataclasses.field(default_factory=_no_cube)
     residual_after: Cube = dataclasses.field(default_factory=_no_cube)
 
@@ -208,7 +208,7 @@ class Step:
     @property
     def negligible(self) -> bool:
         """True if the effect hardly matters for calibrated q and u."""
-        return self.change_of_qu < self.negligible_below
+        return self.change_of_qu < thresholds.NEGLIGIBLE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -253,7 +253,9 @@ class Diagnosis(Drawn):
     `noise_scale` is the scatter of what no candidate explains over what N_ERR says, `noise_p` the chance that noise of
     the stated size scatters as much. `classes` are significant effects of the first examination with those that
     these data cannot tell from them, `limits` what effects that were not found stay below: rows of `diagnosis.json`.
-    `members` are the classes of what was added, with what their members do to stars.
+    `members` are the classes of what was added, with what their members do to stars, `rounds` all that was tried or
+    ranked, with the reason for which it was not added, `not_scored` what was not, and why. `descriptions` counts those
+    that were scored.
     """
 
     first_figure = "ladder"
@@ -274,9 +276,18 @@ class Diagnosis(Drawn):
     noise_p: float = float("nan")
     choices: tuple[Choice, ...] = ()
     classes: tuple[Mapping[str, Any], ...] = ()
-    policy: Policy = POLICY
-    ended: bool = False
+    ended: str = ""
     members: tuple[ClassOf, ...] = ()
+    rounds: tuple[Any, ...] = ()
+    not_scored: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    descriptions: int = 0
+
+    def why(self, name: str) -> str:
+        """Why an effect, a description or a change of the instrument was not named, with the numbers.
+
+        ValueError, with the nearest names, for what is none of them.
+        """
+        return why(document(self), name)
 
     def calibration(self) -> Calibration:
         """The calibration of the extended model: its mean over what these data cannot tell apart, with its spread."""
@@ -290,8 +301,8 @@ class Diagnosis(Drawn):
         parts = []
         if self.ended:
             parts.append(
-                f"the search ended after {self.policy.minutes:g} minutes with this model, the best so far: allow more "
-                "minutes, or start from it as --model"
+                f"the search ended after {self.ended} with this model, the best so far: allow more minutes, if it was "
+                "you who set them, or start from it as --model"
             )
         looked_at = len(self.after.calset.points)
         if looked_at < self.points:
@@ -299,7 +310,7 @@ class Diagnosis(Drawn):
                 f"{looked_at} of {self.points} field points were looked at, and fitted: refit all of them with the "
                 "model found"
             )
-        if len(self.steps) > self.policy.most_names:
+        if len(self.steps) > thresholds.MOST_NAMES:
             parts.append(
                 f"{len(self.steps)} names were needed: something that is not in the catalogue can look like several "
                 "that are"
@@ -309,11 +320,11 @@ class Diagnosis(Drawn):
         ]
         if far:
             parts.append(f"far beyond its prior, which was widened: {', '.join(far)}")
-        weak = [s.effect for s in self.steps if s.robust_ratio > self.policy.largest_robust_ratio]
+        weak = [s.effect for s in self.steps if s.robust_ratio > thresholds.LARGEST_ROBUST_RATIO]
         if weak:
             parts.append(
                 f"errors of {', '.join(weak)} are too small by more than a factor "
-                f"{self.policy.largest_robust_ratio:g} if single exposures have disturbances of their own"
+                f"{thresholds.LARGEST_ROBUST_RATIO:g} if single exposures have disturbances of their own"
             )
         return "; ".join(parts)
 
@@ -533,7 +544,13 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "cannot_be_tested": diagnosis.untestable,
         "chi2_per_dof_before": diagnosis.before.chi2 / max(diagnosis.before.dof, 1),
         "chi2_per_dof_after": diagnosis.after.chi2 / max(diagnosis.after.dof, 1),
+        "rounds": [
+            {"p_value": turn.p_value, "added": turn.added, "asked": [one._asdict() for one in turn.asked]}
+            for turn in diagnosis.rounds
+        ],
+        "not_scored": dict(diagnosis.not_scored),
+        "descriptions": diagnosis.descriptions,
         "caution": diagnosis.caution,
-        "policy": diagnosis.policy.document(),
+        "policy": thresholds.in_use(),
         "seconds": diagnosis.seconds,
     }

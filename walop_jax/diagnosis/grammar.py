@@ -26,9 +26,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from walop_jax.data.records import Exposures
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.dependences import STEPS, Asked, between, starts_of_steps
 from walop_jax.diagnosis.hypotheses import Probe, said_by
-from walop_jax.diagnosis.policy import RINGS
 from walop_jax.likelihood import limits
 from walop_jax.model.conventions import Units
 from walop_jax.model.effects import Context, Described, EffectKind
@@ -359,7 +359,7 @@ def _of_cameras(instrument: Instrument, asked: Asked) -> Iterator[tuple[Sentence
         for factor in (*asked.slow(), *asked.single(), *asked.nights()):
             yield _times(gain, factor)
         if asked.over_field:
-            yield _times(gain, *(f"ring {n}" for n in RINGS))
+            yield _times(gain, *(f"ring {n}" for n in thresholds.RINGS))
             both = tuple(Sentence("gain", "of", name) for name in arm.analyser.cameras)
             for factor in (*asked.kinds(), *asked.single()):
                 yield _times(_times(both, factor), "x", "y")

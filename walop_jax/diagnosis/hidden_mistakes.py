@@ -25,9 +25,9 @@ from walop_jax.calibration.could_hide import as_text, change_by_effect, moves_wi
 from walop_jax.calibration.matrix import first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import Probe
-from walop_jax.diagnosis.policy import POLICY, PROBABILITY, Policy
 from walop_jax.diagnosis.score import local_p, noncentrality
 from walop_jax.diagnosis.stated_conditions import Singles
 from walop_jax.fit.verdict import DATA, EFFECT, Hidden
@@ -60,7 +60,7 @@ class _Mistake(NamedTuple):
     acts: bool = False
 
 
-def hidden_mistakes(design: Design, singles: Singles, policy: Policy = POLICY) -> Hidden:
+def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     """Single mistakes as large as the data would just have shown at 99 % probability, and what they do.
 
     Kept are those that move the parameters by more than their standard errors, and effects that act on starlight; first
@@ -70,7 +70,7 @@ def hidden_mistakes(design: Design, singles: Singles, policy: Policy = POLICY) -
     fit = design.fit
     usual = usual_exposure(fit.calset, fit.model.template)
     instrument = fit.model.instrument(fit.values)
-    found = list(_mistakes(design, singles, usual, policy))
+    found = list(_mistakes(design, singles, usual))
     along = np.array([one.along for one in found]).reshape(len(found), -1).T
     changes = (fit.model.selection() @ design.taken_up(along)).T
     turns = np.array([0.0 if one.effect is None else abs(turn_of(instrument, one.effect)) for one in found])
@@ -107,10 +107,10 @@ def hidden_mistakes(design: Design, singles: Singles, policy: Policy = POLICY) -
     )
 
 
-def _mistakes(design: Design, singles: Singles, usual: int, policy: Policy) -> Iterator[_Mistake]:
+def _mistakes(design: Design, singles: Singles, usual: int) -> Iterator[_Mistake]:
     """All of them, amplitude by amplitude."""
     of_stars = _Starlight(design, singles.asked, usual)
-    p, first = local_p(policy.alarm, len(singles.testable)), 0
+    p, first = local_p(thresholds.ALARM, len(singles.testable)), 0
     shown = set()
     for one in singles.rivals:
         count = len(one.candidate.widths)
@@ -119,7 +119,7 @@ def _mistakes(design: Design, singles: Singles, usual: int, policy: Policy) -> I
         plausible, alive = np.broadcast_to(one.plausible, count), singles.alive[at]
         if not plausible.any():
             continue
-        least = noncentrality(p, max(singles.table[one.candidate.name].rank, 1), PROBABILITY)
+        least = noncentrality(p, max(singles.table[one.candidate.name].rank, 1), thresholds.PROBABILITY)
         left = np.where(alive, singles.left[at], 1.0)
         sizes = np.where(alive, np.minimum(plausible, np.sqrt(least / left)), plausible)
         along = singles.along[:, at] * sizes

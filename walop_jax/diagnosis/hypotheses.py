@@ -18,7 +18,7 @@ from walop_jax.diagnosis.dependences import FEWEST_POINTS
 from walop_jax.diagnosis.score import Candidate, Score
 from walop_jax.likelihood.columns import Change, Columns, own_columns
 from walop_jax.model.dependence import conditions_of_effect
-from walop_jax.model.effects import Context, Effect, EffectKind
+from walop_jax.model.effects import Context, Described, Effect, EffectKind
 from walop_jax.model.effects.catalogue import applies
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.instrument import Instrument
@@ -69,6 +69,11 @@ class Ranked:
     score: Score
     log_bayes: float
     others: tuple[tuple[Probe, Score], ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Its name: of what has none, the descriptions."""
+        return self.probe.name if self.effect is Described else self.effect.name
 
 
 def applicable(

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.could_hide import CouldHide
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.examination import Matrix, Vector
-from walop_jax.diagnosis.policy import ALARM, ASKED_BY_CAMERA, PROBABILITY
 from walop_jax.fit.verdict import DATA, EFFECT
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
@@ -104,8 +104,8 @@ class DetectionLimits(Displayed):
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
         return {
-            "probability": PROBABILITY,
-            "alarm": ALARM,
+            "probability": thresholds.PROBABILITY,
+            "alarm": thresholds.ALARM,
             "limits": [dataclasses.asdict(entry) for entry in self.limits],
             "effects": list(self.effects),
             "separation": self.separation.tolist(),
@@ -151,7 +151,7 @@ class DetectionLimits(Displayed):
                 f"{e.effect}.{e.parameter}", EFFECT, e.detected[1], e.unit, "", True, False, e.error_of_qu
             )
             for e in self.limits
-            if e.effect not in ASKED_BY_CAMERA
+            if e.effect not in thresholds.ASKED_BY_CAMERA
         )
         data = (
             CouldHide(e.what, DATA, e.size, e.unit, "", True, False, e.error_of_qu) for e in self.conditions

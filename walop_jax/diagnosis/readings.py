@@ -26,7 +26,7 @@ import numpy as np
 
 from walop_jax.data.records import POLARISER, CalibrationSet, Exposures, Points, Position
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.diagnosis.policy import POLICY, Policy
+from walop_jax.diagnosis import thresholds
 from walop_jax.fit.model_file import base_model, model_like
 from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.fit.search import FAR_OFF
@@ -65,18 +65,18 @@ class Alternative:
         return f"{self.what} (χ²/dof = {self.explained:.3g}): {self.remedy}"
 
 
-def refuse_mixups(result: FitResult, policy: Policy = POLICY) -> None:
+def refuse_mixups(result: FitResult) -> None:
     """Raise `DataError` with the remedy if a fit leaves what another reading of its data explains."""
-    found = mixups_of(result, policy)
+    found = mixups_of(result)
     if found:
         raise refusal(result, found)
 
 
-def mixups_of(result: FitResult, policy: Policy = POLICY) -> tuple[Alternative, ...]:
+def mixups_of(result: FitResult) -> tuple[Alternative, ...]:
     """The readings of the data that explain what a fit leaves, best first."""
     if result.dof <= 0:
         return ()
-    return mixups(result.calset, result.model, result.chi2 / result.dof, policy)
+    return mixups(result.calset, result.model, result.chi2 / result.dof)
 
 
 def refusal(result: FitResult, found: Sequence[Alternative]) -> DataError:
@@ -87,14 +87,12 @@ def refusal(result: FitResult, found: Sequence[Alternative]) -> DataError:
     )
 
 
-def mixups(
-    calset: CalibrationSet, model: Model, left: float, policy: Policy = POLICY
-) -> tuple[Alternative, ...]:
+def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternative, ...]:
     """The readings of the data that explain them, best first, where a fit misses them by a per cent or more.
 
     `left` is the χ²/dof of a fit of `model`.
     """
-    if left < policy.poor_fit:
+    if left < thresholds.POOR_FIT:
         return ()
     # The program that a small set was fitted with is there already.
     few = calset if len(calset.points) <= _FEW else thinned(calset, _POINTS, neighbours=1)
@@ -103,21 +101,21 @@ def mixups(
     if not seen.any():
         return ()
     # What has gone wrong with all exposures misses all of the light by so much.
-    coarse = np.median(block.sigma[seen] / block.counts[seen]) * np.sqrt(left) >= policy.reading_coarse
+    coarse = np.median(block.sigma[seen] / block.counts[seen]) * np.sqrt(left) >= thresholds.READING_COARSE
     few = dataclasses.replace(few, intensities=TableIntensities.dense(few.points, block))
     likelihood = Likelihood.of(few, model)
     stands, values = _left(likelihood, left, _STEPS[1])
     left = min(left, stands)
-    if left < policy.poor_fit:  # the fit has lost its way, not the data
+    if left < thresholds.POOR_FIT:  # the fit has lost its way, not the data
         return ()
     of_all = (_readings(few, model), _instruments(few)) if coarse and left >= FAR_OFF else ()
     for readings in (_of_some_exposures(likelihood, _worst_exposures(likelihood, values)), *of_all):
         tried = [_judged(one, few, model, left, _STEPS[0]) for one in readings]
         best = [_judged(one, few, model, one.explained, _STEPS[1]) for one in _sorted(tried)[:_BEST]]
-        enough = min(1.0 + (left - 1.0) / policy.reading_gain, FAR_OFF)
+        enough = min(1.0 + (left - 1.0) / thresholds.READING_GAIN, FAR_OFF)
         good = [one for one in _sorted(best) if one.explained < enough]
         if good:
-            return tuple(one for one in good if one.explained < policy.reading_alike * good[0].explained)
+            return tuple(one for one in good if one.explained < thresholds.READING_ALIKE * good[0].explained)
     return ()
 
 

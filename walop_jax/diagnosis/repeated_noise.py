@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import local_p
 from walop_jax.io.text import some
 
@@ -38,9 +38,9 @@ class _Pair(NamedTuple):
     correlation: float
 
 
-def repeated_noise(design: Design, policy: Policy = POLICY) -> Iterator[str]:
+def repeated_noise(design: Design) -> Iterator[str]:
     """Sentences on exposures that hold the same noise, by their number."""
-    pairs = pairs_alike(design, policy.alarm)
+    pairs = pairs_alike(design, thresholds.ALARM)
     if pairs:
         number = design.fit.calset.exposures.exposure
         each = [f"{number[p.first]} and {number[p.second]} (correlation {p.correlation:.2f})" for p in pairs]
@@ -51,7 +51,7 @@ def repeated_noise(design: Design, policy: Policy = POLICY) -> Iterator[str]:
         )
 
 
-def pairs_alike(design: Design, alarm: float = POLICY.alarm) -> list[_Pair]:
+def pairs_alike(design: Design, alarm: float = thresholds.ALARM) -> list[_Pair]:
     """Pairs of exposures whose residuals hang together as only those of the same measurement do, closest first."""
     measured = design.measured
     if measured.shared.exposures is not None:

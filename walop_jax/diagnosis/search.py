@@ -1,295 +1,300 @@
-"""The search for what is missing: additions are tried, confirmed and adopted, one after the other.
+"""The search for what is missing: while something is, additions are tried, refused with a reason, or adopted.
 
-Names are added by evidence, one after the other, by the same rules for every judge. A *judge* says what an addition is
-worth. That of the blind study (`tests/diagnosis/blind.py`) takes its linear step (a Schur complement of the score
-space): no model is computed, and thousands of scenes run through the rules below. `workflow.Refit` fits it, but only
-what may be added:
+All is functions of a `State`, which never changes. `refused` has all rules by which an addition is not made, `search`
+is the loop. What differs between the search that fits (`refits.Refits`) and the one of the blind study, which takes
+linear steps (`tests/diagnosis/linear_judge.py`), is a `Judge`.
 
-1. Candidates are ordered by their linear evidence. What linear algebra finds not worth telling is not tried.
+1. Candidates are ordered by their linear evidence. What could not be added by its linear step is not tried.
 2. The best is fitted. If it leaves nothing but noise, no rival can be better. If its evidence differs from that of its
-   linear step by more than `Policy.linear_good`, rivals that lie within twice the difference are fitted as well.
-3. Where the model is far off and no name explains half of that, or none is found, what cannot be differentiated
+   linear step by more than `thresholds.LINEAR_GOOD`, rivals that lie within twice the difference are fitted as well.
+3. Where the model is far off and no name explains half of that, or none is left, what cannot be differentiated
    competes with the names: structural effects and other descriptions of the instrument (`descriptions`).
-4. What data that took no part in the fit confirm joins the model (`adopted`), and what is left is scored again.
+4. The best that data which took no part in its fit confirm is adopted, and what is left is scored again.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
-from typing import Any, TypeVar
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from walop_jax.calibration.accuracy import largest_change
-from walop_jax.calibration.matrix import instrument_matrices
-from walop_jax.diagnosis.design import Design, held_out
-from walop_jax.diagnosis.exact import Trial, in_words, refit_without
+from walop_jax.diagnosis import thresholds
+from walop_jax.diagnosis.exact import Trial, in_words
 from walop_jax.diagnosis.examination import Evidence, explains, leaders
-from walop_jax.diagnosis.findings import Step
+from walop_jax.diagnosis.findings import Choice
 from walop_jax.diagnosis.hypotheses import Ranked
-from walop_jax.diagnosis.policy import Policy
-from walop_jax.diagnosis.score import Candidate
-from walop_jax.fit.robust import field_cells, states
 from walop_jax.model.effects import Described
 
-LaidOut = tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, " _"], int, float]
-
-# ------------------------------------------------------------------------------- what an effect does, by two fits
-
-
-def before_and_after(name: str, before: Design, after: Design) -> dict[str, Any]:
-    """The fields of a `Step` that compare the fits without and with an effect."""
-    effect = after.fit.model.instrument(after.fit.values).effect(name)
-    # An effect with a number for every exposure, or for one of them, cannot predict exposures that it has not seen.
-    many = any(np.size(getattr(effect, f)) > 4 for f in effect.kind.amplitudes())
-    many |= isinstance(effect, Described) and any("exposure" in text for text in effect.sentences)
-    scheme = "field blocks" if many else "exposures"
-    old, new = (instrument_matrices(design.fit) for design in (before, after))
-    return {
-        "chi2_before": before.fit.chi2,
-        "chi2_after": after.fit.chi2,
-        "heldout_scheme": scheme,
-        "heldout_before": held_out(before, scheme),
-        "heldout_after": held_out(after, scheme),
-        "change_of_qu": largest_change(old, new),
-        "residual_before": before.measured.residual,
-        "residual_after": after.measured.residual,
-    }
+MOST_LISTED = 40
+"""Candidates of a kind that a round lists without having tried them."""
 
 
-def refitted_in_order(steps: Sequence[Step], start: Design, end: Design) -> list[Step]:
-    """The steps as they lead, one after the other, from one fit to another that has no effects beside theirs.
+class Reason(NamedTuple):
+    """One candidate in a round: its evidence (ln B), corrected p, whether it was fitted, and why it was not added.
 
-    The models between the two are fitted again; what belongs to the discovery of an effect stays.
+    `against` are KINDs of exposures that speak against it.
     """
-    fits = [end.fit] if steps else []
-    for step in reversed(steps[1:]):
-        fits.append(refit_without(fits[-1], step.effect))
-    compared, before = [], start
-    for step, result in zip(steps, reversed(fits), strict=True):
-        after = end if result is end.fit else Design.of(result)
-        compared.append(dataclasses.replace(step, **before_and_after(step.effect, before, after)))
-        before = after
-    return compared
+
+    name: str
+    evidence: float
+    p_value: float
+    fitted: bool
+    reason: str
+    against: str = ""
 
 
-def predicts_unseen(
-    design: Design, terms: Sequence[Candidate], least: float, *, of_states: bool = True
-) -> bool:
-    """True if terms without a name predict states and parts of the field that they have not seen.
+@dataclasses.dataclass(frozen=True)
+class Round:
+    """One round of a search: global p before it, what was added (empty: nothing), and all that was asked."""
 
-    One Gauss–Newton step of everything, with and without the terms, from all data but those of a unit gives the
-    density of that unit, ln p = −½ (dᵀΣ⁻¹d + ln det Σ), Σ = s² (1 + A H⁻¹ Aᵀ): it is broad where the step leaves it
-    open, and s² is the χ²/dof that a model leaves, 1 or more. Units are states (exposures that differ in nothing but
-    the filter; not where the terms are about single ones), and the cells of the field, where there are several. The
-    mean gain must exceed `least` times its standard error over the units, for both: a term that only follows what each
-    setting of an element does by itself predicts the field, and no other setting. Nor must it bend the rest of the
-    model: the mean of dᵀd over the states must not grow, where a density may become more probable by being broader
-    alone.
+    p_value: float
+    added: str
+    asked: tuple[Reason, ...]
 
-    Symbols     d prediction error of the unit, A its rows of the Jacobian, H normal matrix of all others and priors
+
+@dataclasses.dataclass(frozen=True)
+class State:
+    """A search at one moment: the evidence of the current model, the additions so far, and why there are no others.
+
+    `choices` are other descriptions of the instrument that were compared, `fits` counts exact fits of additions,
+    `ended` says after how much the search was broken off (empty: it was not).
     """
-    widths = np.concatenate([one.widths for one in terms])
-    own = design.stacked([one.columns for one in terms])
-    prior = np.zeros((len(widths), design.jacobian.shape[1]))
-    rows = np.vstack([np.hstack([design.jacobian, own]), np.hstack([prior, np.diag(1.0 / widths)])])
-    residual = np.append(design.residual, np.zeros(len(widths)))
-    calset = design.fit.calset
-    units = {"cells": field_cells(calset)[design.point]}
-    if of_states:
-        units["states"] = states(calset)[design.exposure]
-    for kind, unit in units.items():
-        if kind == "cells" and len(np.unique(unit)) < 2:
-            continue
-        before = _predictions(design.jacobian, design.residual, unit, design.projector.free)
-        after = _predictions(rows, residual, unit, design.projector.free)
-        gain, closer = (after - before).T
-        if len(gain) < 2 or gain.mean() < least * gain.std(ddof=1) / np.sqrt(len(gain)):
-            return False
-        if kind == "states" and closer.mean() > 0.0:
-            return False
-    return True
+
+    evidence: Any
+    steps: tuple[Trial, ...] = ()
+    rounds: tuple[Round, ...] = ()
+    choices: Mapping[str, Choice] = dataclasses.field(default_factory=dict)
+    fits: int = 0
+    ended: str = ""
 
 
-def gains_by_kind(before: Design, after: Design) -> dict[str, float]:
-    """Gain in ln p of the exposures of each KIND, as all others predict them, by what one design has beyond another.
+Judge = Any
+"""Worth of an addition, by exact fits (`refits.Refits`) or by linear steps alone (the blind study):
 
-    Polariser, Moon and standards see one instrument: what is true makes none of them less probable given the others.
-    The gains of a KIND and of all others by themselves add up to the evidence.
-    """
-    kinds = before.fit.calset.exposures.kind[before.exposure]
-    names = np.unique(kinds)
-    if len(names) < 2:
-        return {}
-    one, other = ((d.jacobian, d.residual, d.projector.free, d.fit.noise_scale) for d in (before, after))
-    return dict(zip(map(str, names), gains_of_units(kinds, one, other).tolist(), strict=True))
+over        amount of work after which nothing further is tried, in words; empty: there is more to spend
+fitted      a linear trial as the judge finds it
+others      trials of what has no linear step, and other descriptions of the instrument that were compared
+decided     trials in order of evidence, with those that are even decided
+confronted  a trial with what data that took no part in its fit say of it
+adopted     the state once a trial has joined the model
+"""
 
 
-def gains_of_units(unit: np.ndarray, before: LaidOut, after: LaidOut) -> Float[np.ndarray, " u"]:
-    """Gain in ln p of each unit of the data rows, as all others predict it, of one model over another.
-
-    Of each model the Jacobian, the residuals at its minimum, priors last, its degrees of freedom, and the factor on the
-    errors in whose units the data rows are.
-    """
-    count, found = np.unique(unit, return_counts=True)[1], []
-    for rows, residual, free, noise in (before, after):
-        density = _predictions(rows, residual, unit, free)[:, 0]
-        found.append(density - count * free / len(unit) * np.log(noise))
-    return found[1] - found[0]
-
-
-def _predictions(
-    rows: Float[np.ndarray, "r n"],
-    residual: Float[np.ndarray, " r"],
-    unit: np.ndarray,
-    free: int,
-) -> Float[np.ndarray, "u 2"]:
-    """ln p of the data rows of each unit as all the others predict them, and the square of how far they are off.
-
-    Rows beyond those of `unit` are priors.
-    """
-    norm = np.linalg.norm(rows, axis=0)
-    scaled = rows / np.where(norm > 0, norm, 1.0)
-    ridge = 1e-12 * np.eye(len(norm))
-    gram, along = scaled.T @ scaled + ridge, scaled.T @ residual
-    step = np.linalg.solve(gram, along)
-    scale = max(1.0, float(residual @ residual - along @ step) / max(free, 1))
-    whole = np.linalg.slogdet(gram)[1]
-    found = []
-    for one in np.unique(unit):
-        a, r = scaled[: len(unit)][unit == one], residual[: len(unit)][unit == one]
-        rest = gram - a.T @ a
-        d = r - a @ np.linalg.solve(rest, along - a.T @ r)
-        pull = a.T @ d
-        square = d @ d - pull @ np.linalg.solve(gram, pull)
-        spread = whole - np.linalg.slogdet(rest)[1]
-        density = -0.5 * (square / scale + spread + len(r) * free / len(unit) * np.log(scale))
-        found.append((density, float(d @ d)))
-    return np.array(found)
+def search(state: State, judge: Judge) -> State:
+    """The state in which nothing is missing, or nothing more can be added."""
+    for _ in range(thresholds.MOST_STEPS):
+        if not state.evidence.alarm:
+            break
+        if ended := judge.over(state.fits):
+            return dataclasses.replace(state, ended=ended)
+        trial, state = _next(state, judge)
+        if trial is None:
+            break
+        state = judge.adopted(state, trial)
+    return state
 
 
-# ----------------------------------------------------------------------------------------------------------- the search
+def refused(evidence: Evidence, trial: Trial) -> str:
+    """Reason not to add what was tried; empty: there is none."""
+    if trial.fit is not None and not trial.fit.converged:
+        return "its fit did not converge"
+    if not trial.predicts:
+        return "by its linear step it does not predict settings and field points that it has not seen"
+    worth, needed = trial.evidence / evidence.floor**2, evidence.evidence_needed
+    if worth <= needed:
+        return f"ln B = {worth:.3g} is not above {needed:.3g}"
+    explained, least = evidence.chi2 - trial.left, _least_explained(evidence, trial)
+    if explained < least:
+        missing = evidence.chi2 - evidence.dof
+        return f"it explains {explained:.4g} of {missing:.4g} that are missing in χ², less than {least:.4g}"
+    # What is left is noise, and was not before: a pattern can only say the same with more numbers.
+    suffices = trial.noise and not explains(evidence.chi2, evidence.dof)
+    if not suffices and not _stands(evidence, trial, worth):
+        return f"a pattern without a name is more probable (ln B = {evidence.best_pattern:.3g}, its own {worth:.3g})"
+    before, after = (trial.compared.get(f"heldout_{when}", np.nan) for when in ("before", "after"))
+    if after >= before:
+        return (
+            f"data that were left out agree worse with it (mean squared residual {before:.4g} → {after:.4g})"
+        )
+    return f"exposures of {trial.against} speak against it" if trial.against else ""
 
-State = TypeVar("State", bound=Evidence)
+
+def _least_explained(evidence: Evidence, trial: Trial) -> float:
+    """Part of what is missing in χ² that an addition must explain."""
+    missing = evidence.chi2 - evidence.dof
+    least = thresholds.LEAST_SHARE * missing
+    # Of a poor fit the final model is asked (`thresholds.PART`): what is missing there may be many things.
+    if evidence.poor or trial.effect is Described:
+        return least
+    surely = missing - 2.0 * np.sqrt(2.0 * evidence.dof)
+    return max(least, thresholds.LEAST_SHARE_OF_NAME * surely)
 
 
-def search(state: State, judge: Any, policy: Policy) -> Iterator[tuple[Trial, State, State]]:
-    """Additions until nothing is missing or none is found, each with the evidence before and after."""
-    for _ in range(policy.most_steps):
-        if not (state.alarm and judge.time_left()):
-            return
-        found = _next(state, judge, policy)
-        if found is None:
-            return
-        before, state = state, judge.adopted(state, found)
-        yield found, before, state
+def _stands(evidence: Evidence, trial: Trial, worth: float) -> bool:
+    """True if no pattern without a name is clearly more probable."""
+    probes = [probe for probe in evidence.probes if probe.effect is trial.effect]
+    if not probes and trial.effect is not Described:  # what has no linear step
+        return True
+    if evidence.stands(probes, worth):
+        return True
+    more = evidence.followed(trial.item) if trial.effect is Described and trial.item is not None else 0.0
+    return more > 0.0 and evidence.stands(probes, worth + more / evidence.floor**2)
 
 
-def linear_trials(state: Evidence, policy: Policy) -> list[Trial]:
+def hopeless(evidence: Evidence, trial: Trial) -> str:
+    """Reason not to try what a linear step would refuse even if it were better by as much as such steps may miss."""
+    if trial.evidence <= thresholds.LINEAR_BELOW:
+        return refused(evidence, trial)
+    more = 1.0 + thresholds.LINEAR_SHARE
+    left = evidence.chi2 - more * (evidence.chi2 - trial.left)
+    return refused(evidence, dataclasses.replace(trial, evidence=more * trial.evidence, left=left))
+
+
+# ------------------------------------------------------------------------------------------------------ one round
+
+
+def linear_trials(evidence: Evidence) -> list[Trial]:
     """The leading names, and sentences that are more probable than every name, by linear steps; best first."""
-    trials = [linear_trial(state, item) for item in leaders(state.significant, policy)]
-    said = state.sentences_before_names()[: policy.most_sentences]
-    trials += [linear_trial(state, item) for item in said]
-    return sorted(trials, key=lambda trial: names_first(trial, policy))
+    trials = [linear_trial(evidence, item) for item in leaders(evidence.significant)]
+    some = evidence.sentences_before_names()[: thresholds.MOST_SENTENCES]
+    return sorted((*trials, *(linear_trial(evidence, item) for item in some)), key=names_first)
 
 
-def linear_trial(state: Evidence, item: Ranked) -> Trial:
+def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
     """Trial of one candidate by its linear step; `linear` is what a fit should find, with its errors."""
-    noise, statistic = state.table.noise_scale, item.score.statistic
-    left = state.chi2 - statistic * (noise * state.scale) ** 2
+    noise, statistic = evidence.table.noise_scale, item.score.statistic
+    left = evidence.chi2 - statistic * (noise * evidence.scale) ** 2
     return Trial(
         item.effect,
         item.log_bayes,
         left,
-        explains(left, state.dof - item.score.rank),
+        explains(left, evidence.dof - item.score.rank),
         item=item,
         linear=item.log_bayes + 0.5 * statistic * (noise**2 - 1.0),
     )
 
 
-def names_first(trial: Trial, policy: Policy) -> float:
+def names_first(trial: Trial) -> float:
     """Order of trials: by evidence, but a sentence only where it is clearly more probable than a name."""
-    return -trial.evidence + (policy.even_odds if trial.effect is Described else 0.0)
+    return -trial.evidence + (thresholds.EVEN_ODDS if trial.effect is Described else 0.0)
 
 
-def _worth(state: Evidence, trial: Trial) -> bool:
-    return state.is_worth_telling(
-        trial.effect, trial.evidence, trial.left, noise=trial.noise, item=trial.item
-    )
+class _Log:
+    """The trials of one round by name, each with the reason for which it was refused."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        self.evidence, self.trials = evidence, dict[str, Trial]()
+
+    def passed(self, trials: Iterable[Trial], why: Any = refused) -> list[Trial]:
+        """The trials that are not refused; all are noted."""
+        judged = [dataclasses.replace(trial, refused=why(self.evidence, trial)) for trial in trials]
+        self.trials |= {trial.name: trial for trial in judged}
+        return [trial for trial in judged if not trial.refused]
 
 
-def _promising(state: Evidence, trial: Trial, policy: Policy) -> bool:
-    """True if a linear trial could be worth telling, were it better by as much as linear steps may miss."""
-    if trial.evidence <= policy.linear_below:
-        return _worth(state, trial)
-    more = 1.0 + policy.linear_share
-    left = state.chi2 - more * (state.chi2 - trial.left)
-    return _worth(state, dataclasses.replace(trial, evidence=more * trial.evidence, left=left))
-
-
-def _next(state: Evidence, judge: Any, policy: Policy) -> Trial | None:
-    """The addition with the highest evidence that is worth telling and confirmed; None where there is none."""
-    waiting = [trial for trial in linear_trials(state, policy) if _promising(state, trial, policy)]
-    tried, ready = list(waiting), []
+def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
+    """The addition with the highest evidence that is not refused (None: all are), and the state with the reasons."""
+    evidence, log, fits, choices = state.evidence, _Log(state.evidence), state.fits, state.choices
+    waiting = log.passed(linear_trials(evidence), hopeless)
+    tried, accepted, ended = list(waiting), None, ""
     others_asked = sentences_asked = False
-    while True:
-        new = []
-        while waiting and judge.time_left():
-            first = waiting.pop(0)
-            trial = judge.fitted(state, first)
-            if trial is None or not _worth(state, trial):
-                continue
-            new.append(trial)
-            tried = [trial if one is first else one for one in tried]
-            error = abs(trial.evidence - trial.linear)
-            reach = 2.0 * error if error > policy.linear_good else 0.0
-            if trial.noise or not waiting or trial.linear - waiting[0].linear >= reach:
-                break
+    while accepted is None:
+        new: list[Trial] = []
+        while waiting and not (ended := judge.over(fits)):
+            linear, fits = waiting.pop(0), fits + 1
+            passed = log.passed([judge.fitted(evidence, linear)])
+            new += passed
+            if passed:
+                tried = [passed[0] if one is linear else one for one in tried]
+                if _is_sure(passed[0], waiting):
+                    break
         if not (new or sentences_asked):  # names that came first by linear steps that were not to be believed
             sentences_asked = True
-            waiting = _sentences_behind(state, tried, policy)
+            waiting = log.passed(_sentences_behind(evidence, tried), hopeless)
             tried += waiting
             if waiting:
                 continue
-        missing = state.chi2 - state.dof
-        explained = any(t.noise or state.chi2 - t.left > policy.good_share * missing for t in new)
-        if not others_asked and not explained and (state.poor or not new):
+        missing = evidence.chi2 - evidence.dof
+        explained = any(t.noise or evidence.chi2 - t.left > thresholds.GOOD_SHARE * missing for t in new)
+        if not others_asked and not explained and (evidence.poor or not new):
             others_asked = True
-            others = [trial for trial in judge.others(state) if _worth(state, trial)]
-            new += others
-            tried += others
-        ready = judge.decided(sorted(new, key=lambda trial: names_first(trial, policy)))
-        for trial in ready:
-            if judge.confirmed(state, trial):
-                return _with_rivals(state, trial, tried, policy)
-        if not waiting or not judge.time_left():
-            return None
+            others, choices = judge.others(dataclasses.replace(state, fits=fits))
+            fits += len(others)
+            others = log.passed(others)
+            new, tried = [*new, *others], [*tried, *others]
+        for trial in judge.decided(sorted(new, key=names_first)):
+            if accepted := next(iter(log.passed([judge.confronted(evidence, trial)])), None):
+                break
+        if not waiting or (ended := judge.over(fits)):
+            break
+    if accepted is not None:
+        ended, accepted = "", _with_rivals(evidence, accepted, tried)
+    added = "" if accepted is None else accepted.name
+    turn = Round(evidence.table.p_global, added, tuple(_asked(evidence, log.trials, added)))
+    rounds = (*state.rounds, turn)
+    return accepted, dataclasses.replace(state, rounds=rounds, choices=choices, fits=fits, ended=ended)
 
 
-def _sentences_behind(state: Evidence, tried: Sequence[Trial], policy: Policy) -> list[Trial]:
-    """The leading sentences that are promising, without those that were tried."""
-    known = [trial.item for trial in tried]
-    some = [item for item in state.significant_sentences if item not in known][: policy.most_sentences]
-    return [one for one in (linear_trial(state, item) for item in some) if _promising(state, one, policy)]
+def _is_sure(trial: Trial, waiting: Sequence[Trial]) -> bool:
+    """True if no trial that waits can be better: this one leaves noise, or agrees with its linear step."""
+    error = abs(trial.evidence - trial.linear)
+    reach = 2.0 * error if error > thresholds.LINEAR_GOOD else 0.0
+    return trial.noise or not waiting or trial.linear - waiting[0].linear >= reach
 
 
-def _with_rivals(state: Evidence, trial: Trial, tried: Sequence[Trial], policy: Policy) -> Trial:
+def _sentences_behind(evidence: Evidence, tried: Sequence[Trial]) -> list[Trial]:
+    """The leading sentences, without those that were tried."""
+    some = [item for item in evidence.significant_sentences if not any(item is one.item for one in tried)]
+    return [linear_trial(evidence, item) for item in some[: thresholds.MOST_SENTENCES]]
+
+
+def _with_rivals(evidence: Evidence, trial: Trial, tried: Sequence[Trial]) -> Trial:
     """A trial with what is not improbable beside it, and other shapes of its effect that are as probable."""
     rivals, shapes = [], list(trial.alternatives)
     for other in tried:
-        if other is trial:
+        if other.name == trial.name:
             continue
         linear = other.fit is None and not np.isnan(trial.linear)
         apart = abs(other.linear - trial.linear if linear else other.evidence - trial.evidence)
-        if other.effect is not trial.effect and apart < policy.improbable:
+        if other.effect is not trial.effect and apart < thresholds.IMPROBABLE:
             rivals.append(other.effect.name)
-        elif other.effect is trial.effect and other.fit is not None and apart < policy.even_odds:
+        elif other.effect is trial.effect and other.fit is not None and apart < thresholds.EVEN_ODDS:
             shapes.append(in_words(other.instance))
-    item = trial.item or next((r for r in state.ranked if r.effect is trial.effect), None)
-    nameless = () if item is None else state.nameless(item, trial.sentences)
-    rivals += () if item is None else state.held_in_part(item)
+    item = trial.item or next((r for r in evidence.ranked if r.effect is trial.effect), None)
+    nameless = () if item is None else evidence.nameless(item, trial.sentences)
+    rivals += () if item is None else evidence.held_in_part(item)
     return dataclasses.replace(
         trial, alternatives=tuple(shapes), rivals=tuple(dict.fromkeys(rivals)), nameless=nameless
     )
+
+
+def _asked(evidence: Evidence, trials: Mapping[str, Trial], added: str) -> Iterable[Reason]:
+    """Everything that was tried in a round, and the leading candidates that were only ranked, with the reasons."""
+    table = evidence.table
+    for name, trial in trials.items():
+        reason = trial.refused or ("" if name == added else _came_first(added))
+        p = table.p_global if trial.item is None else table.corrected(trial.item.score)
+        yield Reason(name, trial.evidence, p, trial.fit is not None, reason, trial.against)
+    for ranked in (evidence.significant, evidence.significant_sentences):
+        for item in ranked[:MOST_LISTED]:
+            if item.name not in trials:
+                reason = _too_far(evidence, item)
+                yield Reason(item.name, item.log_bayes, table.corrected(item.score), False, reason)
+
+
+def _came_first(added: str) -> str:
+    return f"{added} was added first" if added else "the search was broken off before it was its turn"
+
+
+def _too_far(evidence: Evidence, item: Ranked) -> str:
+    """Reason for which a significant candidate was not tried: what comes before it."""
+    names, sentences = evidence.significant, evidence.significant_sentences
+    best = max([*names[:1], *sentences[:1]], key=lambda one: one.log_bayes)
+    if item.effect is Described and names and best is not names[0] and not evidence.sentences_before_names():
+        return f"names explain the same without it, {names[0].name} first (ln B = {names[0].log_bayes:.3g})"
+    gap = best.log_bayes - item.log_bayes
+    if best is item or gap <= 0.0:
+        return "others were tried first"
+    return f"{best.name} is more probable, by {gap:.3g} in ln B"

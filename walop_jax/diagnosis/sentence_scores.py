@@ -14,10 +14,9 @@ import numpy as np
 from scipy import linalg
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates
-from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.score import ScoreSpace, ScoreTable
 
 TOGETHER = 1e8  # numbers of columns that are there at a time
@@ -69,13 +68,13 @@ def _columns(design: Design, some: list[Probe]) -> Iterator[tuple[Probe, np.ndar
     yield from ((probe, said[probe.name].columns) for probe in some if probe.name in said)
 
 
-def described_doubts(design: Design, policy: Policy = POLICY) -> Iterator[str]:
+def described_doubts(design: Design) -> Iterator[str]:
     """A sentence if descriptions of what may be missing explain more than noise does."""
     table = sentence_scores(design)
-    if table.p_global >= policy.alarm:
+    if table.p_global >= thresholds.ALARM:
         return
-    names = table.significant(policy.alarm, _SHOWN)
+    names = table.significant(thresholds.ALARM, _SHOWN)
     yield (
         f"the residuals are explained better with something that the model has not (p = {table.p_global:.2g}, limit "
-        f"{policy.alarm:g}; nearest: {' | '.join(names)}): walop-jax diagnose looks for the cause"
+        f"{thresholds.ALARM:g}; nearest: {' | '.join(names)}): walop-jax diagnose looks for the cause"
     )

@@ -32,10 +32,10 @@ from jaxtyping import Bool, Float
 from scipy import special
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import log_evidence_ratio
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates, applicable, probes, showable
-from walop_jax.diagnosis.policy import ASKED_BY_CAMERA, POLICY, Policy
 from walop_jax.diagnosis.readings import with_exposures, with_places
 from walop_jax.diagnosis.score import (
     Candidate,
@@ -56,7 +56,7 @@ _FITTED, _ROUNDS = 3, 3  # stated numbers that are fitted exactly, and steps of 
 _ALIKE = 25.0  # in χ², within which conditions are told together
 _PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
 MOST_OF_ELEMENT = 4  # numbers of an element whose priors may be wrong together
-_ASKED_OTHERWISE = (*ASKED_BY_CAMERA, "standard_outlier")  # camera by camera, and as priors
+_ASKED_OTHERWISE = (*thresholds.ASKED_BY_CAMERA, "standard_outlier")  # camera by camera, and as priors
 _LEVELS = "exposures at a second light level"
 _DARK = "bias and dark frames"
 _ONE_STAR = "a bright star in one beam: its light in the other cameras"
@@ -161,16 +161,14 @@ def scored(design: Design, rivals: tuple[_Single, ...]) -> Singles:
     return Singles(rivals, table, along, np.diag(space.gram), space.alive)
 
 
-def stated_conditions(
-    design: Design, singles: Singles | None = None, policy: Policy = POLICY
-) -> Iterator[str]:
+def stated_conditions(design: Design, singles: Singles | None = None) -> Iterator[str]:
     """A sentence on the single numbers that the residuals of a fit speak against, the clearest first.
 
     Of a fit that does not explain its data only where one of them alone would.
     """
     singles = singles or Singles.of(design)
     rivals, table, scores = singles.rivals, singles.table, singles.testable
-    found = [score for score in scores if corrected_p(score.log_p, len(scores)) < policy.alarm]
+    found = [score for score in scores if corrected_p(score.log_p, len(scores)) < thresholds.ALARM]
     if not found:
         return
     found.sort(key=lambda score: score.log_p)
@@ -185,17 +183,18 @@ def stated_conditions(
     said = {one.candidate.name: one.said for one in rivals}
     told = "; or for ".join(said[score.name](score) for score in likely[:_SHOWN])
     more = f"; or for {len(likely) - _SHOWN} others" if len(likely) > _SHOWN else ""
-    yield f"the residuals ask for {told}{more} (p = {corrected_p(best.log_p, len(scores)):.2g}, limit {policy.alarm:g})"
+    p = corrected_p(best.log_p, len(scores))
+    yield f"the residuals ask for {told}{more} (p = {p:.2g}, limit {thresholds.ALARM:g})"
 
 
-def rival_conditions(design: Design, chi2: float, policy: Policy = POLICY) -> Iterator[str]:
+def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
     """A sentence on stated conditions, each of which, if wrong, explains the data as well as a model with `chi2` does.
 
     `design` is of the fit before anything was added to its model.
     """
     scored = [item for item in condition_scores(design) if item.score.testable]
     square = float(np.sum(design.projector(design.residual) ** 2))
-    least = special.chdtri(1, local_p(policy.alarm, len(scored))) if scored else np.inf
+    least = special.chdtri(1, local_p(thresholds.ALARM, len(scored))) if scored else np.inf
     gains = [float(item.score.amplitudes[0]) ** 2 * item.square for item in scored]
     alike = [
         (gain, item)
@@ -208,14 +207,14 @@ def rival_conditions(design: Design, chi2: float, policy: Policy = POLICY) -> It
         yield f"what was found explains no more than one number that the set states would, if it were {said}"
 
 
-def instead_of_names(before: FitResult, after: FitResult, policy: Policy = POLICY) -> str:
+def instead_of_names(before: FitResult, after: FitResult) -> str:
     """The number that the set states which, if wrong, explains the data better than names do; empty: none.
 
     Compared are the evidence of the names, ln B of `after` against `before`, and that of the number, fitted exactly,
     with its width as prior: ½ (χ² − χ²_c) − ½ ln(1 + w² C̃ᵀC̃). One number may so come before sixteen.
     """
     asked = [one for one in condition_scores(Design.of(before)) if one.score.testable]
-    asked = [one for one in asked if corrected_p(one.score.log_p, len(asked)) < policy.alarm]
+    asked = [one for one in asked if corrected_p(one.score.log_p, len(asked)) < thresholds.ALARM]
     if after.noise_scale != before.noise_scale:  # one scale of the errors, or χ² of both are not comparable
         after = fit(after.likelihood, start=after.values, noise_scale=before.noise_scale)
     best, told = log_evidence_ratio(before, after), ""

@@ -36,9 +36,9 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import special
 
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design, pattern_scores
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
-from walop_jax.diagnosis.policy import POLICY, Policy
 from walop_jax.diagnosis.readings import refuse_dead_cameras, refuse_mixups
 from walop_jax.diagnosis.repeated_noise import repeated_noise
 from walop_jax.diagnosis.score import Projector, ScoreTable, local_p
@@ -71,14 +71,11 @@ NOISELESS = 1e-6
 _SHOWN = 3
 
 
-def examined(
-    result: FitResult, seed: int = 0, *, as_written: bool = False, policy: Policy = POLICY
-) -> FitResult:
+def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> FitResult:
     """The fit with the verdict on it: what its residuals say against it, beside χ², priors and convergence.
 
     A fit that explains nothing is held against other readings of its data first (`readings`), unless these were
-    tried already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p,
-    `policy` holds the thresholds.
+    tried already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p.
     Of a set with more than `TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at.
     A χ² that is a few per cent too large while nothing else is wrong is put down to the stated errors, and the
     standard errors are made from the residuals. Raises `DataError` with the remedy for data that another reading
@@ -88,13 +85,13 @@ def examined(
     result = with_pixels(result)
     if not result.converged:
         if not as_written and result.chi2 > FAR_OFF * max(result.dof, 1):
-            refuse_mixups(result, policy)
+            refuse_mixups(result)
         return result.judged()
     near = result.explains_data or result.nearly_explains_data
     if not (near or as_written):
-        refuse_mixups(result, policy)
+        refuse_mixups(result)
     whole = on_field_points(result)
-    if not near and (scaled := tuple(_errors_too_small(result, seed, policy))):
+    if not near and (scaled := tuple(_errors_too_small(result, seed))):
         return result.judged(scaled)
     design = Design.of(sampled(whole, _most(whole)))
     if result.errors_too_large and _hold_no_noise(design):
@@ -104,18 +101,18 @@ def examined(
     hidden = None
     if near:
         table, singles = pattern_scores(design, seed), Singles.of(design)
-        hidden = hidden_mistakes(design, singles, policy)
+        hidden = hidden_mistakes(design, singles)
         doubts = (
-            *stated_conditions(design, singles, policy),
-            *_patterns(table, policy),
-            *described_doubts(design, policy),
+            *stated_conditions(design, singles),
+            *_patterns(table),
+            *described_doubts(design),
             *in_words(components),
-            *_groups(design, policy),
-            *repeated_noise(design, policy),
+            *_groups(design),
+            *repeated_noise(design),
         )
     else:  # anything may be in such residuals; what single places of the field share sits on stars as well
         components = [one for one in components if one.grouping.structure]
-        doubts = (*stated_conditions(design, policy=policy), *in_words(components))
+        doubts = (*stated_conditions(design), *in_words(components))
     doubts = (*doubts, *_summed_pixels(result), *_far_from_pixels(result))
     structure = structure_of(components)
     found = with_honest_errors(result)
@@ -171,7 +168,7 @@ def _most(result: FitResult) -> int:
     return max(1, TRUST_ROWS // max(len(result.calset.exposures), 1))
 
 
-def _errors_too_small(result: FitResult, seed: int, policy: Policy) -> Iterator[str]:
+def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:
     """A warning if residuals far larger than the stated errors are nothing but noise."""
     factor = float(np.sqrt(result.chi2 / max(result.dof, 1)))
     scaled = fit(result.likelihood, start=result.values, noise_scale=factor)
@@ -179,7 +176,7 @@ def _errors_too_small(result: FitResult, seed: int, policy: Policy) -> Iterator[
     design = Design.of(sampled(whole, _most(whole)))
     rough = found_components([*variance_components(design), *_of_pixels(scaled)])
     rough = rough or any(_summed_pixels(result))
-    if pattern_scores(design, seed).p_global >= policy.alarm and not (rough or any(_groups(design, policy))):
+    if pattern_scores(design, seed).p_global >= thresholds.ALARM and not (rough or any(_groups(design))):
         yield (
             f"N_ERR is {factor:.3g} times too small: with errors as large the residuals hold nothing but noise; check "
             "the gain and the unit of N_ERR"
@@ -211,12 +208,12 @@ def sampled(result: FitResult, most: int) -> FitResult:
     return dataclasses.replace(result, likelihood=Likelihood.of(calset, result.model))
 
 
-def _patterns(table: ScoreTable, policy: Policy) -> Iterator[str]:
-    if table.p_global >= policy.alarm:
+def _patterns(table: ScoreTable) -> Iterator[str]:
+    if table.p_global >= thresholds.ALARM:
         return
-    names = table.significant(policy.alarm, _SHOWN)
+    names = table.significant(thresholds.ALARM, _SHOWN)
     yield (
-        f"the residuals hold patterns that noise does not make (p = {table.p_global:.2g}, limit {policy.alarm:g}: "
+        f"the residuals hold patterns that noise does not make (p = {table.p_global:.2g}, limit {thresholds.ALARM:g}: "
         f"{', '.join(names)}): walop-jax diagnose looks for the cause"
     )
 
@@ -276,10 +273,10 @@ def _groups_of(design: Design) -> Mapping[str, Bool[np.ndarray, "1 e k"]]:
     return groups
 
 
-def _groups(design: Design, policy: Policy = POLICY) -> Iterator[str]:
+def _groups(design: Design) -> Iterator[str]:
     scores = group_scores(design)
     # A part of the data so small that chance moves it by a quarter is held to a far smaller p by the number of groups.
-    limit = local_p(policy.alarm, len(scores))
+    limit = local_p(thresholds.ALARM, len(scores))
     odd = [s for s in scores if s.p_value < limit and not 1.0 / UNEVEN < s.ratio < UNEVEN]
     if odd:
         odd.sort(key=lambda s: -abs(np.log(max(s.ratio, 1e-12))))

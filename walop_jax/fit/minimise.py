@@ -114,40 +114,40 @@ def minimise(
     """
     x = trial = np.asarray(start, float)
     size = 1.0 / damping if damping > 0 else np.inf
-    here, step, history = None, np.zeros(len(x)), []
+    current, step, history = None, np.zeros(len(x)), []
     distance, before, condition = np.inf, np.inf, np.inf
     result = RESULTS.nonlinear_max_steps_reached
     while len(history) < maximum_steps:
-        there = evaluate(trial)
-        history.append(there.objective)
-        if here is None and not np.isfinite(there.objective):
-            here, result = there, RESULTS.nonfinite
+        candidate = evaluate(trial)
+        history.append(candidate.objective)
+        if current is None and not np.isfinite(candidate.objective):
+            current, result = candidate, RESULTS.nonfinite
             break
-        lowered = here is None or there.objective < here.objective
-        size, accept = _judged(step, here, there, size)
-        if here is None or accept:
-            x, here, before = trial, there, distance
-            distance, condition = distance_to_minimum(there)
+        lowered = current is None or candidate.objective < current.objective
+        size, accept = _judged(step, current, candidate, size)
+        if current is None or accept:
+            x, current, before = trial, candidate, distance
+            distance, condition = distance_to_minimum(candidate)
         if progress is not None:
-            progress(len(history), here)
-        step = _step(here, scale, 1.0 / size)
-        left = distance**2 / before if accept and np.isinf(size) and np.isfinite(before) else np.inf
-        rough = far_off(here) and distance < ROUGH and (before < ROUGH or len(history) == maximum_steps)
-        smallest = ROUNDING * abs(here.objective)
-        last = not lowered and -_change(step, here) < smallest
-        if min(distance, left) < tolerance or rough or (last and distance**2 < smallest):
-            if tolerance <= distance and left < tolerance:
-                x, distance = x + step, left
+            progress(len(history), current)
+        step = _step(current, scale, 1.0 / size)
+        remaining = distance**2 / before if accept and np.isinf(size) and np.isfinite(before) else np.inf
+        rough = far_off(current) and distance < ROUGH and (before < ROUGH or len(history) == maximum_steps)
+        smallest = ROUNDING * abs(current.objective)
+        last = not lowered and -_change(step, current) < smallest
+        if min(distance, remaining) < tolerance or rough or (last and distance**2 < smallest):
+            if tolerance <= distance and remaining < tolerance:
+                x, distance = x + step, remaining
             result = RESULTS.conlim if condition > LARGEST_CONDITION else RESULTS.successful
             break
         if last:
             result = RESULTS.stagnation
             break
         trial = x + step
-    assert here is not None
+    assert current is not None
     return Minimum(
         x=x,
-        expansion=here,
+        expansion=current,
         result=result,  # pyright: ignore[reportArgumentType]
         message=_in_words(result, len(history), distance, condition),  # pyright: ignore[reportArgumentType]
         steps=len(history),
@@ -180,14 +180,14 @@ def distance_to_minimum(expansion: Expansion) -> tuple[float, float]:
         return np.inf, np.inf
     # In units of what each is known to: in others a parameter that the data hardly see would fall below the rounding.
     size = np.sqrt(np.clip(np.diag(matrix), 0.0, None))
-    seen = size > 0
-    if not seen.any():
+    informed = size > 0
+    if not informed.any():
         return 0.0, np.inf if len(gradient) else 1.0
-    unit = size[seen]
-    value, vector = np.linalg.eigh(matrix[np.ix_(seen, seen)] / np.outer(unit, unit))
-    condition = float(value[-1] / value[0]) if seen.all() and value[0] > 0 else np.inf
+    unit = size[informed]
+    value, vector = np.linalg.eigh(matrix[np.ix_(informed, informed)] / np.outer(unit, unit))
+    condition = float(value[-1] / value[0]) if informed.all() and value[0] > 0 else np.inf
     positive = value > value[-1] * 1e-15
-    along = vector.T @ (gradient[seen] / unit)
+    along = vector.T @ (gradient[informed] / unit)
     return float(np.sqrt(np.sum(along[positive] ** 2 / value[positive]))), condition
 
 

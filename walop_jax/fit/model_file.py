@@ -131,24 +131,24 @@ def parse(text: str, build: Callable[[ModelTable], Model]) -> Model:
         changes[name] = _changes(parameter, entry)
     changed = tuple(dataclasses.replace(p, **changes.get(p.name, {})) for p in model.parameters)
     laws = {name: law.document() for name, law in laws_of(content.get("law", {})).items()}
-    parts = [kind.name for kind in model.catalogue]
+    kinds = [kind.name for kind in model.catalogue]
     for name in laws:
-        if not fnmatch.filter(model.names, name) and re.split("[.#]", name)[0] not in parts:
+        if not fnmatch.filter(model.names, name) and re.split("[.#]", name)[0] not in kinds:
             raise unknown_name("parameter of [law]", name, model.names)
     return dataclasses.replace(model, parameters=changed, laws=laws)
 
 
 def _header(table: Mapping[str, Any], choices: Mapping[str, Any], entries: Mapping[str, Any]) -> ModelTable:
     hints = {"instrument": str, "plates": str, "throughput_degree": int, "effects": tuple[str, ...]}
-    given = Reader("").values(hints, table, "model")
-    effects = given.get("effects", ())
-    if not 0 <= (degree := given.get("throughput_degree", 0)) <= 12:
+    options = Reader("").values(hints, table, "model")
+    effects = options.get("effects", ())
+    if not 0 <= (degree := options.get("throughput_degree", 0)) <= 12:
         raise ValueError(f"[model] throughput_degree = {degree!r} must be a whole number from 0 to 12")
     check_names("effect (it has choices but is not in the list of [model])", choices, effects)
     for name, values in choices.items():
         if not isinstance(values, Mapping):
             raise ValueError(f"[effects] {name} = {values!r} must be a table, [effects.{name}]")
-    return ModelTable(**given, choices=choices, entries=entries)
+    return ModelTable(**options, choices=choices, entries=entries)
 
 
 def _changes(parameter: Parameter, entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -234,11 +234,11 @@ def _level(calset: CalibrationSet) -> float:
 
     A camera gets half of the unpolarised light: N = T/2.
     """
-    for part, points, exposures in parts_of(calset):
-        known = calset.exposures.flux_known[exposures]
-        for start in range(0, len(points) if known.any() else 0, LEVEL_POINTS):
-            block = part.block(start, min(start + LEVEL_POINTS, len(points)))
-            counts = block.counts[block.used & known]
+    for subset, points, exposures in parts_of(calset):
+        stated = calset.exposures.flux_known[exposures]
+        for start in range(0, len(points) if stated.any() else 0, LEVEL_POINTS):
+            block = subset.block(start, min(start + LEVEL_POINTS, len(points)))
+            counts = block.counts[block.used & stated]
             if counts.size:
                 return float(2.0 * counts.mean())
     return LEVEL
@@ -298,13 +298,15 @@ def model_like(calset: CalibrationSet, old: Model) -> Model:
     """
     header = header_of(old)
     model = base_model(calset, old.template, plates=header.plates, throughput_degree=header.throughput_degree)
-    own = dict.fromkeys((*(effect.kind for effect in old.template.effects), *old.catalogue))
-    model = dataclasses.replace(model, catalogue=tuple(own))
+    own_kinds = dict.fromkeys((*(effect.kind for effect in old.template.effects), *old.catalogue))
+    model = dataclasses.replace(model, catalogue=tuple(own_kinds))
     model = _with_effects(model, header, effect_context(model.template, calset.exposures))
-    kept = {p.name: p for p in old.parameters if p.name != GAUGE and p.part not in SKY_AND_STARS}
+    unchanged = {p.name: p for p in old.parameters if p.name != GAUGE and p.part not in SKY_AND_STARS}
     parameters = tuple(
-        dataclasses.replace(p, free=kept[p.name].free, prior=kept[p.name].prior, tie=kept[p.name].tie)
-        if p.name in kept
+        dataclasses.replace(
+            p, free=unchanged[p.name].free, prior=unchanged[p.name].prior, tie=unchanged[p.name].tie
+        )
+        if p.name in unchanged
         else p
         for p in model.parameters
     )
@@ -333,10 +335,10 @@ def model_without_data(
         )
         model = make_model(nominal.name, nominal, frozen=(GAUGE,))
         model = dataclasses.replace(model, catalogue=known_to(header, catalogue))
-        known = context or Context(
+        conditions = context or Context(
             sources=nominal.standard.names, cameras=nominal.cameras.names, units=nominal.units
         )
-        return _with_effects(model, header, known)
+        return _with_effects(model, header, conditions)
 
     return parse(text, build)
 
@@ -344,8 +346,8 @@ def model_without_data(
 def known_to(header: ModelTable, catalogue: Catalogue) -> tuple[EffectKind, ...]:
     """A catalogue with the entries that a model file brings along; those of the catalogue stay."""
     names = {effect.name for effect in catalogue}
-    own = {name: table for name, table in header.entries.items() if name not in names}
-    return (*catalogue, *entries(own))
+    stated = {name: table for name, table in header.entries.items() if name not in names}
+    return (*catalogue, *entries(stated))
 
 
 def _with_effects(model: Model, header: ModelTable, context: Context) -> Model:

@@ -79,14 +79,14 @@ def clipped(calset: CalibrationSet, model: Model | None = None, beyond: float = 
         result = fit(likelihood, noise_scale=float(np.sqrt(square)) if bent else None)
         values = result.values
         residual = likelihood.residuals(values)[1]
-        found = Clipped(calset, result, used - int(table.used.sum()), used)
+        clipping = Clipped(calset, result, used - int(table.used.sum()), used)
         off = _distance(likelihood, residual)[table.point, table.exposure]
-        if found.too_many:
-            return found
+        if clipping.too_many:
+            return clipping
         if off.max(initial=0.0) > beyond:
             table = table.flagged(table.used & (off > max(beyond, 0.5 * off.max())), DataFlag.BAD_PIXEL)
         elif not bent or _mean_square(likelihood, residual) > FAR_OFF:
-            return found
+            return clipping
 
 
 def _mean_square(likelihood: Likelihood, residual: Float[np.ndarray, "p e k"]) -> float:

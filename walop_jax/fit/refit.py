@@ -226,8 +226,8 @@ class FitResult(Fitted):
     def display(self) -> Display:
         """The verdict and the parameters."""
         verdict = "not examined" if self.verdict is None else self.verdict.words
-        known = self.answer() if self.answer is not None and self.converged else None
-        facts = dict(known.facts() if known is not None else ()) | {
+        accuracy = self.answer() if self.answer is not None and self.converged else None
+        facts = dict(accuracy.facts() if accuracy is not None else ()) | {
             "χ²/dof": f"{self.chi2:.1f} / {self.dof} = {self.chi2 / max(self.dof, 1):.4g}, from {self.n_data} "
             f"intensities, {len(self.model.free)} free parameters",
             "effects": ", ".join(self.model.effect_names) or "none beyond the base model",
@@ -278,21 +278,21 @@ def fit(
     """
     began, model = time.perf_counter(), likelihood.model
     first = _start(likelihood) if start is None else np.asarray(start, float)
-    found = find_minimum(likelihood, first, noise_scale, worth)
+    best = find_minimum(likelihood, first, noise_scale, worth)
     for _ in range(LAYOUTS):
         # Retarders that a fit has made thicker need more wavelengths than those that it began with.
-        before, likelihood = likelihood, likelihood.following(found.values)
+        before, likelihood = likelihood, likelihood.following(best.values)
         if likelihood is before:
             break
-        found = find_minimum(likelihood, found.values, noise_scale, worth)
-    check_constrained(model, found.posterior)
+        best = find_minimum(likelihood, best.values, noise_scale, worth)
+    check_constrained(model, best.posterior)
     return FitResult(
         likelihood=likelihood,
-        values=found.values,
-        covariance=covariance(model, found.posterior),
-        posterior=found.posterior,
-        minimum=found.minimum,
-        starts=found.starts,
+        values=best.values,
+        covariance=covariance(model, best.posterior),
+        posterior=best.posterior,
+        minimum=best.minimum,
+        starts=best.starts,
         seconds=time.perf_counter() - began,
     )
 
@@ -300,8 +300,8 @@ def fit(
 def _start(likelihood: Likelihood) -> Vector:
     """The start values of the model; of a set that stands for pixels, the values at which these were summed."""
     model, compression = likelihood.model, likelihood.calset.compression
-    known = {} if compression is None else compression.values
-    x = [known.get(model.names[i], model.start[i]) for i in model.free]
+    values = {} if compression is None else compression.values
+    x = [values.get(model.names[i], model.start[i]) for i in model.free]
     return model.full(np.array(x))
 
 
@@ -313,12 +313,12 @@ def with_honest_errors(result: FitResult) -> FitResult:
     """
     if result.explains_data or result.errors_from != STATED or result.dof <= 0 or not result.converged:
         return result
-    found = robust_errors(result.likelihood, result.values, result.posterior)
+    robust = robust_errors(result.likelihood, result.values, result.posterior)
     select = result.model.selection()
     return dataclasses.replace(
         result,
-        covariance=select @ found.covariance @ select.T,
-        errors_from=found.made_from,
+        covariance=select @ robust.covariance @ select.T,
+        errors_from=robust.made_from,
         verdict=None,
     )
 
@@ -368,8 +368,8 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
             f"the errors of the data had to be multiplied by {result.noise_scale:.3g} for a fit: the model is far off",
             blocking=False,
         )
-    there = result.model.instrument(result.values).patched()
-    for sentence in extrapolations(there, curves_of(result.calset)):
+    instrument = result.model.instrument(result.values).patched()
+    for sentence in extrapolations(instrument, curves_of(result.calset)):
         yield Doubt(Quality(0), sentence, blocking=False)
     for name in result.at_prior_edge:
         p, value = result.model[name], result.value(name)[0]
@@ -381,10 +381,12 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
         )
     yield from (Doubt(Quality.DOUBTED, sentence) for sentence in doubts)
     if result.errors_from != STATED:
-        found = result.errors_from.removeprefix("residuals: ").replace("chi2/dof", "χ²/dof")
-        found = found.replace(" states", " states of the exposures").replace(" cells", " cells of the field")
-        made = f"error bars were enlarged to match the scatter of the residuals ({found})"
-        yield Doubt(Quality(0), made, blocking=False)
+        reason = result.errors_from.removeprefix("residuals: ").replace("chi2/dof", "χ²/dof")
+        reason = reason.replace(" states", " states of the exposures").replace(
+            " cells", " cells of the field"
+        )
+        text = f"error bars were enlarged to match the scatter of the residuals ({reason})"
+        yield Doubt(Quality(0), text, blocking=False)
 
 
 def refit(

@@ -83,33 +83,33 @@ def larger(one: Matrix, other: Matrix) -> Matrix:
     """
     value, vector = np.linalg.eigh(0.5 * (one + one.T))
     root = vector * np.sqrt(np.clip(value, 0.0, None))
-    known = value > 1e-15 * value[-1]
-    whiten = (vector[:, known] / np.sqrt(value[known])).T
+    significant = value > 1e-15 * value[-1]
+    whiten = (vector[:, significant] / np.sqrt(value[significant])).T
     ratio, axis = np.linalg.eigh(whiten @ other @ whiten.T)
-    spread = root[:, known] @ axis
+    spread = root[:, significant] @ axis
     return (spread * np.maximum(ratio, 1.0)) @ spread.T
 
 
 def _gradients(likelihood: Likelihood, values: Vector) -> Iterator[tuple[str, Float[np.ndarray, "b f"]]]:
     """Gradients of the blocks, with the errors as stated, for each way of cutting the data."""
-    whole = likelihood.layout.points
-    if whole > ROBUST_POINTS:
+    count = likelihood.layout.points
+    if count > ROBUST_POINTS:
         likelihood = Likelihood.of(thinned(likelihood.calset, ROBUST_POINTS), likelihood.model)
-    share = whole / likelihood.layout.points
+    share = count / likelihood.layout.points
     calset, select = likelihood.calset, likelihood.model.selection()
     instrument, cell = likelihood.model.instrument(values), field_cells(calset)
     by_exposure = np.zeros((len(calset.exposures), select.shape[1]))
     by_cell, first = np.zeros((int(cell.max(initial=0)) + 1, select.shape[1])), 0
     for batch in likelihood.points:
-        found = engine.linearised_residuals(instrument, likelihood.plan, batch)
-        residual, slope = (np.asarray(part) for part in found)
+        arrays = engine.linearised_residuals(instrument, likelihood.plan, batch)
+        residual, slope = (np.asarray(item) for item in arrays)
         residual = residual.reshape(batch.counts.shape)
         rows = slope.reshape(*residual.shape, -1)
         # Points that fill the last batch have no weight, and so no gradient.
-        parts = np.einsum("pekn,pek->pen", rows, residual) @ select
-        by_exposure += parts.sum(axis=0)
-        inside = min(len(parts), len(cell) - first)
-        np.add.at(by_cell, cell[first : first + inside], parts[:inside].sum(axis=1))
+        gradients = np.einsum("pekn,pek->pen", rows, residual) @ select
+        by_exposure += gradients.sum(axis=0)
+        inside = min(len(gradients), len(cell) - first)
+        np.add.at(by_cell, cell[first : first + inside], gradients[:inside].sum(axis=1))
         first += inside
     for name, labels in (("states", states(calset)), ("filters", _labels(calset.exposures.filter))):
         grouped = np.zeros((int(labels.max(initial=0)) + 1, select.shape[1]))

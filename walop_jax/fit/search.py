@@ -133,33 +133,33 @@ def find_minimum(
         return _best_gaps(likelihood, _from_afar(likelihood, first, noise_scale, worth))
     on_pixels = stands_for_pixels(likelihood, first)
     points = PIXEL_SAMPLE if on_pixels else max(limits.SAMPLE, layout.points // limits.FARTHEST)
-    some, runner = thinned(likelihood.calset, points), likelihood.runner
-    sample = Likelihood.of(some, likelihood.model, memory=layout.allowed, runner=runner)
-    found = find_minimum(sample, first, noise_scale, worth)
-    scale, starts = found.posterior.noise_scale, found.starts
-    every = strips_of(likelihood) // FIRST_STRIPS if on_pixels else 0
-    passes = [("fit of some image rows", every, 1.0)] if every > 1 else []
+    sample_set, runner = thinned(likelihood.calset, points), likelihood.runner
+    sample = Likelihood.of(sample_set, likelihood.model, memory=layout.allowed, runner=runner)
+    best = find_minimum(sample, first, noise_scale, worth)
+    scale, starts = best.posterior.noise_scale, best.starts
+    stride = strips_of(likelihood) // FIRST_STRIPS if on_pixels else 0
+    passes = [("fit of some image rows", stride, 1.0)] if stride > 1 else []
     passes.append((f"fit of all {'pixels' if on_pixels else 'points'}", 1, LARGE_TOLERANCE))
     for label, step, tolerance in passes:
 
-        def of_pixels(values: Vector, scale: float, _: Posterior | None, every: int = step) -> Posterior:
-            return expand_pixels(likelihood, values, scale, every)
+        def of_pixels(values: Vector, scale: float, _: Posterior | None, stride: int = step) -> Posterior:
+            return expand_pixels(likelihood, values, scale, stride)
 
         how = {"expand": of_pixels if on_pixels else None, "tolerance": tolerance, "damping": 0.0}
-        found = _search(likelihood, label, found.values, scale, **how)
-    return dataclasses.replace(found, starts=starts)
+        best = _search(likelihood, label, best.values, scale, **how)
+    return dataclasses.replace(best, starts=starts)
 
 
-def _best_gaps(likelihood: Likelihood, found: FoundMinimum) -> FoundMinimum:
+def _best_gaps(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
     """The lowest minimum with air gaps some orders of their fringes thicker or thinner.
 
     Fringes of gaps a quarter of a wavelength apart differ by their sign, within a narrow band: each is a minimum of its
     own. Steps go on while they lower the objective.
     """
     model, quarter = likelihood.model, 0.25 * float(np.asarray(likelihood.plan.wavelength).mean())
-    for gap in model.gaps() if found.minimum.converged else ():
+    for gap in model.gaps() if best.minimum.converged else ():
         for _ in range(MOST_ORDERS):
-            before = found
+            before = best
             for order in (-2, -1, 1, 2):
                 start = before.values.copy()
                 start[gap] += order * quarter
@@ -168,12 +168,12 @@ def _best_gaps(likelihood: Likelihood, found: FoundMinimum) -> FoundMinimum:
                 label = f"checking for another order of fringes ({model.names[gap]} = {start[gap]:.4g} µm)"
                 scale = before.posterior.noise_scale
                 trial = _search(likelihood, label, start, scale, before.posterior, maximum_steps=OTHER_STEPS)
-                found = dataclasses.replace(found, starts=found.starts + 1)
-                if trial.minimum.converged and trial.posterior.objective < found.posterior.objective:
-                    found = dataclasses.replace(trial, starts=found.starts)
-            if found.minimum is before.minimum:
+                best = dataclasses.replace(best, starts=best.starts + 1)
+                if trial.minimum.converged and trial.posterior.objective < best.posterior.objective:
+                    best = dataclasses.replace(trial, starts=best.starts)
+            if best.minimum is before.minimum:
                 break
-    return found
+    return best
 
 
 def _from_afar(
@@ -181,58 +181,58 @@ def _from_afar(
 ) -> FoundMinimum:
     """The minimum from start values that may be far away, the errors of the data scaled if need be."""
     check_identifiable(likelihood)
-    given = noise_scale or 1.0
-    found = _search(likelihood, "fit", first, given, maximum_steps=FIRST_STEPS)
-    promising = found.posterior.objective < worth if worth is not None else found.misfit < FAR_OFF
-    if not found.minimum.converged and promising:
-        found = _search(likelihood, "fit, continued", found.values, given, found.posterior, damping=0.0)
-    if noise_scale is not None or found.misfit < FAR_OFF:
-        return found
-    return _far_off(likelihood, found)
+    scale = noise_scale or 1.0
+    best = _search(likelihood, "fit", first, scale, maximum_steps=FIRST_STEPS)
+    promising = best.posterior.objective < worth if worth is not None else best.misfit < FAR_OFF
+    if not best.minimum.converged and promising:
+        best = _search(likelihood, "fit, continued", best.values, scale, best.posterior, damping=0.0)
+    if noise_scale is not None or best.misfit < FAR_OFF:
+        return best
+    return _far_off(likelihood, best)
 
 
-def _far_off(likelihood: Likelihood, found: FoundMinimum) -> FoundMinimum:
+def _far_off(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
     """The best place for a model that is far from the data: errors scaled to its residuals, other orders tried."""
-    left, starts = most_passes(likelihood.model) - found.minimum.steps, 1
+    budget, starts = most_passes(likelihood.model) - best.minimum.steps, 1
 
     def search(label: str, values: Vector, scale: float, most: int) -> FoundMinimum:
-        nonlocal left
-        most = max(1, min(most, left))
-        more = _search(likelihood, label, values, scale, found.posterior, maximum_steps=most)
-        left -= more.minimum.steps
+        nonlocal budget
+        most = max(1, min(most, budget))
+        more = _search(likelihood, label, values, scale, best.posterior, maximum_steps=most)
+        budget -= more.minimum.steps
         return more
 
-    def rescaled(found: FoundMinimum) -> FoundMinimum:
+    def rescaled(best: FoundMinimum) -> FoundMinimum:
         for _ in range(MAXIMUM_RESCALINGS):
-            scale = float(np.sqrt(found.misfit)) if found.misfit > FAR_OFF else 1.0
-            if left <= 0 or abs(scale / found.posterior.noise_scale - 1.0) < 0.1:
+            scale = float(np.sqrt(best.misfit)) if best.misfit > FAR_OFF else 1.0
+            if budget <= 0 or abs(scale / best.posterior.noise_scale - 1.0) < 0.1:
                 break
             # Half of what is left at most: the other orders are to be tried as well.
             label = f"the model is far off; errors × {scale:.3g}"
-            found = search(label, found.values, scale, max(FIRST_STEPS, left // 2))
-        return found
+            best = search(label, best.values, scale, max(FIRST_STEPS, budget // 2))
+        return best
 
-    found = rescaled(found)
-    others = list(_order_starts(likelihood)) if found.misfit > FAR_OFF else []
-    for number, (label, other) in enumerate(others, start=2):
-        if left <= 0:
+    best = rescaled(best)
+    starts_left = list(_order_starts(likelihood)) if best.misfit > FAR_OFF else []
+    for number, (label, first_values) in enumerate(starts_left, start=2):
+        if budget <= 0:
             break
-        label = f"start {number} of {len(others) + 1}, {label}"
-        trial, starts = search(label, other, found.posterior.noise_scale, OTHER_STEPS), starts + 1
-        if trial.posterior.objective < found.posterior.objective:
-            found = rescaled(trial)
-    if not found.minimum.converged and left > 0:
-        found = search("the best of them", found.values, found.posterior.noise_scale, left)
-    minimum = found.minimum
-    if not minimum.converged and found.misfit > FAR_OFF:
-        passes = most_passes(likelihood.model) - left
+        label = f"start {number} of {len(starts_left) + 1}, {label}"
+        trial, starts = search(label, first_values, best.posterior.noise_scale, OTHER_STEPS), starts + 1
+        if trial.posterior.objective < best.posterior.objective:
+            best = rescaled(trial)
+    if not best.minimum.converged and budget > 0:
+        best = search("the best of them", best.values, best.posterior.noise_scale, budget)
+    minimum = best.minimum
+    if not minimum.converged and best.misfit > FAR_OFF:
+        passes = most_passes(likelihood.model) - budget
         message = (
-            f"given up after {passes} steps from {starts} starts: χ²/dof stays near {found.misfit:.3g}, and more steps "
+            f"given up after {passes} steps from {starts} starts: χ²/dof stays near {best.misfit:.3g}, and more steps "
             "buy nothing; check the columns of the set, INSTRUME and the description of the instrument, or look for "
             "what is missing (walop-jax diagnose)"
         )
         minimum = dataclasses.replace(minimum, message=message)
-    return dataclasses.replace(found, minimum=minimum, starts=starts)
+    return dataclasses.replace(best, minimum=minimum, starts=starts)
 
 
 def check_identifiable(likelihood: Likelihood) -> None:

@@ -43,11 +43,11 @@ def in_field_points(
         return calset
     tell("fitting all pixels")
     result = fit(likelihood)
-    found = on_field_points(result).calset
-    if found.compression is not None:
-        found = with_pixel_structure(found, look(result))
-        tell(f"looking at {len(found.points)} field points that stand for all pixels")
-    return found
+    summed = on_field_points(result).calset
+    if summed.compression is not None:
+        summed = with_pixel_structure(summed, look(result))
+        tell(f"looking at {len(summed.points)} field points that stand for all pixels")
+    return summed
 
 
 def with_pixel_structure(calset: CalibrationSet, structure: Structure) -> CalibrationSet:
@@ -70,9 +70,9 @@ def with_pixels(result: FitResult) -> FitResult:
     before = float(np.sum(likelihood.residuals(values_then(result))[1][:, summed] ** 2))
     beside = np.where(summed, 0, likelihood.used.sum(axis=0)) @ likelihood.data_per_row
     new = [result.model.parameters[i] for i in result.model.free]
-    more = sum((p.prior is not None) - 1 for p in new if p.name not in compression.values)
+    further = sum((p.prior is not None) - 1 for p in new if p.name not in compression.values)
     data = compression.chi2 + result.posterior.data - before
-    dof = compression.dof + round(float(beside)) + more
+    dof = compression.dof + round(float(beside)) + further
     return dataclasses.replace(result, posterior=dataclasses.replace(result.posterior, data=data, dof=dof))
 
 

@@ -5,14 +5,16 @@ Columns with unit and description, FITS or ECSV.
 
 from __future__ import annotations
 
+import json
 import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy.table import Column as AstropyColumn
-from astropy.table import Table
+from astropy.table import Table, vstack
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
@@ -25,6 +27,7 @@ FORMATS = {
     ".ecsv": "ascii.ecsv",
     ".vot": "votable",
     ".votable": "votable",
+    ".parquet": "parquet",
 }
 """Extensions of tables that are read, and what astropy calls the format."""
 
@@ -55,6 +58,40 @@ def astropy_table(
     )
 
 
+def faults_of_ucds(ucds: Mapping[str, str]) -> list[str]:
+    """Sentences on words for the meaning of columns that are no UCD of the vocabulary of the IVOA."""
+    from astropy.io.votable.ucd import check_ucd
+
+    wrong = [
+        name for name, ucd in ucds.items() if ucd and not check_ucd(ucd, check_controlled_vocabulary=True)
+    ]
+    return [f"{name}: {ucds[name]!r} is no UCD" for name in wrong]
+
+
+def _as_votable(table: Table) -> Any:
+    """The table as a VOTable: the cards of its header as parameters, the frame of its times."""
+    from astropy.io.votable import from_table
+    from astropy.io.votable.tree import Param, TimeSys
+
+    made: Any = from_table(table)
+    made.version = "1.4"
+    resource, cards = made.resources[0], dict(table.meta or {})
+    for key, value in cards.items():
+        text = json.dumps(value) if isinstance(value, bool | int | float) else str(value)
+        param = Param(made, name=str(key), ID=str(key), datatype="unicodeChar", arraysize="*", value=text)
+        resource.tables[0].params.append(param)
+    if scale := str(cards.get("TIMESYS", "")):
+        resource.time_systems.append(
+            TimeSys(ID="TIME", timescale=scale, refposition="TOPOCENTER", timeorigin=0.0)
+        )
+    return made
+
+
+def stacked(first: Any, second: Any) -> Any:
+    """The rows of two tables as one; what a row has no column for is masked."""
+    return vstack([first, second], metadata_conflicts="silent")
+
+
 def write_table(path: str | os.PathLike[str], table: Table, *, overwrite: bool = False) -> None:
     """Write an astropy table in the format of the name; whole or not at all.
 
@@ -64,7 +101,13 @@ def write_table(path: str | os.PathLike[str], table: Table, *, overwrite: bool =
     with atomic_path(path, overwrite=overwrite) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            table.write(temporary, format=kind, overwrite=True)
+            if kind == "votable":
+                _as_votable(table).to_xml(str(temporary))
+            else:
+                table.write(temporary, format=kind, overwrite=True)
+        except ImportError as error:
+            what = f"needs {error.name or 'a library'}, which is not installed"
+            raise fail(what, file=path, advice="pip install 'walop-jax[parquet]', or write .fits") from error
         except (ValueError, TypeError) as error:
             what = f"cannot be written: {' '.join(str(error).split())[:300]}"
             raise fail(what, file=path, advice="try .ecsv") from error

@@ -6,6 +6,7 @@ Files to be read are ordinary ones; text, TOML, plain data as JSON without NaN a
 from __future__ import annotations
 
 import bz2
+import datetime
 import gzip
 import io
 import json
@@ -50,6 +51,11 @@ def value_and_error(value: float | str | None, sigma: float | None) -> tuple[str
         return with_minus_sign(f"{value:.{digits}e}"), with_minus_sign(f"{sigma:.1e}")
     shown = max(0, places)
     return with_minus_sign(f"{round(value, places) + 0.0:.{shown}f}"), f"{round(sigma, places):.{shown}f}"
+
+
+def date_of(mjd: float) -> str:
+    """The calendar date (UTC) of a Modified Julian Date: 2026-06-29."""
+    return (datetime.datetime(1858, 11, 17) + datetime.timedelta(days=float(mjd))).date().isoformat()
 
 
 def with_minus_sign(text: str) -> str:

@@ -246,7 +246,9 @@ class Columns:
             parts = list(KINDS[sentence.kind].slots(self.patched, sentence))
         except NoSuchPlaceError as error:
             raise NoSlotError(str(error)) from None
-        if not all(self._holds(part.slot) and "colour" not in part.factors for part in parts):
+        # Of the wavelengths in a band the light of an exposure has the mean.
+        inside = (part.slot[0] != "light" and "colour" in part.factors for part in parts)
+        if any(inside) or not all(self._holds(part.slot) for part in parts):
             raise NoSlotError(sentence.text)
         if sentence.kind != "thermal" or "temperature" in self.plan.conditions.planned:
             return parts

@@ -4,6 +4,11 @@ A *station* is an element with the ray that meets it; a *state* holds the positi
 optical setting (an angle in degrees, None when out), in the order of their columns. Settings that agree in the
 elements nearest to the analysers share the products of these, so every product is made once. `solved` hands all
 elements of one class over together: the half-wave plates are one computation, compiled once.
+
+Turning     An element that turns evenly from a to b during an exposure acts by its mean matrix ∫ M(θ) dθ / (b − a),
+            since light adds up and no other element turns then: whole turns by the trapezoidal rule, which is exact for
+            the harmonics of a turn that `WHOLE` nodes follow, the rest by Gauss and Legendre's about its middle.
+Limits      b − a = 0: M(a). Of an ideal retarder cos 2θ, cos 4θ become cos(n (a + b)/2) sinc(n (b − a)/2).
 """
 
 from __future__ import annotations
@@ -11,6 +16,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,9 +27,34 @@ from walop_jax.model.mueller import product
 from walop_jax.model.ray import Ray
 
 Station = tuple[Element, Ray]
-State = tuple[float | None, ...]
 Mueller = Float[Array, "... 4 4"]
-Solved = dict[tuple[int, float | None], Mueller | None]
+WHOLE = 64  # angles of a whole turn
+FEWEST, PER_RADIAN = 8, 12.0  # angles of a part of a turn, and how many more for each radian
+
+
+class Turning(NamedTuple):
+    """Position of an element that turns by `turn` (deg) during an exposure, about the angle `middle` (deg)."""
+
+    middle: float
+    turn: float
+
+    def angles(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Angles (deg) of which the mean is taken, and their weights."""
+        rest = self.turn % 360.0
+        whole = self.turn - rest
+        start = self.middle - self.turn / 2.0
+        at = start + 360.0 / WHOLE * np.arange(WHOLE) if whole else np.zeros(0)
+        weight = np.full(len(at), whole / self.turn / WHOLE)
+        if rest:
+            nodes, part = np.polynomial.legendre.leggauss(FEWEST + int(PER_RADIAN * np.deg2rad(rest)))
+            at = np.append(at, start + rest / 2.0 * (1.0 + nodes))
+            weight = np.append(weight, part * rest / self.turn / 2.0)
+        return at, weight
+
+
+Angle = float | Turning
+State = tuple[Angle | None, ...]
+Solved = dict[tuple[int, Angle | None], Mueller | None]
 """Mueller matrices by number of the station and angle at which its element stands (None for one that does not move)."""
 
 
@@ -36,28 +67,38 @@ def stations(elements: Sequence[Element], ray: Ray) -> tuple[list[Station], Ray]
     return found, ray
 
 
-def positions(element: Element, moving: Sequence[str], states: Sequence[State]) -> list[float | None]:
+def positions(element: Element, moving: Sequence[str], states: Sequence[State]) -> list[Angle | None]:
     """Angles (deg) of an element, state by state; None where it is out (or does not move: see `Solved`)."""
     if element.moves is None:
         return [None] * len(states)
-    column = moving.index(element.moves)
-    return [element.position(state[column]) for state in states]
+    places = [state[moving.index(element.moves)] for state in states]
+    return [at if isinstance(at, Turning) else element.position(at) for at in places]
 
 
 def solved(every: Sequence[Station], moving: Sequence[str], states: Sequence[State]) -> Solved:
     """Mueller matrices of all stations at all the positions in which they occur."""
     cases: list[tuple[tuple[int, float | None], Element, Ray]] = []
+    means: list[tuple[int, Turning]] = []
     for number, (element, ray) in enumerate(every):
         if element.moves is None:
             cases.append(((number, None), element, ray))
             continue
-        angles = {angle for angle in positions(element, moving, states) if angle is not None}
+        there = dict.fromkeys(angle for angle in positions(element, moving, states) if angle is not None)
+        turning = [at for at in there if isinstance(at, Turning)]
+        means += [(number, at) for at in turning]
+        angles = {at for at in there if not isinstance(at, Turning)}.union(
+            *(at.angles()[0].tolist() for at in turning)
+        )
         cases += [((number, angle), element.turned(angle), ray) for angle in sorted(angles)]
     result: Solved = {}
     for kind in dict.fromkeys(type(element) for _, element, _ in cases):
         own = [case for case in cases if type(case[1]) is kind]
         matrices = kind.solved([(element, ray) for _, element, ray in own])
         result.update({key: matrix for (key, _, _), matrix in zip(own, matrices, strict=True)})
+    for number, at in means:
+        angles, weights = at.angles()
+        known = [matrix for angle in angles.tolist() if (matrix := result[number, angle]) is not None]
+        result[number, at] = jnp.tensordot(jnp.asarray(weights), jnp.stack(known), 1) if known else None
     return result
 
 

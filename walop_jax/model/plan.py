@@ -17,11 +17,10 @@ from jaxtyping import Array, Float, Int
 
 from walop_jax.data.records import POLARISER, Exposures
 from walop_jax.model.compiled import array
+from walop_jax.model.fold import State
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import Conditions
 from walop_jax.model.sources import ExposureArrays
-
-State = tuple[float | None, ...]
 
 
 class Plan(eqx.Module):
@@ -29,7 +28,7 @@ class Plan(eqx.Module):
 
     Nodes: `wavelength` (µm) and the `conditions` at which the optics are solved. Bands: rows of `node_weight`,
     sorted by positions of the moving elements; `moving` holds the prefixes of their columns and `settings`
-    (positions, first band, one past the last), a position being an angle in degrees or None when out.
+    (positions, first band, one past the last), a position being an angle in degrees, `Turning`, or None when out.
     `band_of[e, s + 1]` is the band of exposure e for light of source s (s = −1: no source). Bands in which `slope` is
     1 are weighted with the distance from their mean wavelength (µm); None: there are none. `work` counts the places
     × exposures that are computed with it: programs for few of them are compiled without optimisation (`compiled`).

@@ -15,6 +15,7 @@ from walop_jax.data.settings import Settings
 from walop_jax.io.errors import fail
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
+from walop_jax.model.fold import Turning
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import EXTRAPOLATED, MATERIALS
 from walop_jax.model.plan import Plan, blank_exposures, exposure_arrays, hours_of
@@ -206,9 +207,11 @@ def _plan(
     assert set(values) == set(CONDITIONS)
     # A band is (positions, filter, conditions, colour temperature, slope); sorting puts equal positions together.
     # NaN (out, flat spectrum) becomes a sortable stand-in.
-    states = _rows(
-        [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving], len(settings)
-    )
+    # The angle of each element, and after all of them by how much each turns.
+    still = np.zeros(len(settings))
+    places = [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving]
+    turns = [settings.turns.get(prefix, still) for prefix in moving]
+    states = _rows([*places, *turns], len(settings))
     planned = _rows([values[name] for name in names], len(settings))
     teff = np.nan_to_num(settings.teff).tolist()
     sloping = np.zeros(len(settings), bool) if slope is None else slope
@@ -249,7 +252,8 @@ def _plan(
     laid = []
     found = [key[0] for key in bands]
     for value in sorted(set(found)):
-        state = tuple(None if np.isinf(angle) else float(angle) for angle in value)
+        pairs = zip(value[: len(moving)], value[len(moving) :], strict=True)
+        state = tuple(None if np.isinf(at) else Turning(at, turn) if turn else at for at, turn in pairs)
         laid.append((state, found.index(value), len(found) - found[::-1].index(value)))
     plan = Plan(
         wavelength=array(np.concatenate([rules[name][0] for name, _ in groups])),

@@ -360,7 +360,7 @@ def light_slots(instrument: Instrument) -> dict[Slot, int]:
     if any(isinstance(source, MoonSky) for source in instrument.sources):
         found += [(kind, "of", SKY) for kind in OF_SOURCES]
     if instrument.standard.names:
-        found += [(kind, "of", Standards.name) for kind in OF_QU]
+        found += [(kind, "of", Standards.name) for kind in (*OF_QU, "rotator")]
     if polariser is not None:
         found += [(kind, "of", polariser.name) for kind in (*OF_POLARISER, *GENERATORS)]
         found += [(kind, "ahead of", polariser.name) for kind in (*GENERATORS, *ADDED)]

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.records import KINDS, ExposureKind
+from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.parameters import Component, number, param
 from walop_jax.model.ray import NotPlannedError
 
@@ -64,6 +65,11 @@ class ExposureArrays(eqx.Module):
     colour: Float[Array, "e s 2"] | None = None
     slope_band: Int[Array, " e"] | None = None
     kinds: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def wavelength(self) -> Any:
+        """Mean wavelengths (µm) of the filters, as the first star sees them; the usual one where no colour matters."""
+        return REFERENCE_WAVELENGTH if self.colour is None else self.colour[:, 0, 0]
 
     @property
     def median(self) -> Float[Array, "e k"]:
@@ -165,12 +171,25 @@ class MoonSky(Source):
         return qu
 
 
+class StandardChange(Component):
+    """Change of q (axis 0) or u (1) of one value of a standard in single exposures."""
+
+    size: Scalar
+    value: int = eqx.field(static=True)
+    axis: int = eqx.field(static=True)
+
+    def factor(self, exposures: ExposureArrays) -> Float[Array, " e"]:
+        """Factor of the size in every exposure."""
+        raise NotImplementedError
+
+
 class Standards(Source):
     """Catalogue Stokes parameters of the standard stars.
 
     There is a value for each of `names`; `stars` holds for each the first value of its star, `bands` mean wavelength
     and rms width (µm) of the band that it is of. Both are empty where no star has a colour: then a value holds for any
     light. `unknown` are values of which no band is known, but that it is one of those that the star was seen in.
+    `changes` are added to the values in single exposures.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -191,6 +210,8 @@ class Standards(Source):
     bands: tuple[tuple[float, float], ...] = eqx.field(static=True, default=())
     stars: tuple[int, ...] = eqx.field(static=True, default=())
     unknown: tuple[int, ...] = eqx.field(static=True, default=())
+    angle: Scalar | None = number(unit="deg", about="added to all position angles", default=None)
+    changes: tuple[StandardChange, ...] = ()
 
     name: ClassVar[str] = "standard"
     kind: ClassVar[str] = "standard"
@@ -236,7 +257,7 @@ class Standards(Source):
         seen = sight.source >= 0
         return seen if self.names else jnp.zeros_like(seen)
 
-    def values(self, source: Int[Any, "*p e"], colour: Float[Array, "e s 2"] | None) -> Int[Any, "*p e"]:
+    def values(self, source: Int[Any, "*p e"], colour: Float[Any, "e s 2"] | None) -> Int[Any, "*p e"]:
         """The value that each exposure of a source goes by: that of its star whose band is the nearest; −1 for none."""
         if colour is None or len(set(self.stars)) == len(self.names):
             return source
@@ -262,6 +283,12 @@ class Standards(Source):
         colour = sight.exposures.colour
         row = jnp.maximum(self.values(sight.source, colour), 0)
         qu, rotator = jnp.stack([self.q[row], self.u[row]], axis=-1), sight.exposures.rotator
+        for one in self.changes:
+            qu = qu.at[:, one.axis].add(
+                jnp.where(row == one.value, one.size * one.factor(sight.exposures), 0.0)
+            )
+        if self.angle is not None:
+            rotator = rotator - jnp.deg2rad(self.angle)
         if colour is None or not self.bands:
             return turned(qu, rotator), jnp.zeros_like(qu)
         first, number = np.unique(self.stars, return_inverse=True)

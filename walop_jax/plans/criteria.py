@@ -26,7 +26,7 @@ from walop_jax.calibration.matrix import matrix_slopes
 from walop_jax.data.schema import Column
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import InputTable, numeric_column
-from walop_jax.diagnosis.policy import POLICY
+from walop_jax.diagnosis import thresholds
 from walop_jax.likelihood.inverses import root_of
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.parameters import check_names
@@ -36,10 +36,10 @@ LONGEST = 1440.0
 """Minutes of a plan at most. It is one of a night, in which the sky stands still and the instrument does not change."""
 WORST, MEAN, APART = "worst", "mean", "apart"
 _SURE = 1.645  # standard deviations above which 95 % of a normal distribution lie, below zero
-NAMED = _SURE + float(np.sqrt(_SURE**2 + 2.0 * POLICY.improbable))
+NAMED = _SURE + float(np.sqrt(_SURE**2 + 2.0 * thresholds.IMPROBABLE))
 """Distance d (σ) from a rival of as many numbers at which a diagnosis names an effect in 95 of 100 sets: 5.7.
 
-The evidence beside the rival has mean d²/2 and scatter d, and must exceed `Policy.improbable`."""
+The evidence beside the rival has mean d²/2 and scatter d, and must exceed `thresholds.IMPROBABLE`."""
 COLOURS = (float("nan"), 4000.0, 8000.0)
 """Colour temperatures (K; NaN: flat photon spectrum) at which p is to be known."""
 TARGET_GRID = 9  # field points along each axis at which the error of p is asked

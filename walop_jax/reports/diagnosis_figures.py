@@ -16,9 +16,9 @@ from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
 from matplotlib.ticker import MaxNLocator
 
 from walop_jax.data.records import Points
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, PointMap, ResidualComparison, Table
 from walop_jax.diagnosis.limits_found import NO_LEVEL, DetectionLimits
-from walop_jax.diagnosis.policy import POLICY
 from walop_jax.fit.verdict import SUSPECT_SIGMA
 from walop_jax.reports.style import (
     AFTER,
@@ -31,6 +31,7 @@ from walop_jax.reports.style import (
     SMALL,
     AnyFigure,
     Canvas,
+    angle_ticks,
     colour_bar,
     field_axes,
     largest_size,
@@ -100,19 +101,21 @@ def _maps(
     shown = np.any([np.isfinite(values).any(axis=1) for values in maps.values()], axis=0)
     shown = shown if shown.any() else np.ones(len(points), bool)
     size, grid = (0.6 + 2.0 * len(cameras), 0.55 + 1.75 * len(maps)), (len(maps), len(cameras))
-    figure, axes = on.panels(*size, *grid, sharex=True, sharey=True, squeeze=False)
+    figure, axes = on.panels(*size, *grid, sharex=True, sharey=True, squeeze=False, least=0.8, labels=0.2)
     tiles: Any = None
     for number, values in enumerate(maps.values()):
         for k, axis in enumerate(axes[number]):
             field_axes(axis, f"camera {cameras[k]}" if number == 0 else "")
-            axis.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], prune="both"))
+            axis.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 4, 5, 10], prune="both"))
             axis.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="both"))
             tiles = point_map(axis, points.x, points.y, values[:, k], norm, colours, shown)
             if signs:
                 _signs(axis, points, values[:, k], norm)
     outer_labels(axes)
-    for axis, title in zip(axes[:, 0], maps, strict=True):
-        axis.set_ylabel(f"{title}\n\nY (deg)", fontsize=FONT)
+    for row, title in zip(axes, maps, strict=True):
+        for axis in row:
+            if axis.get_subplotspec().is_first_col():
+                axis.set_ylabel(f"{title}\n\nY (deg)", fontsize=FONT)
     colour_bar(figure, tiles, axes, label, pad=0.015, aspect=18 * len(maps), fraction=0.03)
     return figure
 
@@ -151,9 +154,7 @@ def signature_figure(
         upper[k].set_title(f"camera {camera}", fontsize=FONT)
         lower[k].set_xlabel(label, fontsize=FONT)
         if angular:
-            lower[k].set_xticks(
-                np.arange(0, 361, 90) if np.max(x, initial=0.0) > 180 else np.arange(0, 181, 45)
-            )
+            angle_ticks(lower[k].xaxis, figure, lower[k].get_subplotspec().get_gridspec().ncols)
     upper[0].set_ylabel("residual (σ)", fontsize=FONT)
     lower[0].set_ylabel("remaining (σ)", fontsize=FONT)
     upper[0].legend(frameon=False, fontsize=SMALL, loc="best")
@@ -243,7 +244,7 @@ def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
             rows = rows[np.argsort(shares["MEMBER"][rows].astype(int), kind="stable")]
             place = shares["MEMBER"][rows].astype(int)
         else:
-            axis.set_xticks(place, shares["MEMBER"][rows])
+            axis.set_xticks(place, shares["MEMBER"][rows], rotation=90 if group == "kind" else 0)
             axis.set_xlim(-0.6, len(rows) - 0.4)
         axis.axhline(1.0, color="0.5", lw=0.8, zorder=0)
         size = 5 if group != "exposure" else 3.5
@@ -261,7 +262,7 @@ def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
 
 
 _PIXELS = 121
-_STEPS = (0.0, 1.0, 2.0, POLICY.separation, 4.0, 5.0, 6.0)
+_STEPS = (0.0, 1.0, 2.0, thresholds.SEPARATION, 4.0, 5.0, 6.0)
 
 
 @styled
@@ -303,6 +304,6 @@ def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     axis.set_ylabel("effect present (at its detection limit)", fontsize=FONT)
     axis.set_xlabel("could be mistaken for", fontsize=FONT)
     colour_bar(
-        figure, shown, axis, f"separation (σ); below {POLICY.separation:g}: can be mistaken", shrink=0.7
+        figure, shown, axis, f"separation (σ); below {thresholds.SEPARATION:g}: can be mistaken", shrink=0.7
     )
     return figure

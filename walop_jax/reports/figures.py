@@ -12,6 +12,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from scipy.ndimage import zoom
 
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap
 from walop_jax.calibration.thresholds import GOAL
@@ -20,6 +21,7 @@ from walop_jax.fit.model_file import instrument_of
 from walop_jax.io.text import two_digits, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.reports.style import (
+    ABOVE,
     AFTER,
     DIVERGING,
     FONT,
@@ -29,6 +31,7 @@ from walop_jax.reports.style import (
     AnyFigure,
     Canvas,
     Field,
+    angle_ticks,
     colour_bar,
     element_kind,
     element_symbols,
@@ -57,7 +60,7 @@ def residuals_figure(
     on: Canvas = PAGE,
 ) -> AnyFigure:
     """Residuals of every field point before and after a fit, full vectors of parameters; a histogram of the latter."""
-    figure, (left, middle, right) = on.panels(9.6, 3.0, 1, 3)
+    figure, (left, middle, right) = on.panels(9.6, 3.0, 1, 3, least=1.6)
     _before_and_after(figure, (left, middle), likelihood, before, values)
     middle.set_ylabel("")
     _histogram(right, likelihood, values)
@@ -73,13 +76,15 @@ def calibration_figure(
     on: Canvas = PAGE,
 ) -> AnyFigure:
     """A calibration on one page: maps of the matrix, residuals of every field point before and after the fit."""
-    figure = on.figure(10.2, 2.35 * max(2, maps.arms))
-    grid = figure.add_gridspec(max(2, maps.arms), 4)
-    panels = [figure.add_subplot(grid[i, j]) for i in range(maps.arms) for j in range(3)]
-    matrix_panels(figure, panels, maps.values, field_of(maps), range(3 * maps.arms), smooth=True)
-    right = [figure.add_subplot(grid[i, 3]) for i in range(2)]
-    _before_and_after(figure, right, likelihood, before, values)
-    outer_labels(right)
+    rows = max(2, maps.arms)
+    figure, axes = on.panels(10.2, 2.35 * rows, rows, 4, turned=True, sharex=True, sharey=True)
+    matrix_panels(
+        figure, axes[: maps.arms, :3], maps.values, field_of(maps), range(3 * maps.arms), smooth=True
+    )
+    _before_and_after(figure, tuple(axes[:2, 3]), likelihood, before, values)
+    for axis in (*axes[maps.arms :, :3].ravel(), *axes[2:, 3]):
+        axis.remove()
+    outer_labels(axes)
     return figure
 
 
@@ -162,7 +167,8 @@ def modulation_figure(
     names = names or instrument_of(calset).cameras.names
     arms = len(names) // 2
     figure, panels = on.panels(4.1 * arms, 3.2, 1, arms, sharex=True, sharey=True, squeeze=False)
-    angle = np.linspace(0.0, 360.0, 181)
+    turn = 180 if np.max(e.clp_angle[shown], initial=0.0) <= 180.0 else 360
+    angle = np.linspace(0.0, turn, 181)
     for arm, axis in enumerate(panels[0]):
         pair, (one, other) = 2 * arm, names[2 * arm : 2 * arm + 2]
         name = f"({one} − {other}) / ({one} + {other})"
@@ -178,8 +184,10 @@ def modulation_figure(
             )
         axis.set_xlabel("polariser angle (deg)", fontsize=FONT)
         axis.set_ylabel(name, fontsize=FONT)
-        axis.set_xticks(np.arange(0, 361, 90))
-    figure.axes[0].legend(frameon=False, fontsize=SMALL)
+        angle_ticks(axis.xaxis, figure, arms)
+    figure.legend(
+        *panels[0, 0].get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=2, loc=ABOVE
+    )
     return figure
 
 
@@ -193,7 +201,7 @@ def matrix_maps_figure(maps: MatrixMaps, kind: int | None = None, on: Canvas = P
     rows = maps.arms if kind is None else 1
     columns = max(len(chosen) // rows, 1)
     size = ((2.9 if rows > 1 else 4.0) * columns, 2.65 * rows + 0.7 * (rows == 1))
-    figure, axes = on.panels(*size, rows, columns, sharex=True, sharey=True, squeeze=False)
+    figure, axes = on.panels(*size, rows, columns, turned=True, sharex=True, sharey=True, squeeze=False)
     matrix_panels(figure, axes, maps.values, field_of(maps), chosen)
     return figure
 
@@ -204,7 +212,9 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
 
     It ends at whole decades, so that the errors of different runs can be compared.
     """
-    figure, axes = on.panels(8.6, 2.3 * maps.arms, maps.arms, 3, sharex=True, sharey=True, squeeze=False)
+    figure, axes = on.panels(
+        8.6, 2.3 * maps.arms, maps.arms, 3, turned=True, sharex=True, sharey=True, squeeze=False
+    )
     low, high = (100.0 * float(edge(maps.errors[maps.errors > 0], initial=1e-6)) for edge in (np.min, np.max))
     high = 10.0 ** np.ceil(np.log10(high))
     low = max(10.0 ** np.floor(np.log10(low)), high / 1e4)
@@ -213,7 +223,7 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
         least, most = (plain(100.0 * float(value)) for value in (errors.min(), errors.max()))
         field_axes(axis, f"error of {name}\n{least} to {most} %")
         image = pixel_map(axis, 100.0 * errors, field_of(maps), LogNorm(low, max(high, 10 * low)), SEQUENTIAL)
-    colour_bar(figure, image, axes, "standard error (%)", pad=0.02, extend="min")
+    colour_bar(figure, image, axes, "standard error (%)", pad=0.02, extend="min", aspect=30)
     outer_labels(axes)
     return figure
 
@@ -247,11 +257,11 @@ def residual_map_figure(residuals: ResidualMap, cameras: Sequence[str], on: Canv
     """
     arms = (len(residuals.values) + 1) // 4
     elements, ratios = residuals.values[: 3 * arms], residuals.values[3 * arms :]
-    figure, axes = on.panels(9.4, 2.0 * arms, arms, 4, sharex=True, sharey=True, squeeze=False)
+    figure, axes = on.panels(9.4, 2.0 * arms, arms, 4, turned=True, sharex=True, sharey=True, squeeze=False)
 
     def draw(axis: Axes, title: str, values: Float[np.ndarray, "y x"], norm: Normalize, colours: str) -> None:
         field_axes(axis, title)
-        colour_bar(figure, pixel_map(axis, values, field_of(residuals), norm, colours), axis, shrink=0.8)
+        colour_bar(figure, pixel_map(axis, values, field_of(residuals), norm, colours), axis)
 
     far = 100.0 * _almost_largest(elements)
     for axis, values, name in zip(axes[:, :3].ravel(), elements, element_symbols(arms), strict=True):
@@ -285,13 +295,16 @@ _RANGE = (1e-4, 3.0)  # per cent
 def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     """The error of p over the field (%, logarithmic; a line at 0.1 %), and which share of the field has which error."""
     percent = np.clip(100.0 * np.nan_to_num(accuracy.error, nan=np.inf), *_RANGE)
-    figure, (left, right) = on.panels(8.2, 3.4, 1, 2, width_ratios=(1.15, 1.0), gridspec_kw={"wspace": 0.1})
+    figure, (left, right) = on.panels(8.2, 3.4, 1, 2, width_ratios=(1.15, 1.0))
     low, high = float(percent.min()), float(percent.max())
-    field_axes(left, f"error of p, {accuracy.filter}")
-    image = pixel_map(left, percent, accuracy.extent, LogNorm(0.003, _RANGE[1]), SEQUENTIAL)
+    field_axes(left, f"error of p (%), {accuracy.filter}")
+    norm = LogNorm(0.003, _RANGE[1])
+    colour_bar(
+        figure, pixel_map(left, percent, accuracy.extent, norm, SEQUENTIAL, smooth=True), left, extend="both"
+    )
     if low < 100.0 * GOAL < high:
-        left.contour(percent, [100.0 * GOAL], extent=accuracy.extent, colors="w", linewidths=1.2)
-    colour_bar(figure, image, left, "standard error (%)", extend="both")
+        fine = 10.0 ** zoom(np.log10(percent), 4, order=1)
+        left.contour(fine, [100.0 * GOAL], extent=accuracy.extent, colors="w", linewidths=1.2)
     edges = np.geomspace(0.8 * low, 1.25 * high, 37)
     share = np.full(percent.size, 100.0 / percent.size)
     right.hist(percent.ravel(), edges.tolist(), weights=share, color=AFTER)
@@ -303,7 +316,7 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     right.set_xscale("log")
     right.set_xlim(edges[0], max(edges[-1], 150.0 * GOAL))
     plain_ticks(right.xaxis)
-    right.set_xlabel("standard error of p (%)", fontsize=FONT)
+    right.set_xlabel("error of p (%)", fontsize=FONT)
     right.set_ylabel("share of the field (%)", fontsize=FONT)
     return figure
 

@@ -70,7 +70,11 @@ def _corner(source: FigureSource) -> AnyFigure:
     if source.canvas.ax is not None:
         raise ValueError("ax: a corner plot needs a figure of its own")
     draws = np.stack([held[name].ravel() for name in shown], axis=1)
-    size = {} if source.canvas.figsize is None else {"width": source.canvas.figsize[0]}
+    size = {}
+    if source.canvas.figsize is not None:
+        size["width"] = source.canvas.figsize[0]
+    if source.canvas.width is not None:
+        size["width"] = source.canvas.width
     return posterior_figures.corner_figure(
         draws, shown, [units[name] for name in shown], source.reference, **size
     )

@@ -17,10 +17,12 @@ from walop_jax.data.settings import Settings
 from walop_jax.fit.model_file import instrument_of
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import with_minus_sign
+from walop_jax.model.instrument import Instrument
 from walop_jax.paper.comparison import Comparison
 from walop_jax.paper.polynomial import fit_paper, fit_transmissions, polariser_states
 from walop_jax.paper.wavelength import plate_names, plate_retardances
 from walop_jax.reports.style import (
+    ABOVE,
     DIVERGING,
     FONT,
     PAGE,
@@ -29,6 +31,7 @@ from walop_jax.reports.style import (
     SMALL,
     AnyFigure,
     Canvas,
+    angle_ticks,
     colour_bar,
     field_axes,
     outer_labels,
@@ -40,8 +43,9 @@ from walop_jax.reports.style import (
 from walop_jax.science.star_errors import QUANTITIES, plate_errors, transmitted
 
 _PIXELS, _LINES = 31, 41
+_STEPS = 21  # from the centre of the field to its edge
 _WAVELENGTH, _WAVELENGTHS = 0.62, (0.5, 0.75)  # µm
-COEFFICIENTS = ("$1$", "$q_m$", "$u_m$", "$q_m^2$", "$u_m^2$")
+COEFFICIENTS = ("constant", "$q_m$", "$u_m$", "$q_m^2$", "$u_m^2$")
 
 
 @styled
@@ -57,11 +61,12 @@ def retardance_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
             np.unwrap(values.reshape(_PIXELS, _PIXELS), axis=1, period=360.0), axis=0, period=360.0
         )
         whole -= 360.0 * np.floor(whole[_PIXELS // 2, _PIXELS // 2] / 360.0)
-        field_axes(axis, f"retardance of {PLATES.get(name, name)} at {1e3 * _WAVELENGTH:.0f} nm (deg)")
+        field_axes(axis, f"{PLATES.get(name, name)} at {1e3 * _WAVELENGTH:.0f} nm")
         norm = Normalize(float(whole.min()), float(whole.max()))
-        colour_bar(figure, pixel_map(axis, whole, calibration.field, norm, SEQUENTIAL), axis)
+        label = "retardance (deg)" if axis is axes[0, -1] else ""
+        colour_bar(figure, pixel_map(axis, whole, calibration.field, norm, SEQUENTIAL), axis, label)
         lines = axis.contour(
-            whole, extent=calibration.field, levels=8, colors="w", linewidths=0.5, negative_linestyles="solid"
+            whole, extent=calibration.field, levels=6, colors="w", linewidths=0.5, negative_linestyles="solid"
         )
         axis.clabel(lines, fontsize=SMALL - 1, fmt=lambda value: with_minus_sign(f"{value:.0f}"))
     outer_labels(axes)
@@ -79,28 +84,51 @@ def retardance_wavelength_figure(calibration: Calibration, on: Canvas = PAGE) ->
     places |= {with_minus_sign(f"X = {x:+.2f}°"): (x, 0.0) for x in (low_x, high_x)}
     places |= {with_minus_sign(f"Y = {y:+.2f}°"): (0.0, y) for y in (low_y, high_y)}
     x, y = (np.array(values) for values in zip(*places.values(), strict=True))
-    found = plate_retardances(instrument, line, x, y)
-    figure, axes = on.panels(3.9 * len(names), 3.1, 1, len(names), squeeze=False)
+    found = _unwrapped_retardances(instrument, line, x, y)
+    figure, axes = on.panels(3.9 * len(names), 3.5, 1, len(names), squeeze=False)
     for name, axis, curves in zip(names, axes[0], found, strict=True):
         for n, (place, curve) in enumerate(zip(places, curves, strict=True)):
-            shown = np.unwrap(curve, period=360.0)
             style = ("-", "--", "-.", ":", (0, (4, 4)))[n]
-            axis.plot(1e3 * line, shown, linestyle=style, color=f"C{n}", lw=1.3, label=place)
+            axis.plot(1e3 * line, curve, linestyle=style, color=f"C{n}", lw=1.3, label=place)
         axis.set_title(PLATES.get(name, name), fontsize=FONT)
         axis.set_xlabel("wavelength (nm)", fontsize=FONT)
-    axes[0, 0].set_ylabel("retardance (deg, plus multiples of 360)", fontsize=FONT)
-    axes[0, 0].legend(frameon=False, fontsize=SMALL)
+    axes[0, 0].set_ylabel("retardance (deg)", fontsize=FONT)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=3, loc=ABOVE)
     return figure
+
+
+def _unwrapped_retardances(
+    instrument: Instrument,
+    line: Float[np.ndarray, " w"],
+    x: Float[np.ndarray, " p"],
+    y: Float[np.ndarray, " p"],
+) -> Float[np.ndarray, "n p w"]:
+    """Retardances (deg) of plates at places and wavelengths (µm), without jumps of 360°.
+
+    At the wavelength of the maps they are those of the maps: between 0 and 360° at the first place, continuous from
+    there along a straight line to each other.
+    """
+    steps = np.linspace(0.0, 1.0, _STEPS)[:, None]
+    along = [(v[0] + steps * (v - v[0])).ravel() for v in (x, y)]
+    lines = np.append(_WAVELENGTH, line)
+    found = plate_retardances(instrument, lines, *along).reshape(-1, _STEPS, len(x), len(lines))
+    there = np.unwrap(found[..., 0], axis=1, period=360.0)[:, -1] - 360.0 * np.floor(
+        found[:, :1, 0, 0] / 360.0
+    )
+    curves = np.unwrap(found[:, -1, :, 1:], axis=-1, period=360.0)
+    near = int(np.argmin(np.abs(line - _WAVELENGTH)))
+    jump = curves[..., near] - there
+    return curves - 360.0 * np.round(jump / 360.0)[..., None]
 
 
 @styled
 def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = PAGE) -> AnyFigure:
     """Maps of the ten coefficients of the method of Paper II, a row for q and one for u."""
     found = fit_paper(calset, filter_name)
-    figure, axes = on.panels(10.6, 4.3, 2, 5, sharex=True, sharey=True)
+    figure, axes = on.panels(10.6, 4.3, 2, 5, turned=True, sharex=True, sharey=True)
     for row, quantity, coefficients in zip(axes, "qu", np.moveaxis(found.coefficients, 1, 0), strict=True):
         for axis, name, values in zip(row, COEFFICIENTS, coefficients.T, strict=True):
-            field_axes(axis, f"{quantity}: {name}")
+            field_axes(axis, f"{quantity}, {name}{'' if name == COEFFICIENTS[0] else ' term'}")
             low, high = _most(values)  # where an exposure holds no u a few are larger by orders of magnitude
             whole = low < 0 < high
             if whole:
@@ -160,9 +188,10 @@ def transmission_figure(
     above.set_ylabel("share of the light", fontsize=FONT)
     below.set_ylabel("residual (%)", fontsize=FONT)
     below.set_xlabel("polariser angle (deg)", fontsize=FONT)
-    above.legend(
-        frameon=False, fontsize=SMALL, ncols=len(names), loc="lower right", bbox_to_anchor=(1.0, 0.99)
+    figure.legend(
+        *above.get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=len(names), loc=ABOVE
     )
+    angle_ticks(below.xaxis, figure, 1)
     return figure
 
 

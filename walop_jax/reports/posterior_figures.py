@@ -185,7 +185,12 @@ def trace_figure(
     return figure
 
 
-def save_figure(path: str | os.PathLike[str], figure: Figure, *, overwrite: bool = False) -> None:
-    """Write a figure (format by the name); it appears whole or not at all."""
+def save_figure(
+    path: str | os.PathLike[str], figure: Figure, *, overwrite: bool = False, exact: bool = False
+) -> None:
+    """Write a figure (format by the name), cut to what is drawn, or of its `exact` size; whole or not at all."""
     with atomic_path(path, overwrite=overwrite) as temporary:
-        figure.savefig(temporary, dpi=200, bbox_inches="tight")
+        if exact:
+            figure.savefig(temporary, dpi=300)
+        else:
+            figure.savefig(temporary, dpi=200, bbox_inches="tight")

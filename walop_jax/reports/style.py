@@ -16,22 +16,33 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.collections import PatchCollection
 from matplotlib.colors import Normalize
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import NullLocator, ScalarFormatter
+from matplotlib.text import Text
+from matplotlib.ticker import MultipleLocator, NullLocator, ScalarFormatter
 
 from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.io.text import with_minus_sign
 
 FONT = 9
 SMALL = 7
+PRINTED = 7
+"""Type (pt) of a figure of a given width: what journals ask for at least, at the size of print."""
+WIDTHS = {"column": 89.0, "page": 183.0}
+"""Widths (mm) of figures in journals, by name."""
+SHARED = ("sharex", "sharey")
+NARROWEST = 1.3  # inches of a panel of a given width: narrower ones go below each other
+LABELS = 0.55  # inches of a panel that its title and numbers take, at any size
 DIVERGING = "RdBu_r"
 SEQUENTIAL = "viridis"
 PLATES = {"half1.plate": "HWP1", "half2.plate": "HWP2"}
 BEFORE = "#b2182b"  # dark enough to be told from AFTER in grey as well; both are ends of DIVERGING
 AFTER = "#2166ac"
 QUIET = "0.8"
+EARLIEST = 30000.0  # of an MJD (1941): smaller numbers count exposures
+ABOVE: Any = "outside upper center"  # of a legend
 MOST_VECTOR = 2000  # points above which tiles are drawn as pixels
 SETTINGS: dict[Any, Any] = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.hashsalt": "walop-jax"}
 """Beside the defaults of matplotlib; without the last no two pages of a run are the same."""
@@ -69,13 +80,15 @@ class PaperFigure(Figure):
 
 @dataclasses.dataclass(frozen=True)
 class Canvas:
-    """Place of a figure: one of its own, of its usual size or of `figsize` (inches), or in place of `ax`.
+    """Place of a figure: one of its own, of its usual size, of `figsize` or of `width` (inches), or in place of `ax`.
 
-    Figures of several panels take the room of `ax`, which goes, as a subfigure.
+    Figures of several panels take the room of `ax`, which goes, as a subfigure. A figure of a given width has type of
+    7 pt; panels that would be too narrow go below each other.
     """
 
     ax: Axes | None = None
     figsize: tuple[float, float] | None = None
+    width: float | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.ax, Axes | None):
@@ -85,7 +98,8 @@ class Canvas:
     def figure(self, width: float, height: float) -> Any:
         """An empty figure; usual sizes in inches. Raises ValueError for axes that stand in no grid."""
         if self.ax is None:
-            layout = ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.05)
+            pad = 0.05 if self.width is None else 0.02
+            layout = ConstrainedLayoutEngine(h_pad=pad + 0.01, w_pad=pad)
             return PaperFigure(figsize=self.figsize or (width, height), dpi=120, layout=layout)
         place, parent = self.ax.get_subplotspec(), self.ax.get_figure()
         if place is None or not isinstance(parent, Figure | SubFigure):
@@ -93,13 +107,65 @@ class Canvas:
         self.ax.remove()
         return parent.add_subfigure(place)
 
-    def panels(self, width: float, height: float, *shape: int, **options: Any) -> tuple[Any, Any]:
-        """A figure, and panels in it with small numbers, as `subplots` makes them."""
-        figure = self.figure(width, height)
-        axes = figure.subplots(*shape, **options)
+    def panels(
+        self,
+        width: float,
+        height: float,
+        rows: int = 1,
+        columns: int = 1,
+        *,
+        least: float = NARROWEST,
+        labels: float = LABELS,
+        turned: bool = False,
+        **options: Any,
+    ) -> tuple[Any, Any]:
+        """A figure, and panels in it with small numbers, as `subplots` makes them.
+
+        `least` is the width (inches) of the narrowest panel that can be read, `labels` the height of what is written
+        around each at any size; where columns are narrower, rows become
+        columns (`turned`), or groups of columns go below each other.
+        """
+        turned = turned and self._narrow(columns, least) and rows < columns
+        group = columns
+        if turned:
+            rows, columns, group = columns, rows, rows
+            other = {"row": "col", "col": "row"}
+            options |= {key: other.get(str(value), value) for key, value in options.items() if key in SHARED}
+        elif self._narrow(columns, least) and "width_ratios" not in options:
+            fitting = [n for n in range(1, columns) if not self._narrow(n, least)]
+            whole = [n for n in fitting if columns % n == 0] if rows > 1 else fitting
+            group = whole[-1]
+            if "height_ratios" in options:
+                options["height_ratios"] = [*options["height_ratios"]] * (columns // group)
+        groups = -(-columns // group)
+        size = (width, height)
+        if self.width is not None:
+            before = (width / (rows if turned else columns), height / (columns if turned else rows))
+            scale = self.width / group / before[0]
+            lowest = 0.0 if labels < LABELS else 1.1 if rows * groups == 1 else 0.8
+            size = self.width, rows * groups * (labels + max(scale * (before[1] - labels), lowest))
+        squeeze = options.pop("squeeze", True)
+        figure = self.figure(*size)
+        axes = figure.subplots(rows * groups, group, squeeze=False, **options)
+        axes = axes.reshape(groups, rows, group).swapaxes(0, 1).reshape(rows, -1)
+        for empty in axes[0, columns:]:
+            empty.remove()
+        if groups * group > columns:  # the last panel takes the rest of its row
+            place = axes[0, columns - 1].get_subplotspec()
+            axes[0, columns - 1].set_subplotspec(
+                place.get_gridspec()[place.rowspan.start, place.colspan.start :]
+            )
+        axes = axes[:, :columns]
+        axes = axes.T if turned else axes
         for axis in np.ravel(axes):
             axis.tick_params(labelsize=SMALL)
+        if squeeze:
+            axes = axes.item() if axes.size == 1 else axes.squeeze()
         return figure, axes
+
+    def _narrow(self, columns: int, least: float) -> bool:
+        """True where so many panels do not fit side by side."""
+        return columns > 1 and self.width is not None and self.width / columns < least
 
     def single(self, width: float, height: float) -> tuple[Any, Axes]:
         """A figure with one panel: `ax` itself where it is given."""
@@ -118,9 +184,21 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
         if any(ax is not None for ax in given):
             return function(*args, **options)
         with own_style():
-            return function(*args, **options)
+            figure = function(*args, **options)
+            if any(isinstance(one, Canvas) and one.width is not None for one in (*args, *options.values())):
+                _in_print(figure)
+            return figure
 
     return draw
+
+
+def _in_print(figure: Any) -> None:
+    """Set all type of a figure to the size of print, but for the signs of tiles."""
+    for axis in figure.axes:
+        axis.tick_params(axis="both", which="both", labelsize=PRINTED, length=2)
+    for text in figure.findobj(Text):
+        if len(text.get_text()) != 1:
+            text.set_fontsize(PRINTED)
 
 
 def field_axes(axis: Axes, title: str = "") -> None:
@@ -130,6 +208,17 @@ def field_axes(axis: Axes, title: str = "") -> None:
     axis.set_ylabel("Y (deg)", fontsize=FONT)
     axis.tick_params(labelsize=SMALL)
     axis.set_aspect("equal")
+
+
+def field_limits(low: float, high: float) -> tuple[float, float]:
+    """Limits of a map of the field along an axis, a little beyond it, in round steps: the same for all of a run."""
+    step = rounded_up(max(high - low, 1e-3) / 12.0)
+    margin = (high - low) / 24.0
+    return math.floor((low - margin) / step + 1e-6) * step, math.ceil((high + margin) / step - 1e-6) * step
+
+
+def _set_limits(axis: Axes, x: tuple[float, float], y: tuple[float, float]) -> None:
+    axis.set(xlim=field_limits(*x), ylim=field_limits(*y), facecolor="0.93")
 
 
 def outer_labels(axes: Any) -> None:
@@ -149,7 +238,7 @@ def pixel_map(
         values, origin="lower", extent=(low_x - half_x, high_x + half_x, low_y - half_y, high_y + half_y),
         norm=norm, cmap=colours, interpolation="bilinear" if smooth else "nearest",
     )  # fmt: skip
-    axis.set(xlim=(low_x, high_x), ylim=(low_y, high_y))
+    _set_limits(axis, (low_x, high_x), (low_y, high_y))
     return image
 
 
@@ -178,9 +267,7 @@ def point_map(
     tiles.set_array(values[known])
     tiles.set_rasterized(bool(known.sum() > MOST_VECTOR))
     axis.add_collection(tiles)
-    axis.set_facecolor("0.93")
-    axis.set_xlim(x[shown].min() - size, x[shown].max() + size)
-    axis.set_ylim(y[shown].min() - size, y[shown].max() + size)
+    _set_limits(axis, *((float(one[shown].min()), float(one[shown].max())) for one in (x, y)))
     return tiles
 
 
@@ -195,8 +282,11 @@ def _spacing(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> float:
 
 
 def colour_bar(figure: Any, image: Any, axes: Any, label: str = "", **options: Any) -> Any:
-    """A colour bar with small numbers, plain ones on a logarithmic scale."""
-    bar = figure.colorbar(image, ax=axes, **({"pad": 0.03} | options))
+    """A colour bar with small numbers, plain ones on a logarithmic scale; of a single map it has the height."""
+    if isinstance(axes, Axes):
+        bar = figure.colorbar(image, cax=axes.inset_axes((1.04, 0.0, 0.06, 1.0)), **options)
+    else:
+        bar = figure.colorbar(image, ax=axes, **({"pad": 0.03} | options))
     bar.set_label(label, fontsize=SMALL + 1)
     bar.ax.tick_params(labelsize=SMALL, which="both")
     if bar.ax.get_yscale() == "log":
@@ -204,6 +294,36 @@ def colour_bar(figure: Any, image: Any, axes: Any, label: str = "", **options: A
     else:
         bar.ax.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
     return bar
+
+
+def angle_ticks(axis: Axis, figure: Any, columns: int) -> None:
+    """Angles in degrees every 45°, or 90° or 180° where panels, so many side by side, have no room for more."""
+    low, high = axis.get_view_interval()
+    room = max(figure.get_figwidth() / columns - 0.5, 0.5) / 0.32  # numbers
+    axis.set_major_locator(MultipleLocator(next((s for s in (45, 90) if (high - low) / s <= room), 180)))
+
+
+def calendar(axis: Axes, mjd: Any) -> bool:
+    """Write dates (UTC), a day at least, along X where times are MJD; False where they only count."""
+    mjd = np.asarray(mjd, float)
+    low, high = (
+        axis.dataLim.intervalx
+    )  # of a single date matplotlib would draw a tenth of all days since 1970
+    margin = max(0.05 * (high - low), 0.5 * (1.0 - (high - low)))
+    axis.set_xlim(low - margin, high + margin)
+    if not mjd.size or not np.nanmin(mjd) > EARLIEST:
+        return False
+    locator = AutoDateLocator(minticks=3, maxticks=7)
+    axis.xaxis.set_major_locator(locator)
+    axis.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+    axis.set_xlabel("date (UTC)", fontsize=FONT)
+    return True
+
+
+def day_of(mjd: Any) -> Any:
+    """Days of matplotlib (since 1970) of MJD; what is no MJD, the number of an exposure group, stays."""
+    mjd = np.asarray(mjd, float)
+    return mjd - 40587.0 if mjd.size and np.nanmin(mjd) > EARLIEST else mjd
 
 
 def plain_ticks(axis: Axis) -> None:

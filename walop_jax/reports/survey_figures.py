@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from walop_jax.reports.style import (
     AFTER,
@@ -16,20 +15,23 @@ from walop_jax.reports.style import (
     PAGE,
     QUIET,
     SMALL,
+    calendar,
+    day_of,
     styled,
 )
+from walop_jax.science.quality import ERRORS, GAIN, OUTSIDE, Limits
 from walop_jax.science.watch_found import Watch
 
 MOST = 8  # parameters in a figure
-SHORTEST = 1.0  # d, of an axis of dates
 
 
 @styled
 def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
     """Parameters whose law lets them change, against time; None where there is none.
 
-    The band is the value under the law with its error, dots what each night would have by itself; dashed lines are
-    breaks of that parameter, dotted ones the events that the user wrote down.
+    The band is the value under the law with its error, dots what each night would have by itself. A step is a step:
+    grey across is the time in which it can have been; dashed lines are other breaks of that parameter, dotted ones the
+    events that the user wrote down.
     """
     found = document["breaks"]
     laws = [name for name in document["laws"] if name not in {one["name"] for one in found}]
@@ -43,18 +45,27 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
         mjd, value, error, alone, alone_error = (
             np.asarray(rows[key], float) for key in ("MJD", "VALUE", "ERROR", "DEVIATION", "DEVIATION_ERR")
         )
-        axis.fill_between(mjd, value - error, value + error, color=QUIET, lw=0)
-        axis.plot(mjd, value, color=AFTER, lw=1.0)
-        axis.errorbar(mjd, value + alone, alone_error, fmt="o", ms=2, lw=0.6, color=AFTER, alpha=0.6)
-        for one in found:
-            if one["name"] == name and one["kind"] != "drift":
-                axis.axvline(
-                    one["after"] if one["kind"] == "step" else one["before"], color=BEFORE, lw=0.9, ls="--"
-                )
+        breaks = [one for one in found if one["name"] == name and one["kind"] != "drift"]
+        steps = sorted(one["date"] for one in breaks if one["kind"] == "step")
+        time, parts = day_of(mjd), np.searchsorted(steps, mjd)
+        for part in range(len(steps) + 1):
+            at = parts == part
+            axis.fill_between(
+                time[at], (value - error)[at], (value + error)[at], color=AFTER, alpha=0.3, lw=0
+            )
+            axis.plot(time[at], value[at], color=AFTER, lw=1.2)
+        axis.errorbar(
+            time, value + alone, alone_error, fmt="o", ms=2.5, mfc="white", lw=0.7, color="0.45", zorder=1.5
+        )
+        for one in breaks:
+            if one["kind"] == "step":
+                axis.axvspan(*day_of([one["before"], one["after"]]), color=QUIET, lw=0, zorder=0)
+            else:
+                axis.axvline(float(day_of(one["before"])), color=BEFORE, lw=0.9, ls="--")
         _events(axis, document["events"])
         unit = str(rows["UNIT"][0]) if len(rows) else ""
         axis.set_ylabel(f"{name}\n{f'({unit})' if unit else ''}".strip(), fontsize=SMALL)
-    _dates(axes[-1, 0])
+    calendar(axes[-1, 0], tracks["MJD"])
     return figure
 
 
@@ -66,10 +77,10 @@ def nights_figure(document: Mapping[str, Any]) -> Figure:
     mjd = np.array([night["mjd"] for night in nights], float)
     figure, axis = PAGE.panels(6.4, 2.0)
     axis.axhspan(-2.0, 2.0, color=QUIET, lw=0)
-    axis.scatter(mjd, excess, s=6, color=np.where(excess > 5.0, BEFORE, AFTER).tolist())
+    axis.scatter(day_of(mjd), excess, s=6, color=np.where(excess > 5.0, BEFORE, AFTER).tolist())
     _events(axis, document["events"])
     axis.set_ylabel("(χ² − dof)/σ", fontsize=FONT)
-    _dates(axis)
+    calendar(axis, mjd)
     return figure
 
 
@@ -84,34 +95,55 @@ def watch_figure(found: Watch) -> Figure:
     named = {change.camera for change in found.changes}
     for k, axis in enumerate(axes[:, 0]):
         gain, error, seen = (100.0 * values[:, k] for values in (found.gain, found.error, found.smallest))
-        axis.fill_between(found.time, -seen, seen, color=QUIET, lw=0, step=None)
+        time = day_of(found.time)
+        axis.fill_between(time, -seen, seen, color=QUIET, lw=0, step=None)
         colour = BEFORE if found.cameras[k] in named else AFTER
-        axis.errorbar(found.time, gain, error, fmt="o", ms=3, lw=1, color=colour)
+        axis.errorbar(time, gain, error, fmt="o", ms=3, lw=1, color=colour)
         for change in found.changes:
-            axis.axvline(change.time, color=BEFORE, lw=0.8, ls="--")
+            axis.axvline(float(day_of(change.time)), color=BEFORE, lw=0.8, ls="--")
         axis.set_ylabel(f"{found.cameras[k]} (%)", fontsize=FONT)
     axes[0, 0].set_title("gain since the calibration; grey: steps that would not be seen", fontsize=FONT)
-    _a_day_at_least(axes[-1, 0])
-    axes[-1, 0].set_xlabel("MJD, or number of the exposure group", fontsize=FONT)
+    if not calendar(axes[-1, 0], found.time):
+        axes[-1, 0].set_xlabel("number of the exposure group", fontsize=FONT)
     return figure
 
 
-def _dates(axis: Any) -> None:
-    """MJD along X, written in full, over a day at least."""
-    _a_day_at_least(axis)
-    axis.set_xlabel("MJD", fontsize=FONT)
-    axis.xaxis.set_major_locator(MaxNLocator(6))
-    axis.xaxis.set_major_formatter(ScalarFormatter(useOffset=False))
+PANELS: Mapping[str, tuple[tuple[str, ...], float, str]] = {
+    "ANGLE": (("ANGLE",), 1.0, "angle (deg)"),
+    "P_RATIO": (("P_RATIO",), 1.0, "p / catalogue"),
+    "ZERO_Q": (("ZERO_Q", "ZERO_U"), 100.0, "zero of q, u (%)"),
+    "CHI2DOF": (("CHI2DOF",), 1.0, "χ²/dof"),
+    "ACCURACY": (("ACCURACY",), 100.0, "error of p (%)"),
+}
+"""Panels of the quality numbers: columns, factor, label."""
 
 
-def _a_day_at_least(axis: Any) -> None:
-    """Limits of X: of a single date matplotlib would draw a tenth of all days since 1858."""
-    low, high = axis.dataLim.intervalx
-    margin = max(0.05 * (high - low), (SHORTEST - (high - low)) / 2.0)
-    axis.set_xlim(low - margin, high + margin)
+@styled
+def quality_figure(table: Any, limits: Limits) -> Figure:
+    """Quality numbers night by night, of all cameras last; grey: their limits, red: outside."""
+    gains = [name for name in table.colnames if name.startswith(f"{GAIN}_")]
+    panels = {**PANELS, GAIN: (tuple(gains), 1.0, "gain of cameras")}
+    figure, axes = PAGE.panels(6.4, 0.9 + 1.1 * len(panels), len(panels), 1, sharex=True, squeeze=False)
+    night = np.asarray(table["NIGHT"], float)
+    time = day_of(night)
+    for axis, (limited, (names, factor, label)) in zip(axes[:, 0], panels.items(), strict=True):
+        for name, marker in zip(names, "osD^v<>phx", strict=False):
+            values = factor * np.ma.filled(np.ma.asarray(table[name], float), np.nan)
+            error = factor * np.asarray(table[ERRORS[name]], float) if name in ERRORS else None
+            outside = np.array([name in str(entry).split() for entry in table[OUTSIDE]])
+            axis.errorbar(time, values, error, fmt=marker, ms=3, lw=0.8, color=AFTER, label=name)
+            axis.plot(time[outside], values[outside], marker, ms=5, color=BEFORE, zorder=5)
+        if limited in limits and limited != GAIN:
+            low, high = (factor * value for value in limits[limited])
+            axis.axhspan(low, high, color=QUIET, lw=0, zorder=0)
+        axis.set_ylabel(label, fontsize=SMALL)
+        if len(names) > 1:
+            axis.legend(ncol=len(names), fontsize=SMALL, frameon=False)
+    calendar(axes[-1, 0], night)
+    return figure
 
 
 def _events(axis: Any, events: Sequence[Mapping[str, Any]]) -> None:
     for event in events:
-        axis.axvline(event["mjd"], color="0.4", lw=0.8, ls=":")
-        axis.update_datalim([(event["mjd"], 0.0)], updatey=False)
+        axis.axvline(float(day_of(event["mjd"])), color="0.4", lw=0.8, ls=":")
+        axis.update_datalim([(float(day_of(event["mjd"])), 0.0)], updatey=False)

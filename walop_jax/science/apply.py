@@ -41,6 +41,7 @@ MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
 COOL, HOT = 3500.0, 10000.0
 """Colour temperatures (K) between which 95 % of the stars without TEFF are taken to lie, normal in 1/T."""
+_MOST_OF_TEFF = 0.5  # error of a TEFF, relative, that is propagated
 _EXPANSIONS = 8  # of the counts, about the errors of the calibration that explain the stars best, …
 _STRAIGHT = 0.01  # … until second derivatives make less difference than this share of the noise, squared
 IMPROBABLE = 1e-6
@@ -54,9 +55,9 @@ class Stars:
     """Stokes parameters of the stars of a catalogue, in the order of `Catalogue.star`.
 
     On the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere. `covariance`
-    is the sum of `photon`, `calibration` (parameters of the optics and of the detectors), `spectrum`: a star
-    without TEFF has the colour of a population (`COOL`, `HOT`), and `changed`: what the whole catalogue says has
-    changed since the calibration. `colour` is the error of (q, u) if TEFF were ignored; without TEFF, half the
+    is the sum of `photon`, `calibration` (parameters of the optics and of the detectors), `spectrum`: a TEFF has its
+    error, a star without one the colour of a population (`COOL`, `HOT`), and `changed`: what the whole catalogue says
+    has changed since the calibration. `colour` is the error of (q, u) if TEFF were ignored; without TEFF, half the
     difference between stars of 3500 K and 10 000 K. `hidden` is the largest shift of q and u by a single mistake
     that the data of the calibration would not have shown (NaN: nobody asked). `flag` holds bits of `Quality`;
     `rows` counts the rows of a star. `check` is what all stars say together.
@@ -103,9 +104,18 @@ def apply(
         watched += work.residuals(block, chosen)
         if progress is not None:
             progress(done, len(catalogue))
+    return work.together(_joined(parts), work.checked(watched, chosen))
+
+
+def results_of(calibration: Calibration, catalogue: Catalogue) -> Stars:
+    """Stokes parameters of all stars, each by itself: nothing that all of them say together is in the errors."""
+    work = _Application(AnalysisVectors(calibration), catalogue, force=True)
+    return _joined([work.block(rows).stars for _, rows in work.blocks()])
+
+
+def _joined(parts: list[Stars]) -> Stars:
     columns = [f.name for f in dataclasses.fields(Stars) if f.name != "check"]
-    stars = Stars(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))  # pyright: ignore[reportArgumentType]
-    return work.together(stars, work.checked(watched, chosen))
+    return Stars(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))  # pyright: ignore[reportArgumentType]
 
 
 def residuals_of(
@@ -214,8 +224,9 @@ class _Application:
 
         nothing = np.zeros_like(calibration)
         spectrum, colour = nothing, np.zeros((len(rows), vectors.cameras, 2))
-        if np.isnan(teff).any():
-            colour = np.stack([change_of(weights) for weights in _unknown_colour(teff)], axis=-1)
+        teff_err = catalogue.teff_err[rows]
+        if np.isnan(teff).any() or teff_err.any():
+            colour = np.stack([change_of(weights) for weights in _unsure_colour(teff, teff_err)], axis=-1)
             mean, width = (shift(colour[..., n]) for n in range(2))
             spectrum = mean[:, :, None] * mean[:, None] + width[:, :, None] * width[:, None]
         flag = self.flags(rows, used, first, found)
@@ -474,18 +485,20 @@ def _ignored_colour(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:
     return np.where(np.isnan(teff)[:, None], half, flat - colour_weights(teff, COLOURS))
 
 
-def _unknown_colour(
-    teff: Float[np.ndarray, " r"],
+def _unsure_colour(
+    teff: Float[np.ndarray, " r"], error: Float[np.ndarray, " r"]
 ) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
-    """Mixtures of spectra: mean of the stars without TEFF less the flat one, and their standard deviation.
+    """Mixtures of spectra: mean of what the colour of a star may be less what it was taken to be, and the deviation.
 
-    The effect of the colour is close to linear in 1/T, in which `COOL` and `HOT` lie two deviations from the mean. Rows
-    with TEFF have weight 0.
+    The effect of the colour is close to linear in 1/T, in which `COOL` and `HOT` lie two deviations from the mean of
+    the stars without TEFF, and in which a TEFF (K) has its `error`, (1/T) · error/T.
     """
-    unknown = np.isnan(teff)[:, None]
+    unknown, share = np.isnan(teff)[:, None], np.minimum(error / teff, _MOST_OF_TEFF)
     hot, cool = colour_weights(np.array([HOT, COOL]), COLOURS)
     flat = colour_weights(np.array([np.nan]), COLOURS)[0]
-    return np.where(unknown, 0.5 * (hot + cool) - flat, 0.0), np.where(unknown, 0.25 * (cool - hot), 0.0)
+    warmer, cooler = (colour_weights(teff / (1.0 + sign * share), COLOURS) for sign in (-1.0, 1.0))
+    deviation = np.where(unknown, 0.25 * (cool - hot), 0.5 * (cooler - warmer))
+    return np.where(unknown, 0.5 * (hot + cool) - flat, 0.0), deviation
 
 
 # ------------------------------------------------------------------------------------- settings and flags

@@ -1,181 +1,48 @@
-"""Tables that an instrument is asked about: field points, and catalogues of stars (docs: files).
-
-Catalogues have one row per star and exposure, an intensity of every camera.
-"""
+"""Catalogues of stars: a row for each star and exposure, an intensity of every camera (docs: files)."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, finite, plain_column
-from walop_jax.data.settings import TEMPERATURE, Settings
+from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, plain_column
 from walop_jax.data.table_intensities import equal_rows
 from walop_jax.data.units import Place
 from walop_jax.data.user_tables import (
+    OF_STARS,
     InputTable,
-    empty_cells,
     numeric_column,
-    read_input_table,
     vector_columns,
 )
 from walop_jax.io.errors import rows_text
 from walop_jax.model.instrument import Instrument
+from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
+from walop_jax.science.field_points import FieldPoints, doubt_radians, field_points
+from walop_jax.sky.directions import same_stars
 
 _NEGATIVE = 5.0  # sigma: what noise about a subtracted background may do, and no more
-_SINGLE = 1  # point: it may lie outside without a doubt about its unit
-_WHOLE = 1e-4  # deg: angles in radians that are so close to whole degrees are not read as degrees
-_FINITE = finite("correct or remove these rows")
-
-
-def _also_finite(column: Column, missing: object) -> Column:
-    """A column of a calibration set in a table of field points, where a number is needed in every row."""
-    return dataclasses.replace(column, missing=missing, rules=(_FINITE, *column.rules))
-
-
-POINT_COLUMNS: Mapping[str, Column] = {
-    "X": Column("float", "deg", rules=(_FINITE,)),
-    "Y": Column("float", "deg", rules=(_FINITE,)),
-    "TEFF": EXPOSURES["TEFF"],
-    "FILTER": EXPOSURES["FILTER"],
-    "TEMP": _also_finite(EXPOSURES["TEMP"], TEMPERATURE),
-    "HA": _also_finite(EXPOSURES["HA"], 0.0),
-}
-
-
-@dataclasses.dataclass(frozen=True)
-class FieldPoints:
-    """Field points, and the optical settings there, for which an instrument matrix is asked.
-
-    `x`, `y` in degrees; `outside` marks points beyond the field of the instrument.
-    """
-
-    x: Float[np.ndarray, " n"]
-    y: Float[np.ndarray, " n"]
-    settings: Settings
-    outside: Bool[np.ndarray, " n"]
-
-    def __len__(self) -> int:
-        return len(self.x)
-
-
-def field_points(
-    source: InputTable,
-    instrument: Instrument,
-    always_in: Collection[str] = (),
-    never_in: Collection[str] = (),
-) -> FieldPoints:
-    """The X, Y and optional settings of a table of field points of an instrument.
-
-    A moving element has the columns `<P>_ANGLE` and `<P>_IN`; without the latter it is in the beam where it has an
-    angle. Of column prefixes, those `always_in` must have an angle, and those `never_in`, in the beam in no exposure of
-    the calibration, are in it only where `<P>_IN` says so. Single points outside the field are marked; if most of
-    them lie outside, the unit must be wrong.
-
-    Raises `DataError` naming file, column and row for anything that cannot be meant.
-    """
-    place = Place(source.path, "")
-    columns = {name: numeric_column(source, name, rule) for name, rule in POINT_COLUMNS.items()}
-    check(columns, POINT_COLUMNS, place)
-    x, y = columns["X"], columns["Y"]
-    positions = {}
-    for prefix in instrument.moving():
-        name = f"{prefix}_ANGLE"
-        if prefix in always_in and name not in source.names:
-            what = (
-                f"the angle of {prefix} is missing, which was in the beam in all exposures of the calibration"
-            )
-            advice = (
-                f"give the column {name} (deg, NaN: out); for all points of walop-jax matrix --at {prefix}=0"
-            )
-            raise place.fail(what, name, advice)
-        angle = numeric_column(source, name, EXPOSURES["CLP_ANGLE"])
-        _doubt_radians(source, name, angle, place)
-        inside, unstated = np.isfinite(angle), np.ones(source.rows, bool)
-        if f"{prefix}_IN" in source.names:
-            rule = EXPOSURES["CHWP_IN"]
-            unstated = empty_cells(source, f"{prefix}_IN", rule)
-            inside = np.where(unstated, inside, numeric_column(source, f"{prefix}_IN", rule))
-        if prefix in never_in:
-            what = f"has values, but no exposure of the calibration had {prefix} in the beam: was it, in"
-            advice = f"add {prefix}_IN: F where it was out, T where it was in"
-            place.refuse(inside & unstated, what, name, advice)
-        advice = f"{prefix}_IN is true: give the angle"
-        place.refuse(inside & ~np.isfinite(angle), "is not finite", name, advice)
-        check({name: angle}, {name: EXPOSURES["CLP_ANGLE"]}, place)
-        positions[prefix] = np.where(inside, angle, np.nan)
-    limit = instrument.field_limit
-    outside = np.maximum(np.abs(x), np.abs(y)) > limit
-    if len(x) > _SINGLE and np.mean(outside) > 0.5:
-        raise place.fail(
-            f"most points lie outside ±{limit:g}° of {instrument.name}: {rows_text(np.flatnonzero(outside))}",
-            "X, Y",
-            "field coordinates are in degrees: are these arcmin or pixels?",
-        )
-    settings = Settings(
-        filter=columns["FILTER"],
-        teff=columns["TEFF"],
-        temperature=columns["TEMP"],
-        hour_angle=columns["HA"],
-        positions=positions,
-    )
-    return FieldPoints(x=x, y=y, settings=settings, outside=outside)
-
-
-def _doubt_radians(source: InputTable, name: str, angle: Float[np.ndarray, " n"], place: Place) -> None:
-    """Refuse angles without a unit that are whole degrees if they are radians; remark on others within ±2π."""
-    column = source.column(name)
-    if column is None or getattr(column, "unit", None):
-        return
-    turned = angle[np.isfinite(angle) & (angle != 0)]
-    if not turned.size or np.abs(turned).max() > 6.2832 or np.all(turned == np.round(turned)):
-        return
-    degrees = np.rad2deg(turned)
-    if np.all(np.abs(degrees - np.round(degrees)) < _WHOLE):
-        what = (
-            f"has no unit and is a whole number of degrees in radians ({turned[0]:.6g} = {degrees[0]:.0f}°)"
-        )
-        raise place.fail(what, name, "give degrees, or state the unit of the column")
-    source.remarks.append(f"{name} has no unit and lies within ±2π: taken to be degrees; are these radians?")
-
-
-def true_matrices(
-    path: str | os.PathLike[str], instrument: Instrument
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
-    """X, Y (deg) and M21, M22, … of a table of true matrices, three for each arm.
-
-    Raises `DataError` for what is missing or not finite.
-    """
-    source = read_input_table(path)
-    points = field_points(source, instrument)
-    names = [f"M{arm + 2}{column}" for arm in range(len(instrument.cameras.pairs)) for column in (1, 2, 3)]
-    matrix = np.stack([numeric_column(source, name, Column("float")) for name in names], axis=1)
-    Place(path, "").refuse(
-        ~np.isfinite(matrix), "not finite", f"{names[0]} … {names[-1]}", "remove these rows"
-    )
-    return points.x, points.y, matrix
-
-
-# ------------------------------------------------------------------------------------ stars
+SAME_PLACE = 1.0  # arcsec
+ANOTHER_PLACE = 0.005  # deg in the field, of rows without a time
 
 
 @dataclasses.dataclass(frozen=True)
 class Catalogue:
     """The rows of a science catalogue.
 
-    `points` are positions and settings; `counts` and `sigma` [electron] are NaN where a camera is not used;
-    `spoilt` marks rows in which a camera was flagged, `copy` those that repeat another row of their star to the last
-    bit, which are not used, and `repeated` those that have the counts of another star or setting. `star` numbers the
-    stars from 0; `rotator` [deg] is NaN for results in the instrument frame, `time` [MJD, d] where it is not known.
+    `points` are positions and settings, `teff_err` the errors of the colour temperatures [K] (0: none); `counts` and
+    `sigma` [electron] are NaN where a camera is not used; `spoilt` marks rows in which a camera was flagged, `copy`
+    those that repeat another row of their star to the last bit, which are not used, and `repeated` those that have the
+    counts of another star or setting. `star` numbers the stars from 0; `rotator` [deg] is NaN for results in the
+    instrument frame, `time` [MJD, d] where it is not known.
     `remarks` say what is odd in the table, and what of it is not used.
     """
 
     points: FieldPoints
+    teff_err: Float[np.ndarray, " n"]
     counts: Float[np.ndarray, "n k"]
     sigma: Float[np.ndarray, "n k"]
     spoilt: Bool[np.ndarray, " n"]
@@ -223,13 +90,14 @@ def read_catalogue(
     points, cameras = field_points(source, instrument, always_in, never_in), len(instrument.cameras)
     rule = Column("float", "electron", width=cameras, shape_advice=f"one row holds all {cameras} cameras")
     counts, sigma = vector_columns(source, ("N", "N_ERR"), rule, instrument.cameras.names)
+    points, teff_err = _with_colours(source, points, place)
     advice = "standard errors in electrons; NaN for a camera that is not to be used"
     place.refuse(np.isfinite(counts) & (sigma <= 0), "is not above 0", "N_ERR", advice)
     flagged = _flagged(source, instrument.cameras.names, place)
     bad = flagged | (counts >= saturation) | (counts < -_NEGATIVE * sigma)
     rotator, time = (numeric_column(source, name, EXPOSURES[name]) for name in ("ROTATOR", "MJD"))
     check({"ROTATOR": rotator, "MJD": time}, {name: EXPOSURES[name] for name in ("ROTATOR", "MJD")}, place)
-    _doubt_radians(source, "ROTATOR", rotator, place)
+    doubt_radians(source, "ROTATOR", rotator, place)
     star = _stars(source, points, place)
     on_sky = np.isfinite(rotator)
     most = np.zeros(star.max() + 1, bool)
@@ -245,6 +113,7 @@ def read_catalogue(
     bad |= copy[:, None]
     return Catalogue(
         points=points,
+        teff_err=teff_err,
         counts=np.where(bad, np.nan, counts),
         sigma=np.where(bad, np.nan, sigma),
         spoilt=np.any(bad, axis=1) & ~copy,
@@ -255,6 +124,43 @@ def read_catalogue(
         time=time,
         remarks=source.about(),
     )
+
+
+CARRIED = ("RA", "DEC", *OF_STARS)
+"""Columns that are about the stars, and go through as they are."""
+
+
+def _with_colours(
+    source: InputTable, points: FieldPoints, place: Place
+) -> tuple[FieldPoints, Float[np.ndarray, " n"]]:
+    """Field points with the temperatures that BP_RP gives where there is no TEFF, and the errors of all of them (K)."""
+    source.used.update(set(CARRIED) & set(source.names))
+    columns = {name: Column("float", unit, missing=np.nan) for name, (unit, _) in OF_STARS.items()}
+
+    def numbers(name: str) -> Float[np.ndarray, " n"]:
+        return (
+            numeric_column(source, name, columns[name])
+            if name in source.names
+            else np.full(source.rows, np.nan)
+        )
+
+    teff, error = points.settings.teff, np.nan_to_num(numbers("TEFF_ERR"))
+    place.refuse(error < 0, "is below 0", "TEFF_ERR", "standard errors in K")
+    error = np.where(np.isnan(teff), 0.0, error)
+    colour = numbers("BP_RP")
+    asked = np.isnan(teff) & np.isfinite(colour)
+    if not asked.any():
+        return points, error
+    made, off = temperature_of(np.where(asked, colour, np.nan), numbers("BP_RP_ERR"))
+    within = np.isfinite(made)
+    source.remarks.append(f"TEFF of {int(within.sum())} rows is made of BP_RP ({SOURCE})")
+    if beyond := int(np.sum(asked & ~within)):
+        limits = f"{LIMITS[0]:g} … {LIMITS[1]:g} mag"
+        source.remarks.append(
+            f"BP_RP of {beyond} rows lies beyond {limits}: their errors are those of unknown colours"
+        )
+    settings = dataclasses.replace(points.settings, teff=np.where(within, made, teff))
+    return dataclasses.replace(points, settings=settings), np.where(within, off, error)
 
 
 _OF_RESULTS = ({"QU_COV", "P_DEBIASED"}, {"M21_ERR", "M22_ERR", "P_ERR"})
@@ -307,15 +213,16 @@ _NO_ID = (*MISSING, "-1", "unknown")
 
 
 def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndarray, " n"]:
-    """Number of the star of every row: by ID and FILTER; a row without an ID is a star of its own.
+    """Number of the star of every row: by FILTER, and ID, SOURCE_ID or position; a row without is a star of its own.
 
     IDs that are missing, empty or negative are none.
     """
     rows = np.arange(source.rows)
-    column = source.column("ID")
+    named = next((name for name in ("ID", "SOURCE_ID") if name in source.names), "ID")
+    column = source.column(named)
     if column is None:
-        return rows
-    values, missing, _ = plain_column(column, "ID", Column("str"), place)
+        return _by_position(source, points) if {"RA", "DEC"} <= set(source.names) else rows
+    values, missing, _ = plain_column(column, named, Column("str"), place)
     if values.ndim == 2 and values.shape[1] == 1:
         values, missing = values[:, 0], missing[:, 0]
     if values.ndim != 1:
@@ -336,13 +243,48 @@ def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndar
     if unknown.any():
         which = rows_text(np.flatnonzero(unknown))
         source.remarks.append(
-            f"ID is {values[unknown][0]} in {which}: unknown, a star of its own in each row"
+            f"{named} is {values[unknown][0]} in {which}: unknown, a star of its own in each row"
         )
-    _, name = np.unique(values, return_inverse=True)
-    _, band = np.unique(points.settings.filter, return_inverse=True)
-    key = name.reshape(-1) * (band.max() + 1) + band.reshape(-1)
-    alone = key.max() + 1 + rows
-    return np.unique(np.where(missing | unknown, alone, key), return_inverse=True)[1].reshape(-1)
+    name = np.unique(values, return_inverse=True)[1].reshape(-1)
+    return _numbered(name, missing | unknown, points)
+
+
+def _numbered(
+    name: Int[np.ndarray, " n"], alone: Bool[np.ndarray, " n"], points: FieldPoints
+) -> Int[np.ndarray, " n"]:
+    """Numbers of stars by their name and filter; rows that are `alone` have each a number of their own."""
+    band = np.unique(points.settings.filter, return_inverse=True)[1].reshape(-1)
+    key = name * (band.max() + 1) + band
+    single = key.max() + 1 + np.arange(len(key))
+    return np.unique(np.where(alone, single, key), return_inverse=True)[1].reshape(-1)
+
+
+def _by_position(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n"]:
+    """Numbers of stars by RA and DEC: rows within `SAME_PLACE` that are not of one exposure are one star."""
+    ra, dec, time = (
+        numeric_column(source, name, Column("float", unit, missing=np.nan))
+        for name, unit in (("RA", "deg"), ("DEC", "deg"), ("MJD", "d"))
+    )
+    known = np.isfinite(ra) & np.isfinite(dec)
+    name = np.zeros(len(ra), int)
+    name[known] = same_stars(ra[known], dec[known], SAME_PLACE)
+    # Two stars of one exposure are two stars, however close: by time, or by the place in the field where it is unknown.
+    cell = np.round(np.stack([points.x, points.y], axis=1) / ANOTHER_PLACE)
+    exposure = np.where(
+        np.isfinite(time)[:, None], np.stack([time, np.full(len(time), np.inf)], axis=1), cell
+    )
+    _, of, count = np.unique(
+        np.column_stack([name, exposure]), axis=0, return_inverse=True, return_counts=True
+    )
+    crowded = np.zeros(name.max() + 1, bool)
+    crowded[name[count[of.reshape(-1)] > 1]] = True
+    alone = ~known | crowded[name]
+    star = _numbered(name, alone, points)
+    if (several := len(star) - star.max() - 1) > 0:
+        source.remarks.append(
+            f"{several} rows are further rows of stars at the same RA and DEC (within {SAME_PLACE:g} arcsec): combined"
+        )
+    return star
 
 
 def _copies(

@@ -79,7 +79,7 @@ class ChangeQuestion(NamedTuple):
 
     def words(self, size: float, error: float) -> str:
         """A size of it in words."""
-        more, amount = ("brighter", "fainter")[size < 0], abs(size)
+        direction, amount = ("brighter", "fainter")[size < 0], abs(size)
         if not self.of_camera:
             larger = ("larger", "smaller")[size < 0]
             return f"{self.name} {larger} by {with_error(amount, error)} {self.unit}".rstrip()
@@ -91,7 +91,7 @@ class ChangeQuestion(NamedTuple):
             "time": " at the end of the catalogue than in its middle",
             "flux": " for every 10⁶ electrons",
         }.get(self.kind, "")
-        return f"{self.name} {more} by {with_error(100 * amount, 100 * error)} %{where}"
+        return f"{self.name} {direction} by {with_error(100 * amount, 100 * error)} %{where}"
 
 
 class FoundChange(NamedTuple):
@@ -120,10 +120,10 @@ class InstrumentChange:
     def words(self) -> str:
         """The change in a sentence."""
         text = f"changed since the calibration, {abs(self.best.sigma):.0f} σ: {self._words(self.best)}"
-        others = [self._words(entry) for entry in self.alike if entry.question != self.best.question]
-        if not others:
+        rivals = [self._words(entry) for entry in self.alike if entry.question != self.best.question]
+        if not rivals:
             return text
-        return f"{text}. These rows cannot distinguish it from {some(others, 4)}"
+        return f"{text}. These rows cannot distinguish it from {some(rivals, 4)}"
 
     def _words(self, found: FoundChange) -> str:
         return found.question.words(found.size, found.error)
@@ -207,10 +207,10 @@ class CatalogueCheck(Displayed):
 
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each thing that does not hold."""
-        said = [entry.words() for entry in (*self.changes, *self.places)]
+        texts = [entry.words() for entry in (*self.changes, *self.places)]
         if self.rows_agree:
             assert self.rows is not None
-            said.append(
+            texts.append(
                 f"the rows of a star agree more than independent rows do: together their variance is {self.rows:.3g} "
                 "times what N_ERR says. Are rows there twice, or is their noise correlated? Photon errors of stars of "
                 f"several rows were multiplied by {np.sqrt(self.scale[1]):.3g}"
@@ -218,11 +218,11 @@ class CatalogueCheck(Displayed):
         if self.noise_is_off:
             factor = np.sqrt(self.noise)
             word = f"{factor:.3g} times too small" if factor > 1 else f"{1 / factor:.3g} times too large"
-            said.append(
+            texts.append(
                 f"N_ERR is {word}: χ²/dof of the stars together is {self.noise:.3g}. Photon errors were multiplied by "
                 f"{factor:.3g}"
             )
-        return tuple(said)
+        return tuple(texts)
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
@@ -277,7 +277,7 @@ class CatalogueCheck(Displayed):
             for t in self.tests
             if t.question.of_camera
         )
-        seen = (
+        smallest = (
             f"{100 * self.smallest:.2g} %"
             if np.isfinite(self.smallest)
             else "none: no row has a camera to spare"
@@ -285,7 +285,7 @@ class CatalogueCheck(Displayed):
         facts = (
             ("stars, rows", f"{self.stars}, {self.rows_used}"),
             ("χ²/dof", f"{self.noise:.3f}"),
-            ("smallest change seen", f"{seen} of one camera"),
+            ("smallest change seen", f"{smallest} of one camera"),
         )
         title = "The catalogue agrees with the calibration" if self.holds else "The catalogue DISAGREES"
         return Display(title, facts, ("camera", "grows with", "change", ">σ"), rows, self.warnings())
@@ -336,26 +336,26 @@ class CatalogueSearch:
         ]
         # Columns: those of the cameras, all parameters, two of the colours; from them questions and nuisances are made.
         count, shown = len(kinds) * len(cameras), len(root)
-        asked, known = count + plain, self.root.shape[1]
-        self.asked = asked
-        self.mixing = np.zeros((count + shown + 2, asked + known + 2))
-        self.mixing[:asked, :asked] = np.eye(asked)
-        self.mixing[count : count + shown, asked : asked + known] = self.root
+        questions, nuisances = count + plain, self.root.shape[1]
+        self.asked = questions
+        self.mixing = np.zeros((count + shown + 2, questions + nuisances + 2))
+        self.mixing[:questions, :questions] = np.eye(questions)
+        self.mixing[count : count + shown, questions : questions + nuisances] = self.root
         self.mixing[-2:, -2:] = np.eye(2)
-        self.prior = np.concatenate([np.zeros(asked), np.ones(known + 2)])
+        self.prior = np.concatenate([np.zeros(questions), np.ones(nuisances + 2)])
         self.start = np.zeros(len(self.prior))
         if at is not None:
-            self.start[asked : asked + known] = at[self.matters]
+            self.start[questions : questions + nuisances] = at[self.matters]
         self.nearest = self.start
 
     def _columns(self, part: StarResiduals) -> Float[np.ndarray, "r k c"]:
         cameras = part.model.shape[1]
         values = np.zeros((*part.model.shape, len(self.mixing)))
         place = (part.x, part.y, part.time)
-        seen = np.where(part.root > 0, part.model / np.where(part.root > 0, part.root, 1.0), 0.0)
+        relative = np.where(part.root > 0, part.model / np.where(part.root > 0, part.root, 1.0), 0.0)
         for n, kind in enumerate(self.kinds):
             for k in range(cameras):
-                grown = self.growth.electrons(kind, *place, seen[:, k])
+                grown = self.growth.electrons(kind, *place, relative[:, k])
                 values[:, k, n * cameras + k] = grown * part.root[:, k]
         values[..., len(self.kinds) * cameras : -2] = part.parameters()
         values[..., -2:] = part.colour
@@ -384,9 +384,9 @@ class CatalogueSearch:
             several = single
             if not stated and rows is not None and _chance_beside(rows, noise) < self._alarm:
                 several = max(single, rows.value)
-            each = self.variance * np.where(stars.rows > 1, several, single)
+            variances = self.variance * np.where(stars.rows > 1, several, single)
             matrix, score = normal_matrix(
-                stars, residual, lambda part, _: self._columns(part), scale.kept / each, scale.share
+                stars, residual, lambda part, _: self._columns(part), scale.kept / variances, scale.share
             )
             matrix = self.mixing.T @ matrix @ self.mixing + np.diag(self.prior)
             return _Look(noise, rows, matrix, self.mixing.T @ score - self.prior * sizes)
@@ -408,11 +408,11 @@ class CatalogueSearch:
         """The gains of the cameras that fit the stars best, among all sizes, and how many numbers these are."""
         cameras = sum(question.kind == "gain" for question in self.questions)
         order = [*range(cameras), *range(self.asked, len(look.score))]
-        found = np.zeros_like(look.score)
+        gains = np.zeros_like(look.score)
         matrix, score = eliminated(look.matrix[np.ix_(order, order)], look.score[order], cameras)
         root = whitening(matrix, SINGULAR)
-        found[:cameras] = root @ (root.T @ score)
-        return found, root.shape[1]
+        gains[:cameras] = root @ (root.T @ score)
+        return gains, root.shape[1]
 
     def answer(self) -> CatalogueCheck:
         """All questions, then again behind what was found."""
@@ -441,7 +441,7 @@ class CatalogueSearch:
         changes = tuple(self._change(look, sizes, chosen, n) for n in chosen)
         noise, rows = look.noise, look.rows
         rows_p = 1.0 if rows is None or self.crowded else _chance_beside(rows, noise)
-        found = CatalogueCheck(
+        check = CatalogueCheck(
             stars=len(self.stars.photon),
             rows_used=len(self.stars),
             asked=self.asked + 2,
@@ -456,10 +456,10 @@ class CatalogueSearch:
             growth=self.growth,
         )
         # χ² of rows that repeat each other says nothing of N_ERR: what they share does.
-        single = noise.value if found.noise_is_off else 1.0
-        several = float(rows.value) if rows is not None and found.rows_agree else single
-        found = dataclasses.replace(found, scale=(single, several))
-        return dataclasses.replace(found, places=self._places(found, look, sizes, chosen))
+        single = noise.value if check.noise_is_off else 1.0
+        several = float(rows.value) if rows is not None and check.rows_agree else single
+        check = dataclasses.replace(check, scale=(single, several))
+        return dataclasses.replace(check, places=self._places(check, look, sizes, chosen))
 
     def _places(
         self, found: CatalogueCheck, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int]
@@ -531,15 +531,15 @@ class CatalogueSearch:
         """Every question, alone beside `chosen`, which have no answer here."""
         free = [n for n in range(self.asked) if n not in chosen]
         order = [*free, *chosen, *range(self.asked, len(score))]
-        left, along = eliminated(matrix[np.ix_(order, order)], score[order], len(free))
-        found = [FoundChange(question, 0.0, np.inf, 0.0) for question in self.questions]
-        for n, information, slope in zip(free, np.diag(left), along, strict=True):
+        remaining, along = eliminated(matrix[np.ix_(order, order)], score[order], len(free))
+        sizes = [FoundChange(question, 0.0, np.inf, 0.0) for question in self.questions]
+        for n, information, slope in zip(free, np.diag(remaining), along, strict=True):
             if information > 1e-9 * matrix[n, n]:
                 error = float(information**-0.5)
-                found[n] = FoundChange(
+                sizes[n] = FoundChange(
                     self.questions[n], float(slope * error**2), error, float(slope * error)
                 )
-        return found
+        return sizes
 
     def _change(
         self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], asked: int
@@ -548,11 +548,11 @@ class CatalogueSearch:
         away = np.zeros_like(sizes)
         away[asked] = sizes[asked]
         score = look.score + look.matrix @ away
-        each = self._beside(look.matrix, score, [k for k in chosen if k != asked])
-        best = max(each, key=lambda found: found.sigma**2)
-        alike = [found for found in each if found.sigma**2 > best.sigma**2 - RIVAL]
+        measured = self._beside(look.matrix, score, [k for k in chosen if k != asked])
+        best = max(measured, key=lambda entry: entry.sigma**2)
+        alike = [entry for entry in measured if entry.sigma**2 > best.sigma**2 - RIVAL]
         # A gain is the simplest of what describes the stars alike.
-        ranked = sorted(alike, key=lambda found: (found.question.kind != "gain", -abs(found.sigma)))
+        ranked = sorted(alike, key=lambda entry: (entry.question.kind != "gain", -abs(entry.sigma)))
         return InstrumentChange(ranked[0], tuple(ranked))
 
     def _smallest(self, tests: list[FoundChange]) -> float:

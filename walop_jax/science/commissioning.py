@@ -59,13 +59,13 @@ def requirements(
                 strip = f"{100 * accuracy.without_u:.0f} % of the field"
                 cause = f", worst beside the {strip} where one exposure carries almost no information on u"
                 advice = "observe the stars there with the calibration plate at 22.5° as well"
-            asked = f"p known to {two_digits(100 * MOST)} % in {where}"
-            said = f"{two_digits(100 * reached)} %{cause}"
-            found.append(Requirement(asked, reached <= MOST, said, advice, needed))
-        for name, one in unmeasured(accuracy.not_measured).items():
-            asked = f"what moves stars by {two_digits(100 * MOST)} % is measured"
-            lacking = f"{name} not measured, {off_by(*one.error)} at the usual size"
-            found.append(Requirement(asked, one.error[0] <= MOST, lacking, one.remedy))
+            text = f"p known to {two_digits(100 * MOST)} % in {where}"
+            value = f"{two_digits(100 * reached)} %{cause}"
+            found.append(Requirement(text, reached <= MOST, value, advice, needed))
+        for name, effect in unmeasured(accuracy.not_measured).items():
+            text = f"what moves stars by {two_digits(100 * MOST)} % is measured"
+            lacking = f"{name} not measured, {off_by(*effect.error)} at the usual size"
+            found.append(Requirement(text, effect.error[0] <= MOST, lacking, effect.remedy))
         if accuracy.hidden > 0:
             found.append(
                 Requirement(
@@ -76,8 +76,14 @@ def requirements(
                     needed=False,
                 )
             )
-    for one in () if calset is None else inspect(calset).findings:
+    for finding in () if calset is None else inspect(calset).findings:
         found.append(
-            Requirement("exposures and errors", False, one.what, one.advice, needed=one.severity == "fault")
+            Requirement(
+                "exposures and errors",
+                False,
+                finding.what,
+                finding.advice,
+                needed=finding.severity == "fault",
+            )
         )
     return tuple(found)

@@ -65,7 +65,9 @@ class Conformance(Displayed):
             if not mistake or len(group) == 1:
                 notes += map(str, group)
             else:
-                notes.append(f"{mistake}: {some([f'{one.case} {one.quantity}' for one in group], SHOWN)}")
+                notes.append(
+                    f"{mistake}: {some([f'{answer.case} {answer.quantity}' for answer in group], SHOWN)}"
+                )
         right = self.asked - len(self.deviations)
         return Display(f"{right} of {self.asked} numbers are right", notes=tuple(notes))
 
@@ -82,7 +84,7 @@ def values(name: str) -> dict[Key, float]:
 
 def judge(answers: dict[Key, float | None]) -> Conformance:
     """Hold answers against the right ones, and name the first mistake that would answer the same."""
-    expected, mistakes, found = values("answers.csv"), rows("mistakes.csv"), []
+    expected, mistakes, wrong = values("answers.csv"), rows("mistakes.csv"), []
     for (case, quantity), right in expected.items():
         answer = answers.get((case, quantity))
         if not same(quantity, answer, right):
@@ -92,8 +94,8 @@ def judge(answers: dict[Key, float | None]) -> Conformance:
                 if (row["CASE"], row["QUANTITY"]) == (case, quantity)
                 and same(quantity, answer, float(row["VALUE"]))
             )
-            found.append(Deviation(case, quantity, answer, right, next(likely, "")))
-    return Conformance(len(expected), tuple(found))
+            wrong.append(Deviation(case, quantity, answer, right, next(likely, "")))
+    return Conformance(len(expected), tuple(wrong))
 
 
 def same(quantity: str, answer: float | None, expected: float) -> bool:
@@ -111,13 +113,13 @@ def answers_of(path: Path) -> dict[Key, float | None]:
     Raises `DataError` for a file that cannot be read, a case or quantity that is not asked for, and one that is there
     twice.
     """
-    asked = values("answers.csv")
+    questions = values("answers.csv")
     answers: dict[Key, float | None] = {}
     for number, row in enumerate(csv.DictReader(io.StringIO(read_text(path)))):
         key = (str(row.get("CASE") or "").strip(), str(row.get("QUANTITY") or "").strip())
         name, where = " ".join(key).strip(), f"in row {number} (counted from 0)"
-        if key not in asked:
-            advice = nearest(name, map(" ".join, asked))
+        if key not in questions:
+            advice = nearest(name, map(" ".join, questions))
             raise fail(f"{name!r} is not asked for, {where}", file=path, advice=advice)
         if key in answers:
             raise fail(f"{name} is there twice, again in row {number}", file=path, advice="remove one")

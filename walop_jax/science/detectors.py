@@ -52,10 +52,10 @@ def detector_slopes(
         return reported(to_instrument(values), counts)
 
     probe = jnp.full((1, counts.shape[1]), 1e6)
-    known = np.abs(np.asarray(jax.jacfwd(read)(values, probe))).max(axis=(0, 1)) > 0
+    active = np.abs(np.asarray(jax.jacfwd(read)(values, probe))).max(axis=(0, 1)) > 0
     true = jnp.asarray(np.nan_to_num(counts))
     _, slope = jax.jvp(lambda c: read(values, c), (true,), (jnp.ones_like(true),))
-    for place in np.flatnonzero(known[vectors.parameters]):
+    for place in np.flatnonzero(active[vectors.parameters]):
         along = jnp.zeros_like(values).at[vectors.parameters[place]].set(1.0)
         _, change = jax.jvp(lambda v: read(v, true), (values,), (along,))
         yield int(place), -np.asarray(change / slope)

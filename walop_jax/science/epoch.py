@@ -175,13 +175,13 @@ class Epoch(Displayed):
         }
         if self.added:
             facts = {"not in the old model": ", ".join(self.added)} | facts
-        more = len(self.moved) - _SHOWN
+        remaining = len(self.moved) - _SHOWN
         return Display(
             title,
             tuple(facts.items()),
             head=("parameter", ">old", ">new", ">change / σ", "unit"),
             rows=tuple(rows),
-            notes=(f"{more} more in to_table()",) if more > 0 else (),
+            notes=(f"{remaining} more in to_table()",) if remaining > 0 else (),
         )
 
 
@@ -215,8 +215,8 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
     before[: len(a), : len(a)] = old.covariance[np.ix_(a, a)]
     change = new.values[b] - was
     width = np.array([(model[name].prior or (0.0, np.inf))[1] for name in names])
-    both = before @ (after / width[:, None] ** 2)
-    covariance = before + after - both - both.T
+    product = before @ (after / width[:, None] ** 2)
+    covariance = before + after - product - product.T
     sigma = np.sqrt(np.diag(before + after))
     units = [model[name].unit for name in names]
     measured = MeasuredChange.of(names, change, covariance, sigma, units)
@@ -276,13 +276,13 @@ def shared_parameters(old: Model, new: Model) -> list[str]:
 
 def added_amplitudes(old: Model, new: Model) -> list[str]:
     """Names of free parameters in which effects of the new model that the old one lacks are linear at zero."""
-    parts = set(new.effect_names) - set(old.effect_names)
+    effects = set(new.effect_names) - set(old.effect_names)
     shapes = {kind.name: kind.shape for kind in new.catalogue}
     free = [new.parameters[i] for i in new.free]
     return [
         p.name
         for p in free
-        if p.part in parts and p.name.removeprefix(f"{p.part}.").split(".")[0] not in shapes.get(p.part, ())
+        if p.part in effects and p.name.removeprefix(f"{p.part}.").split(".")[0] not in shapes.get(p.part, ())
     ]
 
 
@@ -310,20 +310,20 @@ class MeasuredChange(NamedTuple):
         units: Sequence[str] = (),
     ) -> MeasuredChange:
         """The change of parameters, each in units of its `sigma`; those with none are not known."""
-        known = np.flatnonzero(sigma > 0)
-        unit = sigma[known]
-        scaled = covariance[np.ix_(known, known)] / np.outer(unit, unit)
+        measured = np.flatnonzero(sigma > 0)
+        unit = sigma[measured]
+        scaled = covariance[np.ix_(measured, measured)] / np.outer(unit, unit)
         value, vector = np.linalg.eigh(scaled)
         good = value > _KNOWN * value[-1]
         inverse = (vector[:, good] / value[good]) @ vector[:, good].T
         return cls(
-            tuple(names[k] for k in known.tolist()),
-            change[known] / unit,
+            tuple(names[k] for k in measured.tolist()),
+            change[measured] / unit,
             scaled,
             inverse,
             int(good.sum()),
             unit,
-            tuple(units[k] for k in known.tolist()) if units else ("",) * len(known),
+            tuple(units[k] for k in measured.tolist()) if units else ("",) * len(measured),
         )
 
     @property
@@ -333,11 +333,13 @@ class MeasuredChange(NamedTuple):
 
     def largest(self) -> LargestChange:
         """The largest of the changes of single parameters, each by itself and as if nothing else had changed."""
-        each, alone = np.diag(self.covariance), np.diag(self.inverse)
-        width = np.sqrt(np.stack([np.where(each > _LEANS, each, np.inf), np.where(alone > 0, alone, np.inf)]))
+        variances, alone = np.diag(self.covariance), np.diag(self.inverse)
+        width = np.sqrt(
+            np.stack([np.where(variances > _LEANS, variances, np.inf), np.where(alone > 0, alone, np.inf)])
+        )
         z = np.stack([self.change, self.inverse @ self.change]) / width
         way, i = np.unravel_index(np.abs(z).argmax(), z.shape)
-        asked = int(np.isfinite(width).sum())
+        questions = int(np.isfinite(width).sum())
         p = float(special.chdtrc(1, z[way, i] ** 2))
         # Of one alone: a/√(V⁻¹)_ii, with the error 1/√(V⁻¹)_ii.
         error = self.sigma[i] * (width[0, i] if way == 0 else 1.0 / width[1, i])
@@ -348,8 +350,8 @@ class MeasuredChange(NamedTuple):
             self.units[int(i)],
             float(z[way, i]),
             bool(way),
-            asked,
-            _of_several(p, asked),
+            questions,
+            _of_several(p, questions),
         )
 
 
@@ -382,5 +384,5 @@ def _seen_through(calibration: Calibration) -> list[Settings]:
     usual = calibration.usual_settings(filter_name=name)
     if len(calibration.model.template.arms) > 1:
         return [usual]
-    seen = Settings.of(calibration.exposures, calibration.model.template.patched().moving())
-    return [setting for setting, _ in usual[np.zeros(len(seen), int)].at(**seen.positions).layouts()]
+    settings = Settings.of(calibration.exposures, calibration.model.template.patched().moving())
+    return [setting for setting, _ in usual[np.zeros(len(settings), int)].at(**settings.positions).layouts()]

@@ -73,13 +73,13 @@ def estimate(
     """
     if cameras is not None and cameras.split:
         count, arms = counts.shape[1], len(cameras.arms)
-        mine = np.array([np.isin(np.arange(count), own) for own in cameras.arms])
-        seen = np.where(mine, counts[:, None], np.nan).reshape(-1, count)
+        mine = np.array([np.isin(np.arange(count), members) for members in cameras.arms])
+        measured = np.where(mine, counts[:, None], np.nan).reshape(-1, count)
         row = np.repeat(np.arange(len(counts)), arms)
-        found = estimate(vectors[row], seen, sigma[row], star[row])
-        flux = found.flux.reshape(-1, arms).mean(axis=1)
-        gain = found.gain.reshape(-1, arms, 2, count).sum(axis=1)
-        return dataclasses.replace(found, flux=flux, gain=gain)
+        of_arms = estimate(vectors[row], measured, sigma[row], star[row])
+        flux = of_arms.flux.reshape(-1, arms).mean(axis=1)
+        gain = of_arms.gain.reshape(-1, arms, 2, count).sum(axis=1)
+        return dataclasses.replace(of_arms, flux=flux, gain=gain)
     used = np.isfinite(counts) & np.isfinite(sigma) & (sigma > 0)
     weight = np.where(used, 1.0 / np.where(used, sigma, 1.0) ** 2, 0.0)
     data = np.where(used, counts, 0.0)
@@ -188,14 +188,14 @@ def _minimise(
         flux, gradient, information = _expansion(gram[rows], moment[rows], qu[star[rows]])
         covariance, _ = _inverse(np.add.reduceat(information, where))
         step = np.einsum("sij,sj->si", covariance, np.add.reduceat(gradient, where))
-        known = np.all(np.isfinite(step), axis=1)
-        qu[stars[known]] += step[known]
+        finite = np.all(np.isfinite(step), axis=1)
+        qu[stars[finite]] += step[finite]
         with np.errstate(invalid="ignore"):
             error = np.sqrt(np.einsum("sii->si", covariance))
             small = np.all(np.abs(step) <= np.maximum(CONVERGED, _SETTLED * error), axis=1)
         lit = np.maximum.reduceat(flux, where) > 0
-        settled[stars] = small & lit & known
-        going[stars] = known & ~small
+        settled[stars] = small & lit & finite
+        going[stars] = finite & ~small
         if not going.any():
             break
     return qu, settled

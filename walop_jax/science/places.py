@@ -70,14 +70,14 @@ class DisagreeingPlace:
 
     def words(self) -> str:
         """The place in a sentence."""
-        more = [
+        details = [
             f"{c.name} {('brighter', 'fainter')[c.size < 0]} by {with_error(100 * abs(c.size), 100 * c.error)} %"
             for c in self.alike
         ]
         return (
             f"{self.stars} stars near X {self.x:+.3f}°, Y {self.y:+.3f}° (within {2 * self.size:.2g}°) disagree with "
-            f"the calibration together, {abs(self.sigma):.0f} σ: {some(more, 4, ' or ')} in the centre. Is there dust, "
-            "a ghost, a bright neighbour? Their errors were enlarged"
+            f"the calibration together, {abs(self.sigma):.0f} σ: {some(details, 4, ' or ')} in the centre. Is there "
+            "dust, a ghost, a bright neighbour? Their errors were enlarged"
         )
 
     def document(self) -> dict[str, Any]:
@@ -109,39 +109,39 @@ def places_of(
     `cameras` are names. `residual` is that of `stars` or what is left of it behind changes, `variance` that of the
     residuals of every star over that of its noise (None: `own_variance`).
     """
-    seen = _seen(
+    stars_seen = _seen(
         stars,
         stars.residual if residual is None else residual,
         own_variance(stars) if variance is None else variance,
     )
-    extent = max(float(np.abs([seen.x, seen.y]).max(initial=0.0)), 1e-9)
-    found: list[DisagreeingPlace] = []
-    there = np.ones(len(seen.x), bool)
-    while len(found) < _MOST and there.sum() > 1:
-        part = _Seen(*(values[there] for values in seen))
-        centre, sigma, trials = _strongest(part, extent)
+    extent = max(float(np.abs([stars_seen.x, stars_seen.y]).max(initial=0.0)), 1e-9)
+    places: list[DisagreeingPlace] = []
+    remaining = np.ones(len(stars_seen.x), bool)
+    while len(places) < _MOST and remaining.sum() > 1:
+        subset = _Seen(*(values[remaining] for values in stars_seen))
+        centre, sigma, trials = _strongest(subset, extent)
         if trials * 2.0 * special.ndtr(-abs(sigma)) >= alarm:
             break
-        place = _described(part, centre, sigma, cameras)
-        found.append(place)
-        there &= place.profile(seen.x, seen.y) == 0.0
-    return tuple(found)
+        place = _described(subset, centre, sigma, cameras)
+        places.append(place)
+        remaining &= place.profile(stars_seen.x, stars_seen.y) == 0.0
+    return tuple(places)
 
 
 def _seen(
     stars: StarResiduals, residual: Float[np.ndarray, "r k"], variance: Float[np.ndarray, " s"]
 ) -> _Seen:
     """z and α of the stars; rows of one star at different places are stars of their own."""
-    parts = []
+    columns = []
     extent = max(float(np.abs([stars.x, stars.y]).max(initial=0.0)), 1e-9)
     cell = np.round(np.stack([stars.x, stars.y], axis=1) / (_TOGETHER * extent)).astype(int)
-    for here, rows, part in stars.blocks():
-        key = np.concatenate([part.star[:, None], cell[rows]], axis=1)
+    for numbers, rows, subset in stars.blocks():
+        key = np.concatenate([subset.star[:, None], cell[rows]], axis=1)
         _, first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
         group = group.reshape(-1)
-        cameras = part.model.shape[1]
-        free, _ = part.projected(part.model[:, :, None] * np.eye(cameras))
-        along = np.einsum("rik,crk->ric", part.tangent, free, optimize=True)
+        cameras = subset.model.shape[1]
+        free, _ = subset.projected(subset.model[:, :, None] * np.eye(cameras))
+        along = np.einsum("rik,crk->ric", subset.tangent, free, optimize=True)
 
         def summed(
             values: np.ndarray, group: Int[np.ndarray, " r"] = group, first: Any = first
@@ -151,23 +151,25 @@ def _seen(
             return total
 
         score = summed(np.einsum("crk,rk->rc", free, residual[rows]))
-        square, taken = summed(np.einsum("crk,crk->rc", free, free)), summed(along)
-        own = part.star[first]
-        left = square - np.einsum("sic,sij,sjc->sc", taken, part.photon[own], taken, optimize=True)
-        sees = left > _BLIND * summed(part.model**2)
-        spread = variance[here][own][:, None]
-        root = np.sqrt(np.where(sees, left, 1.0) * spread)
-        parts.append(
+        square, projected = summed(np.einsum("crk,crk->rc", free, free)), summed(along)
+        of_star = subset.star[first]
+        chi2 = square - np.einsum(
+            "sic,sij,sjc->sc", projected, subset.photon[of_star], projected, optimize=True
+        )
+        sees = chi2 > _BLIND * summed(subset.model**2)
+        spread = variance[numbers][of_star][:, None]
+        root = np.sqrt(np.where(sees, chi2, 1.0) * spread)
+        columns.append(
             _Seen(
-                part.x[first],
-                part.y[first],
+                subset.x[first],
+                subset.y[first],
                 np.where(sees, score / root, 0.0),
                 np.where(sees, root / spread, 0.0),
                 summed(np.sum(residual[rows] ** 2, axis=1)) / spread[:, 0],
-                np.maximum(part.dof[own] / np.bincount(own)[own], 0.5),
+                np.maximum(subset.dof[of_star] / np.bincount(of_star)[of_star], 0.5),
             )
         )
-    return _Seen(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+    return _Seen(*(np.concatenate(values) for values in zip(*columns, strict=True)))
 
 
 def _strongest(seen: _Seen, extent: float) -> tuple[tuple[float, float, float], float, int]:
@@ -217,18 +219,18 @@ def _described(
     near = (
         DisagreeingPlace(centre[0], centre[1], _WIDER * centre[2], sigma, 0, ()).profile(seen.x, seen.y) > 0
     )
-    part = _Seen(*(values[near] for values in seen))
+    subset = _Seen(*(values[near] for values in seen))
     fits = []
     for k, name in enumerate(cameras):
-        x, y, size = _fitted(part, k, centre)
+        x, y, size = _fitted(subset, k, centre)
         place = DisagreeingPlace(x, y, size, sigma, 0, ())
-        share, error, gain = _share(part, k, place.profile(part.x, part.y))
+        share, error, gain = _share(subset, k, place.profile(subset.x, subset.y))
         fits.append((gain, place, CameraAtPlace(k, name, share, error)))
     fits.sort(key=lambda fit: -fit[0])
     best, place = fits[0][0], fits[0][1]
-    scatter = (part.chi2.sum() - best) / max(part.dof.sum() - 4.0, 1.0)
+    scatter = (subset.chi2.sum() - best) / max(subset.dof.sum() - 4.0, 1.0)
     alike = [camera for gain, _, camera in fits if gain > best - RIVAL * max(1.0, scatter)]
-    g = place.profile(part.x, part.y)
+    g = place.profile(subset.x, subset.y)
     return dataclasses.replace(place, stars=int((g > np.exp(-2.0)).sum()), alike=tuple(alike))
 
 
@@ -246,8 +248,8 @@ def _fitted(seen: _Seen, camera: int, centre: tuple[float, float, float]) -> tup
     bounds = [(-_WIDER, _WIDER)] * 2 + [(-1.0, np.log(_WIDER))]
     first = np.vstack([np.zeros(3), 0.5 * np.eye(3)])
     options = {"maxiter": 200, "xatol": 0.01, "fatol": 0.1, "initial_simplex": first}
-    found = optimize.minimize(misfit, np.zeros(3), method="Nelder-Mead", bounds=bounds, options=options)
-    return place(found.x)
+    solution = optimize.minimize(misfit, np.zeros(3), method="Nelder-Mead", bounds=bounds, options=options)
+    return place(solution.x)
 
 
 def _share(seen: _Seen, camera: int, g: Float[np.ndarray, " s"]) -> tuple[float, float, float]:

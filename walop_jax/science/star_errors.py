@@ -56,8 +56,8 @@ def joint_errors(vectors: Vectors, reference: Vectors, stars: Float[np.ndarray, 
     p, n, cameras = *counts.shape[:2], counts.shape[-1]
     rows = counts.reshape(-1, cameras)
     star = np.repeat(np.arange(p * n), len(rows) // (p * n))
-    found = estimate(np.repeat(vectors, n, axis=0).reshape(-1, cameras, 3), rows, np.sqrt(rows), star)
-    return star_errors(found.qu.reshape(p, n, 2), stars)
+    stokes = estimate(np.repeat(vectors, n, axis=0).reshape(-1, cameras, 3), rows, np.sqrt(rows), star)
+    return star_errors(stokes.qu.reshape(p, n, 2), stars)
 
 
 def promised_errors(
@@ -71,14 +71,14 @@ def promised_errors(
     vectors = analysis.coloured(setting, x, y)
     counts = _ELECTRONS * transmitted(vectors, stars)
     n, rows = len(stars), counts.reshape(-1, counts.shape[-1])
-    seen, star = np.repeat(vectors, n, axis=0), np.arange(len(rows))
-    found = estimate(seen, rows, np.sqrt(rows), star, analysis.instrument.cameras)
+    repeated, star = np.repeat(vectors, n, axis=0), np.arange(len(rows))
+    stokes = estimate(repeated, rows, np.sqrt(rows), star, analysis.instrument.cameras)
     local = analysis.derivatives(setting, x, y, np.full(len(x), np.nan))
-    gain = found.gain.reshape(len(x), n, 2, -1)
+    gain = stokes.gain.reshape(len(x), n, 2, -1)
     s = np.concatenate([np.ones((n, 1)), stars], axis=1)
     total = np.zeros((len(x), 3))
     for k in range(n):
-        plain, throughput = (gain[:, k] @ np.einsum("s,pksf->pkf", s[k], part) for part in local)
+        plain, throughput = (gain[:, k] @ np.einsum("s,pksf->pkf", s[k], slopes) for slopes in local)
         root = analysis.to_parameters(plain, throughput, x, y) @ analysis.root
         radial = np.einsum("c,pck->pk", stars[k] / np.hypot(*stars[k]), root)
         total += np.stack([*np.sum(root**2, axis=2).T, np.sum(radial**2, axis=1)], axis=1)
@@ -99,9 +99,11 @@ def plate_errors(
     r, n = len(settings), len(x)
     rows = np.stack([analysis.exact(s, x, y)[:, 0] for s in settings], axis=1)
     counts = _ELECTRONS * rows[..., 0]
-    each, star = counts.reshape(n * r, -1), np.repeat(np.arange(n), r)
-    found = estimate(rows.reshape(n * r, -1, 3), each, np.sqrt(each), star, analysis.instrument.cameras)
-    worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(found.photon, nan=np.inf))[:, 1])
+    expected, star = counts.reshape(n * r, -1), np.repeat(np.arange(n), r)
+    stokes = estimate(
+        rows.reshape(n * r, -1, 3), expected, np.sqrt(expected), star, analysis.instrument.cameras
+    )
+    worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(stokes.photon, nan=np.inf))[:, 1])
     # q from a normalised difference with half of the electrons: σ² = 2 / all electrons.
     return worst / np.sqrt(2.0 / counts.sum(axis=(1, 2)))
 
@@ -161,10 +163,10 @@ def truth_vectors(joint: Vectors, matrix: Float[np.ndarray, "p m"]) -> Vectors:
 
     a± = ½ (S ± S₀ m) with S the sum of a pair of cameras, which follow each other; an error of S is second order in p.
     """
-    found = np.empty_like(joint)
+    vectors = np.empty_like(joint)
     rows = matrix.reshape(len(matrix), -1, 3).swapaxes(0, 1)
     for (i, j), row in zip(_two_by_two(joint), rows, strict=True):
         total = joint[:, i] + joint[:, j]
         difference = total[:, :1] * row
-        found[:, i], found[:, j] = 0.5 * (total + difference), 0.5 * (total - difference)
-    return found
+        vectors[:, i], vectors[:, j] = 0.5 * (total + difference), 0.5 * (total - difference)
+    return vectors

@@ -136,8 +136,8 @@ class StarResiduals:
         for start, stop in zip(cuts, [*cuts[1:], len(first)], strict=True):
             if stop > start:
                 stars = slice(int(start), int(stop))
-                part = self.part(stars)
-                yield stars, slice(first[start], first[start] + len(part)), part
+                subset = self.part(stars)
+                yield stars, slice(first[start], first[start] + len(subset)), subset
 
     def parameters(self) -> Float[np.ndarray, "r k n"]:
         """Derivatives of the model over σ to all parameters: plain ones, then the throughput series."""
@@ -165,7 +165,7 @@ class StarResiduals:
     ) -> Float[np.ndarray, "r k"]:
         """Residuals behind a change of the counts over σ, which `change` gives for some stars and their rows."""
         return np.concatenate(
-            [residual[rows] - part.left(change(part, rows)) for _, rows, part in self.blocks()]
+            [residual[rows] - subset.left(change(subset, rows)) for _, rows, subset in self.blocks()]
         )
 
 
@@ -174,7 +174,7 @@ def own_variance(stars: StarResiduals) -> Float[np.ndarray, " s"]:
     spread = np.zeros(len(stars.photon))
     columns = [stars.colour[..., n] for n in range(stars.colour.shape[-1])] if stars.colour.any() else []
     if stars.structure > 0:
-        columns += [stars.structure * stars.model * each for each in np.eye(stars.model.shape[1])]
+        columns += [stars.structure * stars.model * unit for unit in np.eye(stars.model.shape[1])]
     for column in columns:
         spread += stars.chi2(stars.left(column))
     # Gains of the cameras make fewer independent residuals than a star of several rows has.
@@ -196,22 +196,22 @@ def normal_matrix(
 
     `residual` is that of `stars` or what is left of it behind changes; `share` is κ.
     """
-    matrix, score, whole = np.zeros((0, 0)), np.zeros(0), np.zeros(0)
-    for here, rows, part in stars.blocks():
-        values = columns(part, rows)
-        free, along = part.projected(values)
+    matrix, score, diagonal = np.zeros((0, 0)), np.zeros(0), np.zeros(0)
+    for numbers, rows, subset in stars.blocks():
+        values = columns(subset, rows)
+        free, along = subset.projected(values)
         count = len(free)
         if not score.size:
-            matrix, score, whole = np.zeros((count, count)), np.zeros(count), np.zeros(count)
-        w, k = weight[here], share[here]
+            matrix, score, diagonal = np.zeros((count, count)), np.zeros(count), np.zeros(count)
+        w, k = weight[numbers], share[numbers]
         scaled = np.sqrt(w * k)
-        flat = (free * scaled[part.star, None]).reshape(count, -1)
-        half = np.linalg.cholesky(part.photon).swapaxes(1, 2) @ along * scaled[:, None, None]
-        taken = half.reshape(-1, count)
-        matrix += flat @ flat.T - taken.T @ taken
-        score += values.reshape(-1, count).T @ (residual[rows] * w[part.star, None]).ravel()
-        whole += np.einsum("rkc,r->c", values**2, scaled[part.star] ** 2)
-    rounding = np.diag(matrix) <= ROUNDING * whole
+        flat = (free * scaled[subset.star, None]).reshape(count, -1)
+        half = np.linalg.cholesky(subset.photon).swapaxes(1, 2) @ along * scaled[:, None, None]
+        projected = half.reshape(-1, count)
+        matrix += flat @ flat.T - projected.T @ projected
+        score += values.reshape(-1, count).T @ (residual[rows] * w[subset.star, None]).ravel()
+        diagonal += np.einsum("rkc,r->c", values**2, scaled[subset.star] ** 2)
+    rounding = np.diag(matrix) <= ROUNDING * diagonal
     matrix[rounding], matrix[:, rounding], score[rounding] = 0.0, 0.0, 0.0
     return matrix, score
 
@@ -245,36 +245,36 @@ def noise_scale(chi2: Float[np.ndarray, " s"], dof: Float[np.ndarray, " s"]) -> 
     From the median, then from all stars within the cut, until these stay the same. Stars without degrees of freedom
     are not kept.
     """
-    known, of = np.unique(dof, return_inverse=True)
-    known, asked = np.maximum(known, 1e-12), np.isfinite(chi2) & (dof > 0)
-    cut = special.chdtri(known, TRIMMED)
-    inside = special.chdtr(known + 2.0, cut)
-    mean = known * inside / (1.0 - TRIMMED)
-    if not asked.any():
-        return Scale(1.0, 0.0, asked, inside[of])
-    scale = float(np.median(chi2[asked] / special.chdtri(known, 0.5)[of][asked]))
-    kept = asked
+    values, of = np.unique(dof, return_inverse=True)
+    values, usable = np.maximum(values, 1e-12), np.isfinite(chi2) & (dof > 0)
+    cut = special.chdtri(values, TRIMMED)
+    inside = special.chdtr(values + 2.0, cut)
+    mean = values * inside / (1.0 - TRIMMED)
+    if not usable.any():
+        return Scale(1.0, 0.0, usable, inside[of])
+    scale = float(np.median(chi2[usable] / special.chdtri(values, 0.5)[of][usable]))
+    selected = usable
     for _ in range(_ROUNDS):
-        kept = asked & (chi2 <= cut[of] * scale)
-        before, scale = scale, float(chi2[kept].sum() / max(mean[of][kept].sum(), 1e-300))
+        selected = usable & (chi2 <= cut[of] * scale)
+        before, scale = scale, float(chi2[selected].sum() / max(mean[of][selected].sum(), 1e-300))
         if scale <= 0 or abs(scale - before) < 1e-9 * before:
             break
     density = np.exp(
-        special.xlogy(known / 2, cut) - cut / 2 - special.xlogy(known / 2, 2) - special.gammaln(known / 2)
+        special.xlogy(values / 2, cut) - cut / 2 - special.xlogy(values / 2, 2) - special.gammaln(values / 2)
     )
-    slope = known * inside - density * (cut - mean)  # cut · probability density = `density`
-    fourth = known * (known + 2.0) * special.chdtr(known + 4.0, cut)
-    variance = fourth - 2.0 * mean * known * inside + mean**2 * (1.0 - TRIMMED)
-    number = np.bincount(of[kept], minlength=len(known))
+    slope = values * inside - density * (cut - mean)  # cut · probability density = `density`
+    fourth = values * (values + 2.0) * special.chdtr(values + 4.0, cut)
+    variance = fourth - 2.0 * mean * values * inside + mean**2 * (1.0 - TRIMMED)
+    number = np.bincount(of[selected], minlength=len(values))
     worth = 2.0 * float(number @ slope) ** 2 / max(float(number @ variance), 1e-300)
-    return Scale(scale, worth, kept, inside[of])
+    return Scale(scale, worth, selected, inside[of])
 
 
 def beside_fitted(scale: Scale, dof: Float[np.ndarray, " s"], fitted: float) -> Scale:
     """The scale of χ² from which some fitted numbers have taken their part: of the degrees of freedom that are left."""
     number = float(dof[scale.kept].sum())
-    left = max(1.0 - fitted / max(number, 1.0), 0.0)
-    return scale._replace(value=scale.value / max(left, 1e-12), worth=scale.worth * left)
+    share = max(1.0 - fitted / max(number, 1.0), 0.0)
+    return scale._replace(value=scale.value / max(share, 1e-12), worth=scale.worth * share)
 
 
 def of_few(scale: Scale, sigma: float) -> float:
@@ -307,18 +307,18 @@ def shared_by_rows(
     if not several.any():
         return None
     value, dof = np.full(len(several), np.nan), np.zeros(len(several))
-    for here, rows, part in stars.blocks():
-        cameras = part.model.shape[1]
-        same = np.eye(cameras) * (part.root > 0)[:, :, None]
-        free, along = part.projected(same)
-        each = np.einsum("arc,brc->rab", free, free, optimize=True)
-        left = np.add.reduceat(each, part.first) - np.einsum(
-            "sia,sij,sjb->sab", along, part.photon, along, optimize=True
+    for numbers, rows, subset in stars.blocks():
+        cameras = subset.model.shape[1]
+        same = np.eye(cameras) * (subset.root > 0)[:, :, None]
+        free, along = subset.projected(same)
+        products = np.einsum("arc,brc->rab", free, free, optimize=True)
+        remaining = np.add.reduceat(products, subset.first) - np.einsum(
+            "sia,sij,sjb->sab", along, subset.photon, along, optimize=True
         )
-        total = np.add.reduceat(residual[rows], part.first)
-        trace, square = np.trace(left, axis1=1, axis2=2), np.sum(left**2, axis=(1, 2))
-        good = several[here] & (trace > 1e-9 * part.rows)
+        total = np.add.reduceat(residual[rows], subset.first)
+        trace, square = np.trace(remaining, axis1=1, axis2=2), np.sum(remaining**2, axis=(1, 2))
+        good = several[numbers] & (trace > 1e-9 * subset.rows)
         safe = np.where(good, square, 1.0)
-        dof[here] = np.where(good, trace**2 / safe, 0.0)
-        value[here] = np.where(good, np.sum(total**2, axis=1) * trace / safe / variance[here], np.nan)
+        dof[numbers] = np.where(good, trace**2 / safe, 0.0)
+        value[numbers] = np.where(good, np.sum(total**2, axis=1) * trace / safe / variance[numbers], np.nan)
     return noise_scale(value, np.round(dof, 2))

@@ -102,34 +102,30 @@ def watch(
     """
     catalogues, remarks = dated(catalogues, names)
     vectors = AnalysisVectors(with_rivals(calibration))
-    total, parts = sum(map(len, catalogues)), []
+    total, batches = sum(map(len, catalogues)), []
     for catalogue in catalogues:
         share = -(-rows * len(catalogue) // total)
-        parts += residuals_of(vectors, catalogue, share, force=force)
-    if not parts:
+        batches += residuals_of(vectors, catalogue, share, force=force)
+    if not batches:
         raise DataError("N: no star has a camera to spare beside flux, q and u; add rows at other settings")
-    stars = StarResiduals.joined(parts)
-    found = Watching(stars, vectors).watch()
-    return dataclasses.replace(found, remarks=(*remarks, *found.remarks))
+    stars = StarResiduals.joined(batches)
+    result = Watching(stars, vectors).watch()
+    return dataclasses.replace(result, remarks=(*remarks, *result.remarks))
 
 
 def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[Catalogue], tuple[str, ...]]:
     """Catalogues with a time in every row, the number of the catalogue where none has any; what was left out."""
-    known = [np.isfinite(catalogue.time) for catalogue in catalogues]
-    if not any(map(np.any, known)):
+    has_time = [np.isfinite(catalogue.time) for catalogue in catalogues]
+    if not any(map(np.any, has_time)):
         numbered = enumerate(catalogues)
         return [dataclasses.replace(c, time=np.full(len(c), float(n))) for n, c in numbered], ()
     remarks = []
-    for number, timed in enumerate(known):
+    for number, timed in enumerate(has_time):
         if not timed.all():
             name = names[number] if number < len(names) else f"catalogue {number + 1}"
-            rows = (
-                "no row has a time"
-                if not timed.any()
-                else f"{np.sum(~timed)} of {len(timed)} rows have no time"
-            )
+            rows = f"{np.sum(~timed) if timed.any() else 'all'} of {len(timed)} rows have no time"
             remarks.append(f"{name}, MJD: {rows}, others do: left out, as nobody knows when they were taken")
-    return [c.of_rows(timed) for c, timed in zip(catalogues, known, strict=True) if timed.any()], tuple(
+    return [c.of_rows(timed) for c, timed in zip(catalogues, has_time, strict=True) if timed.any()], tuple(
         remarks
     )
 
@@ -194,8 +190,8 @@ class Watching:
         self.tests = len(self.histories) * self.readings.asked
         # Half of the false alarms are for spots: as many as there are would else take from all others.
         self.alarm = threshold(0.5 * ALARM / self.tests)
-        asked = groups * len(self.readings.of_cameras) * len(self.spots)
-        self.alarm_of_spots = threshold(0.5 * ALARM / max(asked, 1))
+        questions = groups * len(self.readings.of_cameras) * len(self.spots)
+        self.alarm_of_spots = threshold(0.5 * ALARM / max(questions, 1))
         # Stars of a single group have a scale with the others of it; those of several groups together.
         low, high = (op.reduceat(self.group, stars.first) for op in (np.minimum, np.maximum))
         self.pool = np.where(low == high, low, groups)
@@ -210,16 +206,16 @@ class Watching:
         A change that stars of a night have in common is no noise: where χ² is not what N_ERR says, weights come from
         the scatter about the gains that fit each group best, if there are stars enough to know it.
         """
-        weight, share, whole, off = self._scaled(residual, np.zeros(len(self.time)))
+        weight, share, scale, off = self._scaled(residual, np.zeros(len(self.time)))
         # The gains, then their gradients as well if the scatter about the gains is not that of noise.
         for kinds in (1, 3):
             for _ in range(ABOUT_GAINS if off else 0):
-                left, fitted = self._behind_gains(residual, weight, share, kinds * len(self.cameras))
-                found = self._scaled(left, fitted)
-                if found[2].worth < FEW:
-                    return weight, share, whole
-                weight, share, _, off = found
-        return weight, share, whole
+                remaining, fitted = self._behind_gains(residual, weight, share, kinds * len(self.cameras))
+                rescaled = self._scaled(remaining, fitted)
+                if rescaled[2].worth < FEW:
+                    return weight, share, scale
+                weight, share, _, off = rescaled
+        return weight, share, scale
 
     def _scaled(
         self, residual: Float[np.ndarray, "r k"], fitted: Float[np.ndarray, " g"]
@@ -228,24 +224,23 @@ class Watching:
         chi2 = self.stars.chi2(residual) / self.variance
         dof, alarm = self.stars.dof.astype(float), ALARM / (len(self.time) + 1)
         least = 1.0 if np.median(self.variance) > CROWDED else 0.0
-        whole = beside_fitted(noise_scale(chi2, dof), dof, float(fitted.sum()))
-        off = is_off(whole, alarm)
-        common = max(whole.value, least) if off else 1.0
+        overall = beside_fitted(noise_scale(chi2, dof), dof, float(fitted.sum()))
+        off = is_off(overall, alarm)
+        common = max(overall.value, least) if off else 1.0
         if fitted.any():  # N_ERR was in doubt ahead of the gains
-            common = max(whole.value, 1.0) * (of_few(whole, self.alarm) if off else 1.0)
-        weight, share, several = np.where(whole.kept, 1.0 / common, 0.0), whole.share.copy(), off
+            common = max(overall.value, 1.0) * (of_few(overall, self.alarm) if off else 1.0)
+        weight, share, several = np.where(overall.kept, 1.0 / common, 0.0), overall.share.copy(), off
         for pool in np.unique(self.pool):
-            here = np.flatnonzero(self.pool == pool)
-            if len(here) < FEW:
+            members = np.flatnonzero(self.pool == pool)
+            if len(members) < FEW:
                 continue
-            taken = fitted[pool] if pool < len(fitted) else fitted.sum()
-            own = beside_fitted(noise_scale(chi2[here], dof[here]), dof[here], float(taken))
-            mine, several = is_off(own, alarm), several or is_off(own, alarm)
-            variance = (
-                max(own.value, least) * (of_few(own, self.alarm) if fitted.any() else 1.0) if mine else common
-            )
-            weight[here], share[here] = np.where(own.kept, 1.0 / variance, 0.0), own.share
-        return weight / self.variance, share, whole, several
+            parameters = fitted[pool] if pool < len(fitted) else fitted.sum()
+            local = beside_fitted(noise_scale(chi2[members], dof[members]), dof[members], float(parameters))
+            mine, several = is_off(local, alarm), several or is_off(local, alarm)
+            larger = of_few(local, self.alarm) if fitted.any() else 1.0
+            variance = max(local.value, least) * larger if mine else common
+            weight[members], share[members] = np.where(local.kept, 1.0 / variance, 0.0), local.share
+        return weight / self.variance, share, overall, several
 
     def _behind_gains(
         self,
@@ -278,43 +273,43 @@ class Watching:
     ) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
         """Q and g of `columns` in all groups (group, column), errors of the calibration eliminated."""
         stars, count, groups = self.stars, self.readings.columns_count, len(self.time)
-        known = self.root.shape[1] + 2
+        nuisances = self.root.shape[1] + 2
         gains = np.zeros((groups * count, groups * count))
-        cross, nuisance = np.zeros((groups * count, known)), np.eye(known)
-        score, pull = np.zeros(groups * count), np.zeros(known)
-        whole = np.zeros((groups, count))
-        for here, rows, part in stars.blocks():
-            group, w, k = self.group[rows], weight[here], share[here]
-            values = np.concatenate([self.readings.columns(part), self._errors(part)], axis=-1)
-            np.add.at(whole, group, np.sum(values[..., :count] ** 2, axis=1) * (w * k)[part.star, None])
-            free, along = part.projected(values)
-            heavy = np.sqrt(w * k)[part.star]
+        cross, nuisance = np.zeros((groups * count, nuisances)), np.eye(nuisances)
+        score, pull = np.zeros(groups * count), np.zeros(nuisances)
+        diagonal = np.zeros((groups, count))
+        for numbers, rows, subset in stars.blocks():
+            group, w, k = self.group[rows], weight[numbers], share[numbers]
+            values = np.concatenate([self.readings.columns(subset), self._errors(subset)], axis=-1)
+            np.add.at(diagonal, group, np.sum(values[..., :count] ** 2, axis=1) * (w * k)[subset.star, None])
+            free, along = subset.projected(values)
+            heavy = np.sqrt(w * k)[subset.star]
             free = free * heavy[:, None]
-            own, other = free[:count], free[count:].reshape(known, -1)
-            each = np.einsum("arc,brc->rab", own, own, optimize=True)
+            shapes, nuisance_columns = free[:count], free[count:].reshape(nuisances, -1)
+            products = np.einsum("arc,brc->rab", shapes, shapes, optimize=True)
             blocks = gains.reshape(groups, count, groups, count)
-            np.add.at(blocks, (group, slice(None), group), each)  # pyright: ignore[reportArgumentType]
-            mixed = np.einsum("arc,nrc->ran", own, free[count:], optimize=True)
-            np.add.at(cross.reshape(groups, count, known), group, mixed)
-            nuisance += other @ other.T
+            np.add.at(blocks, (group, slice(None), group), products)  # pyright: ignore[reportArgumentType]
+            mixed = np.einsum("arc,nrc->ran", shapes, free[count:], optimize=True)
+            np.add.at(cross.reshape(groups, count, nuisances), group, mixed)
+            nuisance += nuisance_columns @ nuisance_columns.T
             # What the stars take by their q and u: sums over the rows of a star in each group.
-            half = np.linalg.cholesky(part.photon).swapaxes(1, 2)
-            row = half[part.star] @ np.einsum("rik,ark->ria", part.tangent, own, optimize=True)
-            pair, where = np.unique(part.star * groups + group, return_inverse=True)
+            half = np.linalg.cholesky(subset.photon).swapaxes(1, 2)
+            row = half[subset.star] @ np.einsum("rik,ark->ria", subset.tangent, shapes, optimize=True)
+            pair, where = np.unique(subset.star * groups + group, return_inverse=True)
             sums = np.zeros((len(pair), *row.shape[1:]))
             np.add.at(sums, where.reshape(-1), row)
             of_star, of_group = pair // groups, pair % groups
             errors = (half @ along[..., count:]) * np.sqrt(w * k)[:, None, None]
-            flat = errors.reshape(-1, known)
+            flat = errors.reshape(-1, nuisances)
             nuisance -= flat.T @ flat
-            taken = np.einsum("pia,pin->pan", sums, errors[of_star], optimize=True)
-            np.subtract.at(cross.reshape(groups, count, known), of_group, taken)
+            projected = np.einsum("pia,pin->pan", sums, errors[of_star], optimize=True)
+            np.subtract.at(cross.reshape(groups, count, nuisances), of_group, projected)
             self._subtract(blocks, sums, of_star, of_group)
-            normal = residual[rows] * w[part.star, None]
+            normal = residual[rows] * w[subset.star, None]
             slopes = np.einsum("rkc,rk->rc", values, normal)
             np.add.at(score.reshape(groups, count), group, slopes[:, :count])
             pull += slopes[:, count:].sum(axis=0)
-        rounding = np.diag(gains) <= ROUNDING * whole.ravel()
+        rounding = np.diag(gains) <= ROUNDING * diagonal.ravel()
         gains[rounding], gains[:, rounding], cross[rounding], score[rounding] = 0.0, 0.0, 0.0, 0.0
         full = np.block([[gains, cross], [cross.T, nuisance]])
         return eliminated(full, np.concatenate([score, pull]), groups * count)
@@ -329,8 +324,8 @@ class Watching:
         """Take what the stars take from the matrix: between all groups that a star is in."""
         pairs = np.bincount(of_star)
         alone = pairs[of_star] == 1
-        own = np.einsum("pia,pib->pab", sums[alone], sums[alone])
-        np.subtract.at(blocks, (of_group[alone], slice(None), of_group[alone]), own)  # pyright: ignore[reportArgumentType]
+        products = np.einsum("pia,pib->pab", sums[alone], sums[alone])
+        np.subtract.at(blocks, (of_group[alone], slice(None), of_group[alone]), products)  # pyright: ignore[reportArgumentType]
         groups, count = blocks.shape[:2]
         several = np.flatnonzero(~alone)
         numbers, place = np.unique(of_star[several], return_inverse=True)
@@ -380,13 +375,13 @@ class Watching:
     def watch(self) -> Watch:
         """Changes, the strongest first, until nothing is left."""
         residual, changes = self.stars.residual, []
-        weight, share, whole = self.weights(residual)
+        weight, share, scale = self.weights(residual)
         matrix, score = self.scan(residual, weight, share)
         while len(changes) < _MOST_CHANGES:
-            found = self.answers(matrix, score)
+            answers = self.answers(matrix, score)
             ways = [self.spotted(residual, weight, share)]
-            if np.abs(found.size / found.error).max() > self.alarm:
-                ways.append(self.settled(residual, found))
+            if np.abs(answers.size / answers.error).max() > self.alarm:
+                ways.append(self.settled(residual, answers))
             if (chosen := self._likeliest([way for way in ways if way is not None])) is None:
                 break
             change, residual = chosen
@@ -394,10 +389,10 @@ class Watching:
             if change.best.kind == "spot":
                 x, y, radius, edge = change.best.place
                 self.spoilt |= profile(self.spots.x, self.spots.y, (x, y, 1.5 * radius, edge)) > 0
-            weight, share, whole = self.weights(residual)
+            weight, share, scale = self.weights(residual)
             matrix, score = self.scan(residual, weight, share)
-        remarks = self.alone(residual, weight, whole)
-        return dataclasses.replace(self.told(changes, matrix, score, whole), remarks=remarks)
+        remarks = self.alone(residual, weight, scale)
+        return dataclasses.replace(self.told(changes, matrix, score, scale), remarks=remarks)
 
     def alone(
         self, residual: Float[np.ndarray, "r k"], weight: Float[np.ndarray, " s"], whole: Scale
@@ -419,34 +414,34 @@ class Watching:
         if len(ways) < 2:
             return ways[0] if ways else None
         dof = self.stars.dof.astype(float)
-        each = [self.stars.chi2(left) / self.variance for _, left in ways]
-        scale = max(1.0, min(noise_scale(chi2, dof).value for chi2 in each))
+        costs = [self.stars.chi2(remaining) / self.variance for _, remaining in ways]
+        scale = max(1.0, min(noise_scale(chi2, dof).value for chi2 in costs))
         cut = special.chdtri(np.maximum(dof, 1e-12), TRIMMED)
-        cost = [float(np.minimum(chi2 / scale, cut)[dof > 0].sum()) for chi2 in each]
+        cost = [float(np.minimum(chi2 / scale, cut)[dof > 0].sum()) for chi2 in costs]
         near = abs(cost[1] - cost[0]) < RIVAL and ways[1][0].best.kind != UNNAMED
         # The simpler one, if both are as good: spots are the first.
-        (change, left), (other, _) = ways[::-1] if near else (ways[n] for n in np.argsort(cost))
+        (change, remaining), (alternative, _) = ways[::-1] if near else (ways[n] for n in np.argsort(cost))
         if near:
-            change = dataclasses.replace(change, alike=change.alike + other.alike)
-        return change, left
+            change = dataclasses.replace(change, alike=change.alike + alternative.alike)
+        return change, remaining
 
     def answers(self, matrix: Any, score: Any) -> Answers:
         """Every history of every reading, each alone."""
         return self.readings.answers(*self._by_group(matrix, score), self.shapes)
 
-    def settled(self, residual: Float[np.ndarray, "r k"], found: Answers) -> Settled:
+    def settled(self, residual: Float[np.ndarray, "r k"], answers: Answers) -> Settled:
         """A change with its rivals, and what is left behind it.
 
         Histories compared are the best of each kind and camera and their neighbours. The fit is repeated with the
         stars that it keeps.
         """
         best: Suspect | None = None
-        total, left, alike = 0.0, residual, []
+        total, remaining, alike = 0.0, residual, []
         for _ in range(_ROUNDS):
             if best is not None:
-                weight, share, _ = self.weights(left)
-                found = self.answers(*self.scan(self.without(left, best, -total), weight, share))
-            ranked = self.suspects(found)
+                weight, share, _ = self.weights(remaining)
+                answers = self.answers(*self.scan(self.without(remaining, best, -total), weight, share))
+            ranked = self.suspects(answers)
             if abs(ranked[0].sigma) < self.alarm or not self.readings.possible(ranked[0]):
                 ranked.sort(key=lambda entry: -abs(entry.sigma))
             before, best = best, ranked[0]
@@ -457,14 +452,14 @@ class Watching:
             ]
             moved = abs(best.size - total) / best.error
             total = best.size
-            left = self.without(residual, best, total)
+            remaining = self.without(residual, best, total)
             if before is not None and before.thing == best.thing and moved < _SETTLED:
                 break
         assert best is not None
         if not self.readings.possible(best):
             best = best._replace(name=UNNAMED, unit="", kind=UNNAMED)
             alike = [best]
-        return self._dated(best, alike), left
+        return self._dated(best, alike), remaining
 
     def _dated(self, best: Suspect, alike: list[Suspect]) -> WatchedChange:
         began = self.time[[entry.history.start for entry in alike]]
@@ -481,9 +476,11 @@ class Watching:
         # Stars that lie off may be those of the spot.
         common = np.zeros(len(self.time) + 1)
         np.maximum.at(common, self.pool, weight * self.variance)
-        every, members = common[self.pool] / self.variance, self.readings.members
+        variances, members = common[self.pool] / self.variance, self.readings.members
         strongest: tuple[SpotFound, int, Any, Any] | None = None
-        for start, (z, root) in enumerate(of_stars(self.stars, self.group, members, residual, every, share)):
+        for start, (z, root) in enumerate(
+            of_stars(self.stars, self.group, members, residual, variances, share)
+        ):
             z[self.spoilt] = 0.0
             spot = self.spots.strongest(z)
             if spot is not None and spot.strength > max(
@@ -504,12 +501,12 @@ class Watching:
             "spot",
             place,
         )
-        ranked, weight = [best], np.where(described, every, weight)
+        ranked, weight = [best], np.where(described, variances, weight)
         for _ in range(2):  # which cameras, and from when on
             best = ranked[0]
-            asked = [best._replace(name=reading.name) for reading in self.readings.of_cameras]
-            asked += [best._replace(history=History("step", g)) for g in range(len(self.time))]
-            if not (ranked := self._sized(residual, asked, weight, share)):
+            questions = [best._replace(name=reading.name) for reading in self.readings.of_cameras]
+            questions += [best._replace(history=History("step", g)) for g in range(len(self.time))]
+            if not (ranked := self._sized(residual, questions, weight, share)):
                 return None
         best = ranked[0]
         if abs(best.sigma) < self.alarm_of_spots or not self.readings.possible(best):
@@ -534,16 +531,16 @@ class Watching:
             return np.concatenate([np.stack(steps, axis=-1), self._errors(part)], axis=-1)
 
         matrix, score = normal_matrix(self.stars, residual, columns, weight, share)
-        count, whole = len(asked), np.diag(matrix)
+        count, diagonal = len(asked), np.diag(matrix)
         matrix = matrix + np.diag((np.arange(len(matrix)) >= count).astype(float))
-        left, pull = eliminated(matrix, score, count)
-        known = np.diag(left)
-        found = [
+        remaining, pull = eliminated(matrix, score, count)
+        information = np.diag(remaining)
+        sizes = [
             entry._replace(size=float(s / i), error=float(i**-0.5))
-            for entry, s, i, most in zip(asked, pull, known, whole, strict=False)
-            if i > ROUNDING * most > 0
+            for entry, s, i, full in zip(asked, pull, information, diagonal, strict=False)
+            if i > ROUNDING * full > 0
         ]
-        return sorted(found, key=lambda entry: -abs(entry.sigma))
+        return sorted(sizes, key=lambda entry: -abs(entry.sigma))
 
     def near(self, z: Float[np.ndarray, "h c"]) -> list[int]:
         """The best history of each kind, whatever has changed, and its neighbours in time."""
@@ -570,13 +567,13 @@ class Watching:
         gain, error, smallest = (np.full((groups, cameras), np.nan) for _ in range(3))
         steps = np.tril(np.ones((groups, groups)))  # group, start
         for k in range(cameras):
-            own = np.diag(blocks[:, k, :, k])
-            gain[:, k] = slopes[:, k] / np.where(own > 0, own, np.inf)
+            variances = np.diag(blocks[:, k, :, k])
+            gain[:, k] = slopes[:, k] / np.where(variances > 0, variances, np.inf)
             for change in changes:
                 may = [e for e in change.alike if e.of_gain and self.cameras[k] in e.members]
                 mine = min(may, key=lambda entry: len(entry.name), default=None)
                 gain[:, k] += 0.0 if mine is None else mine.size * mine.history.over(self.time)
-            error[:, k] = np.where(own > 0, own, np.nan) ** -0.5
+            error[:, k] = np.where(variances > 0, variances, np.nan) ** -0.5
             information = np.einsum("gh,gf,fh->h", steps, blocks[:, k, :, k], steps, optimize=True)
             smallest[:, k] = (self.alarm + SEEN) * np.where(information > 0, information, np.nan) ** -0.5
         chi2 = self.stars.chi2(self.stars.residual)

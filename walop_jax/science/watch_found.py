@@ -109,11 +109,11 @@ class WatchedChange:
         when = how[self.best.history.kind].format(date)
         spread = f"; it began between {ends[0]} and {ends[1]}" if ends[0] != ends[1] else ""
         significance = f"({abs(self.best.sigma):.0f} σ{spread})"
-        others = {e.thing[:2]: e for e in self.alike if e.thing[:2] != self.best.thing[:2]}
-        if not others:
+        rivals = {e.thing[:2]: e for e in self.alike if e.thing[:2] != self.best.thing[:2]}
+        if not rivals:
             return f"{_words(self.best)} {when} {significance}"
-        told = some([_words(entry) for entry in (self.best, *others.values())], 5, " or ")
-        return f"{when} {significance}, one of these, which the stars cannot tell apart: {told}"
+        listed = some([_words(entry) for entry in (self.best, *rivals.values())], 5, " or ")
+        return f"{when} {significance}, one of these, which the stars cannot tell apart: {listed}"
 
 
 def _words(entry: Suspect) -> str:
@@ -161,11 +161,11 @@ class Watch(Displayed):
     @property
     def warnings(self) -> tuple[str, ...]:
         """A sentence for every change, and one if N_ERR is not what the counts scatter by."""
-        said = (*(change.words() for change in self.changes), *self.remarks)
+        texts = (*(change.words() for change in self.changes), *self.remarks)
         if 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS:
-            return said
+            return texts
         return (
-            *said,
+            *texts,
             f"χ²/dof of the stars is {self.noise:.3g}: N_ERR was multiplied by {np.sqrt(self.noise):.3g}",
         )
 
@@ -176,7 +176,7 @@ class Watch(Displayed):
             start = float(self.time[entry.history.start])
             return entry._asdict() | {"history": entry.history.kind, "start": start, "sigma": entry.sigma}
 
-        found = [
+        entries = [
             {
                 "camera": c.camera,
                 "time": c.time,
@@ -199,7 +199,7 @@ class Watch(Displayed):
         ]
         return {
             "holds": self.holds,
-            "changes": found,
+            "changes": entries,
             "smallest_step_seen": float(np.min(self.smallest)),
             "chi2_per_dof": self.noise,
             "tests": self.tests,
@@ -240,7 +240,7 @@ class Watch(Displayed):
             )
             for g in range(len(self.time))
         )
-        seen = two_digits(percent * float(np.min(self.smallest)))
+        smallest = two_digits(percent * float(np.min(self.smallest)))
         return Display(
             title="The calibration holds"
             if self.holds
@@ -249,7 +249,7 @@ class Watch(Displayed):
             else "The stars CANNOT SAY whether the calibration holds",
             facts=(
                 ("exposure groups", f"{len(self.time)}"),
-                ("smallest step seen", f"{seen} % of one camera, in 99 % of cases"),
+                ("smallest step seen", f"{smallest} % of one camera, in 99 % of cases"),
             ),
             head=("time", ">stars", ">χ²/dof", *(f">{name} %" for name in self.cameras), ">seen %"),
             rows=rows,

@@ -113,7 +113,9 @@ class Readings:
         return abs(change.size) <= (1.0 if change.kind == "spot" else self._of(change).widest)
 
     def _of(self, change: Suspect) -> Reading:
-        return next(one for one in self.listed if (one.kind, one.name) == (change.kind, change.name))
+        return next(
+            reading for reading in self.listed if (reading.kind, reading.name) == (change.kind, change.name)
+        )
 
     def answers(
         self,
@@ -123,28 +125,28 @@ class Readings:
     ) -> Answers:
         """Every history (`shapes`) of every reading, each alone, from Q and g by group and column."""
         size = shapes.shape[1], len(self.listed)
-        found = Answers(np.zeros(size), np.full(size, np.inf), np.zeros(size))
+        answers = Answers(np.zeros(size), np.full(size, np.inf), np.zeros(size))
 
-        def information(one: Sum, other: Sum) -> Float[np.ndarray, " h"]:
-            each = [v * w * blocks[:, a, :, b] for a, v in one.items() for b, w in other.items()]
-            return np.einsum("gh,gf,fh->h", shapes, np.sum(each, axis=0), shapes, optimize=True)
+        def information(one: Sum, across: Sum) -> Float[np.ndarray, " h"]:
+            terms = [v * w * blocks[:, a, :, b] for a, v in one.items() for b, w in across.items()]
+            return np.einsum("gh,gf,fh->h", shapes, np.sum(terms, axis=0), shapes, optimize=True)
 
         def slope(of: Sum) -> Float[np.ndarray, " h"]:
             return shapes.T @ np.sum([weight * slopes[:, a] for a, weight in of.items()], axis=0)
 
         trace = np.einsum("gkgk->k", blocks)
         for k, reading in enumerate(self.listed):
-            known, pull = information(reading.along, reading.along), slope(reading.along)
+            info, pull = information(reading.along, reading.along), slope(reading.along)
             if reading.across is not None:
-                other, both = (information(reading.across, of) for of in (reading.across, reading.along))
+                across, mixed = (information(reading.across, of) for of in (reading.across, reading.along))
                 turn = slope(reading.across)
-                angle = np.arctan2(known * turn - both * pull, other * pull - both * turn)
+                angle = np.arctan2(info * turn - mixed * pull, across * pull - mixed * turn)
                 cosine, sine = np.cos(angle), np.sin(angle)
-                known = cosine**2 * known + 2.0 * cosine * sine * both + sine**2 * other
+                info = cosine**2 * info + 2.0 * cosine * sine * mixed + sine**2 * across
                 pull = cosine * pull + sine * turn
-                found.angle[:, k] = np.rad2deg(angle)
+                answers.angle[:, k] = np.rad2deg(angle)
             # Beyond rounding: `scan` has zeros where stars see nothing of a column.
-            seen = known > ROUNDING * sum(trace[a] for a in (*reading.along, *(reading.across or {})))
-            found.size[seen, k] = pull[seen] / known[seen]
-            found.error[seen, k] = known[seen] ** -0.5
-        return found
+            informed = info > ROUNDING * sum(trace[a] for a in (*reading.along, *(reading.across or {})))
+            answers.size[informed, k] = pull[informed] / info[informed]
+            answers.error[informed, k] = info[informed] ** -0.5
+        return answers

@@ -70,9 +70,9 @@ class Spots:
 
     def strongest(self, z: Float[np.ndarray, "s k"]) -> SpotFound | None:
         """The place of the largest T; `z` is 0 for stars that do not see a camera. None where stars are too few."""
-        seen = (z != 0).astype(float)
-        enough = self.within @ seen >= FEW
-        heavy = np.sqrt(np.maximum(self.square @ seen, 1e-300))
+        measured = (z != 0).astype(float)
+        enough = self.within @ measured >= FEW
+        heavy = np.sqrt(np.maximum(self.square @ measured, 1e-300))
         strength = np.where(enough, np.abs(self.shape @ np.clip(z, -CLIPPED, CLIPPED)) / heavy, 0.0)
         if not strength.any():
             return None
@@ -128,21 +128,21 @@ def of_stars(
     Both are 0 where a star does not see it. `members` are 1 for the cameras that are taken together; weights are those
     of `normal_matrix`.
     """
-    parts: list[list[np.ndarray]] = [[], [], [], []]
-    for here, rows, part in stars.blocks():
-        heavy = np.sqrt(weight[here] * share[here])[part.star, None]
-        free, _ = part.projected(part.model[..., None] * members)
-        half = np.linalg.cholesky(part.photon).swapaxes(1, 2)[part.star]
-        along = half @ np.einsum("rik,ark->ria", part.tangent, free, optimize=True)
-        parts[0].append((part.model * residual[rows]) @ members * weight[here][part.star, None])
-        parts[1].append(np.sum(free**2, axis=-1).T * heavy**2)
-        parts[2].append(along * heavy[..., None])
-        parts[3].append(part.model**2 @ members * heavy**2)
-    score, single, along, whole = map(np.concatenate, parts)
+    columns: list[list[np.ndarray]] = [[], [], [], []]
+    for numbers, rows, subset in stars.blocks():
+        heavy = np.sqrt(weight[numbers] * share[numbers])[subset.star, None]
+        free, _ = subset.projected(subset.model[..., None] * members)
+        half = np.linalg.cholesky(subset.photon).swapaxes(1, 2)[subset.star]
+        along = half @ np.einsum("rik,ark->ria", subset.tangent, free, optimize=True)
+        columns[0].append((subset.model * residual[rows]) @ members * weight[numbers][subset.star, None])
+        columns[1].append(np.sum(free**2, axis=-1).T * heavy**2)
+        columns[2].append(along * heavy[..., None])
+        columns[3].append(subset.model**2 @ members * heavy**2)
+    score, single, along, full = map(np.concatenate, columns)
     for start in range(int(group.max()) + 1):
         on = (group >= start).astype(float)[:, None]
-        pull, information, most = (np.add.reduceat(on * v, stars.first) for v in (score, single, whole))
+        pull, information, largest = (np.add.reduceat(on * v, stars.first) for v in (score, single, full))
         information -= np.sum(np.add.reduceat(on[..., None] * along, stars.first) ** 2, axis=1)
-        seen = information > ROUNDING * most
-        root = np.sqrt(np.where(seen, information, 1.0))
-        yield np.where(seen, pull / root, 0.0), np.where(seen, root, 0.0)
+        informed = information > ROUNDING * largest
+        root = np.sqrt(np.where(informed, information, 1.0))
+        yield np.where(informed, pull / root, 0.0), np.where(informed, root, 0.0)

@@ -487,7 +487,7 @@ def read_plan(
 
 
 def plan_of(
-    content: dict[str, Any], folder: Path, instrument: str | os.PathLike[str] | None = None
+    content: dict[str, Any], folder: Path, instrument: str | os.PathLike[str] | Instrument | None = None
 ) -> ObservingPlan:
     """The plan of the entries of a file in `folder`; the rest as `read_plan`."""
     content = dict(content)
@@ -517,9 +517,14 @@ def plan_of(
                 position = "; where an element stands is moving = { HWP = 22.5 }" if name.isupper() else ""
                 raise ValueError(f"{unknown_name('entry of a stop', name, of_stops)}{position}")
     values["stops"] = tuple(Stop(**read.values(of_stops, stop, "stops")) for stop in stops)
-    return ObservingPlan(
-        None if instrument is None else Instrument.read(instrument, elements=defined_elements()), **values
-    )
+    if isinstance(instrument, str | os.PathLike):
+        instrument = Instrument.read(instrument, elements=defined_elements())
+    return ObservingPlan(instrument, **values)
+
+
+def plan_of_document(document: Mapping[str, Any], instrument: Instrument) -> ObservingPlan:
+    """The plan whose `document` was written, for an instrument as designed."""
+    return plan_of(_entries(document), Path(), instrument)
 
 
 def instrument_named(content: Mapping[str, Any], folder: Path) -> str | Path | None:
@@ -535,14 +540,15 @@ def plan_text(plan: ObservingPlan, described: str | None = None) -> str:
 
     An instrument of one's own goes by its name, or by the file beside the plan in which it is `described`.
     """
-    unused = {"polariser_angles"} if plan.stops else set()  # every exposure says its own
-    return tomlkit.dumps(
-        {
-            name: _written(value)
-            for name, value in (plan.document() | ({"instrument": described} if described else {})).items()
-            if value is not None and name not in unused
-        }
-    )
+    return tomlkit.dumps(_entries(plan.document() | ({"instrument": described} if described else {})))
+
+
+def _entries(document: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries of the file of a plan."""
+    unused = {"polariser_angles"} if document.get("stops") else set()  # every exposure says its own
+    return {
+        name: _written(value) for name, value in document.items() if value is not None and name not in unused
+    }
 
 
 def _written(value: Any) -> Any:

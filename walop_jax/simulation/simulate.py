@@ -27,7 +27,7 @@ from walop_jax.model.effects import EFFECTS, EffectKind, effect_by_name, in_orde
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.elements import Analyser
 from walop_jax.model.instrument import Instrument, adapted
-from walop_jax.model.parameters import leaves, unknown_name, values_of
+from walop_jax.model.parameters import leaves, unknown_name, values_of, with_values
 from walop_jax.model.plan import with_median
 from walop_jax.model.sources import Standards
 from walop_jax.model.specification import Model, make_model, series_indices
@@ -134,6 +134,16 @@ def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, 
     return sources, dataclasses.replace(standards, q=array(true[0]), u=array(true[1]), lmax=array(lmax))
 
 
+def _stars_of(plan: ObservingPlan, catalogue: Sources, true: Standards) -> tuple[Sources, Standards]:
+    """The first stars of a catalogue, with a value each, and what they really are: as in `true`, by name."""
+    rows = np.unique(catalogue.stars)[: plan.standards]
+    sources = Sources(**{f.name: getattr(catalogue, f.name)[rows] for f in dataclasses.fields(catalogue)})
+    standards = standards_of(sources, plan.exposures(), plan.curves())
+    known = dict(zip((leaf.name for leaf in leaves(true)), np.asarray(values_of(true)), strict=True))
+    values = zip((leaf.name for leaf in leaves(standards)), np.asarray(values_of(standards)), strict=True)
+    return sources, with_values(standards)(np.array([known.get(*pair) for pair in values]))
+
+
 @dataclasses.dataclass(frozen=True)
 class PhotonNoise:
     """Photon noise and read noise (electron rms per measurement): N = Poisson(μ) + Normal(0, read_noise²).
@@ -176,6 +186,8 @@ def simulate(
     noiseless: bool = False,
     steady: bool = False,
     catalogue_seed: int | None = None,
+    catalogue: Sources | None = None,
+    night: int | None = None,
 ) -> Simulated:
     """Simulate a calibration run: the same plan, seed and effects give the same set, bit for bit.
 
@@ -184,17 +196,18 @@ def simulate(
     counts as they are and states the errors that they would have; `steady` gives every exposure the mean transparency
     and every star the mean brightness. Effects that depend on the run are made
     with `plan.context()`. `catalogue_seed` draws the standards apart from the rest (default: from `seed`): nights of
-    one survey share their stars.
+    one survey share their stars. With a `catalogue` nothing is drawn: the standards of `instrument` are what its stars
+    really are, and the plan takes the first of them. `night` is the number of days after the start of the plan; each
+    has noise and weather of its own, also with the same seed.
     """
-    build, stars, sky, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
-    if catalogue_seed is not None:
-        stars = np.random.default_rng(np.random.SeedSequence(catalogue_seed).spawn(4)[1])
-    sources, standards = _catalogue(plan, stars)
-    if instrument is None:
-        nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
-        instrument = draw_instrument(make_model(plan.name, nominal), build)
-    active = in_order((*instrument.effects, *effects))
-    truth = jax.tree.map(array, dataclasses.replace(instrument.with_source(standards), effects=active))
+    plan = plan if not night else dataclasses.replace(plan, mjd=plan.start + night)
+    sources, truth = true_instrument(
+        plan, seed, instrument=instrument, effects=effects, catalogue_seed=catalogue_seed, catalogue=catalogue
+    )
+    streams = np.random.SeedSequence(seed).spawn(4)[2:]
+    if night:
+        streams = np.random.SeedSequence((seed, night)).spawn(2)
+    sky, noise = map(np.random.default_rng, streams)
     blank = _without_light(plan, sources, seed, len(truth.cameras))
     expected = _expected(blank, truth, fluxes(plan, None if steady else sky))
     detector = PhotonNoise(plan.read_noise)
@@ -209,6 +222,32 @@ def simulate(
     at = table.point, table.exposure
     measured = dataclasses.replace(table, counts=counts[at], sigma=sigma[at])
     return Simulated(dataclasses.replace(blank, intensities=measured), truth)
+
+
+def true_instrument(
+    plan: ObservingPlan,
+    seed: int = 0,
+    *,
+    instrument: Instrument | None = None,
+    effects: Sequence[Effect] = (),
+    catalogue_seed: int | None = None,
+    catalogue: Sources | None = None,
+) -> tuple[Sources, Instrument]:
+    """The catalogue of standards and the true instrument of `simulate`, by the same arguments."""
+    build, stars = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)[:2])
+    if catalogue_seed is not None:
+        stars = np.random.default_rng(np.random.SeedSequence(catalogue_seed).spawn(4)[1])
+    if catalogue is None or instrument is None:
+        sources, standards = _catalogue(plan, stars)
+    else:
+        sources, standards = _stars_of(plan, catalogue, instrument.standard)
+    if instrument is None:
+        nominal = adapted(plan.design, throughput_degree=plan.throughput_degree, throughput=LEVEL)
+        instrument = draw_instrument(make_model(plan.name, nominal), build)
+    active = in_order((*instrument.effects, *effects))
+    return sources, jax.tree.map(
+        array, dataclasses.replace(instrument.with_source(standards), effects=active)
+    )
 
 
 def _beyond_photons(sigma: Cube, expected: Cube, floor: float, rng: np.random.Generator) -> Cube | float:

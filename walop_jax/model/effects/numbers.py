@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 
+import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from walop_jax.model.effects.change import (
     BAND,
@@ -16,6 +18,7 @@ from walop_jax.model.effects.change import (
     SlotTerm,
     Term,
     add,
+    in_exposures,
     itself,
 )
 from walop_jax.model.effects.factors import EXPOSURE, FIELD, WAVELENGTH
@@ -23,10 +26,15 @@ from walop_jax.model.elements import WavePlate
 from walop_jax.model.elements.wave_plate import Grown
 from walop_jax.model.instrument import Instrument, NoSuchPlaceError
 from walop_jax.model.parameters import unknown_name
-from walop_jax.model.sources import MoonPatches
+from walop_jax.model.sources import ExposureArrays, MoonPatches, StandardChange, Standards
 
 OF_QU = ("polarisation q", "polarisation u")
 OF_SOURCES = (*OF_QU, "polarisation")
+PLACES = {
+    "shift": {BAND: ("", "filter_shift")},
+    "rotator": {SKY: ("", "rotator_zero"), Standards.name: (Standards.name, "angle")},
+}
+"""Places of numbers of the instrument as a whole: the part that holds them, and its field."""
 
 
 def _number(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -55,12 +63,13 @@ def _of_plate(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 
 def _of_instrument(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    """Add to a number of the instrument as a whole, at the only place that it has."""
+    """Add to a number of the instrument as a whole, or of all standards."""
     for change, size in terms:
-        place, field = {"shift": (BAND, "filter_shift"), "rotator": (SKY, "rotator_zero")}[change.kind]
-        if change.place != place:
-            raise unknown_name(f"place of {change.kind}", change.place, (place,))
-        instrument = instrument.changed("", **{field: add(size)})
+        places = PLACES[change.kind]
+        if change.place not in places:
+            raise unknown_name(f"place of {change.kind}", change.place, places)
+        part, field = places[change.place]
+        instrument = instrument.changed(part, **{field: add(size)})
     return instrument
 
 
@@ -88,8 +97,10 @@ def _polarised(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 
 def _of_patch(instrument: Instrument, change: Change) -> Grows:
-    """Of one patch of the sky, which is an exposure."""
-    return Grows((EXPOSURE,), None) if change.place == SKY and change.kind != "polarisation" else Grows()
+    """Of one patch of the sky, which is an exposure; of a star what changes with time and from filter to filter."""
+    if change.place != SKY:
+        return Grows((EXPOSURE, WAVELENGTH))
+    return Grows((EXPOSURE,), None) if change.kind != "polarisation" else Grows()
 
 
 def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -101,10 +112,24 @@ def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
             what = unknown_name("description", f"{change.kind} of {change.place}", names_of_stars)
             raise NoSuchPlaceError(str(what))
         at = names.index(change.place)
+        if change.factors:
+            one = GrownStandard(size, at, "qu".index(axis), change)
+            instrument = instrument.changed("standard", changes=lambda there, one=one: (*there, one))
+            continue
         instrument = instrument.changed(
             "standard", **{axis: lambda value, at=at, size=size: value.at[at].add(size)}
         )
     return instrument
+
+
+class GrownStandard(StandardChange):
+    """A change of a standard that grows with time, or from filter to filter."""
+
+    change: Change = eqx.field(static=True)
+
+    def factor(self, exposures: ExposureArrays) -> Float[Array, " e"]:
+        """The product of its factors."""
+        return in_exposures(self.change, exposures)
 
 
 def _slots_of_source(instrument: Instrument, change: Change) -> list[SlotTerm]:

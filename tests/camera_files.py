@@ -1,0 +1,81 @@
+"""Catalogues of the four cameras, as SExtractor and photutils write them, of a table with a row a star."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from astropy import units
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.table import QTable
+
+CAMERAS = ("O1", "E1", "O2", "E2")
+CENTRE = {"RA": 97.5, "DEC": -44.0, "ROTATOR": 35.0}  # deg
+
+
+def of_camera(stars, k: int, rng, scatter=0.1, keep=None) -> dict[str, np.ndarray]:
+    """What a camera sees, in an order of its own: positions scatter by so many arcsec."""
+    rows = rng.permutation(len(stars) if keep is None else np.flatnonzero(keep))
+    offset = scatter / 3600.0 * rng.standard_normal((2, len(rows)))
+    dec = np.asarray(stars["DEC"], float)[rows] + offset[1]
+    columns = {
+        "ALPHA_J2000": np.asarray(stars["RA"], float)[rows] + offset[0] / np.cos(np.deg2rad(dec)),
+        "DELTA_J2000": dec,
+        "FLUX_AUTO": np.asarray(stars["N"])[rows, k],
+        "FLUXERR_AUTO": np.asarray(stars["N_ERR"])[rows, k],
+        "FLAGS": np.zeros(len(rows), np.int16),
+    }
+    columns |= {
+        name: np.asarray(stars[name])[rows] for name in ("SOURCE_ID", "BP_RP") if name in stars.colnames
+    }
+    return columns
+
+
+def ldac(path: Path, columns: dict[str, np.ndarray], words=CENTRE) -> Path:
+    """FITS_LDAC: the header of the image as a table of one row, then the objects."""
+    header = fits.Header(words)
+    cards = np.array([[card.image for card in header.cards]])
+    image = fits.BinTableHDU.from_columns(
+        [fits.Column("Field Header Card", f"{cards.size * 80}A", dim=f"(80, {cards.size})", array=cards)],
+        name="LDAC_IMHEAD",
+    )
+    objects = fits.BinTableHDU(_table(columns).as_array(), name="LDAC_OBJECTS")
+    fits.HDUList([fits.PrimaryHDU(), image, objects]).writeto(path, checksum=True)
+    return path
+
+
+def ascii_head(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    """ASCII_HEAD: a line of comment for each column, then numbers."""
+    table = _table(columns)
+    lines = [f"#{k + 1:4d} {name:<22} about it" for k, name in enumerate(table.colnames)]
+    lines += [" ".join(str(value) for value in row) for row in table.iterrows()]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def photutils(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    """What aperture_photometry of photutils writes as ECSV, positions as coordinates of astropy."""
+    count = len(columns["FLAGS"])
+    made = QTable({"id": np.arange(count) + 1, "xcenter": np.zeros(count) * units.pix})
+    made["sky_center"] = SkyCoord(columns["ALPHA_J2000"], columns["DELTA_J2000"], unit="deg")
+    made["aperture_sum"] = columns["FLUX_AUTO"] * units.electron
+    made["aperture_sum_err"] = columns["FLUXERR_AUTO"] * units.electron
+    for name in ("SOURCE_ID", "BP_RP"):
+        if name in columns:
+            made[name.lower()] = columns[name]
+    made.write(path, format="ascii.ecsv")
+    return path
+
+
+def _table(columns):
+    return QTable(columns)
+
+
+def four(stars, folder: Path, write=ldac, seed=5, **options) -> list[Path]:
+    """The files of the four cameras."""
+    rng = np.random.default_rng(seed)
+    end = {ldac: "fits", ascii_head: "cat", photutils: "ecsv"}[write]
+    return [
+        write(folder / f"{name}.{end}", of_camera(stars, k, rng, **options)) for k, name in enumerate(CAMERAS)
+    ]

@@ -1,0 +1,95 @@
+"""Stars by an old and a new calibration: shift against the covariance that the change was drawn from; nights; again."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from small_run import small_fit
+from star_tables import stars
+
+import walop_jax as walop
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.user_tables import in_memory
+from walop_jax.fit.verdict import Structure
+from walop_jax.science.affected import shift
+from walop_jax.science.apply import results_of
+from walop_jax.science.catalogue import read_catalogue
+
+
+@pytest.fixture(scope="module")
+def old() -> Calibration:
+    return Calibration.from_fit(small_fit())
+
+
+@pytest.fixture(scope="module")
+def table(old):
+    """Two nights of 30 stars each."""
+    made, _ = stars(AnalysisVectors(old), 60, np.random.default_rng(3), flux=4e7)
+    made["MJD"] = np.repeat([61220.9, 61221.9], 30)
+    return made
+
+
+def moved(calibration: Calibration, name: str, sigmas: float) -> Calibration:
+    """One parameter elsewhere, by so many of its standard errors."""
+    at = calibration.model.index(name)
+    values = calibration.values.copy()
+    values[at] += sigmas * np.sqrt(calibration.covariance[at, at])
+    return dataclasses.replace(calibration, values=values)
+
+
+@pytest.mark.parametrize("name", ["collimator.u", "half1.plate.mgf2", "throughput.n1.p10"])
+def test_a_parameter_off_by_its_error_shifts_stars_by_the_error_that_it_makes(old, table, name):
+    """δ = D σ is what the covariance P + δ δᵀ of the old result holds: z² = s/(1 + s), s = δᵀ P⁻¹ δ."""
+    at = old.model.index(name)
+    alone = np.zeros_like(old.covariance)
+    alone[at, at] = old.covariance[at, at]
+    verdict = dataclasses.replace(old.verdict, structure=Structure())
+    one = dataclasses.replace(old, covariance=alone, verdict=verdict)
+    known = table.copy()
+    known["TEFF"] = 5000.0
+    catalogue = read_catalogue(in_memory(known), old.model.template.patched())
+    before, after = results_of(one, catalogue), results_of(moved(one, name, 1.0), catalogue)
+    change = after.qu - before.qu
+    s = np.einsum("si,sij,sj->s", change, np.linalg.inv(before.photon), change)
+    assert s.max() > 1e-3
+    np.testing.assert_allclose(shift(before, after), np.sqrt(s / (1 + s)), rtol=0.02, atol=1e-4)
+
+
+def test_the_same_calibration_changes_nothing(old, table):
+    found = walop.affected(old, old, table)
+    assert found.again == ()
+    assert [night.largest for night in found.nights] == [0.0, 0.0]
+    assert [night.stars for night in found.nights] == [30, 30]
+    assert [night.night for night in found.nights] == [61220.0, 61221.0]
+
+
+def test_what_must_be_made_again_is_named(old, table):
+    """collimator.u adds to u of light ahead of the plates: 5 sigma of it shift u of every star alike."""
+    new = moved(old, "collimator.u", 5.0)
+    moved_by = 5.0 * old["collimator.u"].sigma
+    reduced = walop.apply(old, table)
+    found = walop.affected(old, new, [table, reduced])
+    first, second = found.nights[:2]
+    assert found.again == ("catalogue 1", "catalogue 2")
+    assert [night.most for night in found.nights[:2]] == pytest.approx([n.most for n in found.nights[2:]])
+    assert first.median > found.limit
+    assert first.u == pytest.approx(-moved_by, rel=0.05)
+    assert second.u == pytest.approx(first.u, rel=0.05)
+    assert walop.affected(old, new, table, limit=1e3).again == ()
+    again = walop.affected(old, new, walop.apply(new, table))
+    assert again.warnings == ("catalogue 1: was made with the new calibration already",)
+    document = found.document()
+    assert document["again"] == ["catalogue 1", "catalogue 2"]
+    assert "again" in found.display().text()
+
+
+def test_results_that_are_lost_are_made_again(old, table):
+    """The new calibration takes the middle of the field for beyond its own: no result there."""
+    x0, x1, y0, y1 = old.field
+    small = dataclasses.replace(old, field=(x0 / 9, x1 / 9, y0 / 9, y1 / 9))
+    found = walop.affected(old, small, table)
+    assert found.nights[0].lost > 0
+    assert found.again == ("catalogue 1",)

@@ -1,0 +1,263 @@
+"""Four catalogues of cameras become one: formats, names, flags, positions, and inputs that cannot be meant."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from astropy.table import Table
+from astropy.wcs import WCS
+from camera_files import CAMERAS, CENTRE, ascii_head, four, ldac, of_camera, photutils
+
+import walop_jax as walop
+from walop_jax.data.camera_catalogues import read_camera_catalogue, read_map
+from walop_jax.io.errors import DataError
+from walop_jax.sky.directions import Pointing
+
+POINTING = {"ra": 97.5, "dec": -44.0, "rotator": 35.0}
+
+
+def stars(count=300, seed=1) -> Table:
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-0.3, 0.3, (2, count))
+    ra, dec = Pointing(**POINTING).sky_of(x, y)
+    n = 10 ** rng.uniform(4, 6, count)[:, None] * rng.uniform(0.8, 1.2, (count, 4))
+    table = Table(
+        {"SOURCE_ID": 5_000_000_000_000_000_000 + np.arange(count), "RA": ra, "DEC": dec, "X": x, "Y": y}
+    )
+    table["N"], table["N_ERR"], table["BP_RP"] = n, np.sqrt(n + 900), rng.uniform(0.5, 1.4, count)
+    return table
+
+
+STARS = stars()
+
+
+def by_source(table) -> Table:
+    table = table.copy()
+    table.sort("SOURCE_ID")
+    return table
+
+
+def remarks(caplog, *args, **options):
+    with caplog.at_level("WARNING", logger="walop_jax"):
+        made = walop.gather(*args, **options)
+    return made, "\n".join(record.message for record in caplog.records)
+
+
+@pytest.mark.parametrize("write", [ldac, ascii_head, photutils])
+def test_every_format_gives_the_same_stars(write, tmp_path):
+    made = by_source(walop.gather(four(STARS, tmp_path, write), **({} if write is ldac else POINTING)))
+    assert made["SOURCE_ID"].tolist() == STARS["SOURCE_ID"].tolist()
+    np.testing.assert_allclose(made["N"], STARS["N"], rtol=1e-12)
+    np.testing.assert_allclose(made["N_ERR"], STARS["N_ERR"], rtol=1e-12)
+    np.testing.assert_allclose(made["BP_RP"], STARS["BP_RP"])
+    for name in "XY":  # 0.1 arcsec of scatter, the mean of four
+        assert 3600 * np.std(made[name] - STARS[name]) == pytest.approx(0.05, rel=0.15)
+    assert np.ptp(made["ROTATOR"]) > 0.3  # at each star: meridians converge
+    assert (made.meta["RA"], made.meta["ROTATOR"]) == (CENTRE["RA"], CENTRE["ROTATOR"])
+    assert all(made[name].description for name in made.colnames)
+
+
+def test_a_shifted_and_rotated_camera_is_named_and_put_right(tmp_path, caplog):
+    files = four(STARS, tmp_path)
+    moved = STARS.copy()
+    turn = np.deg2rad(3.0 / 60.0)
+    x = np.cos(turn) * STARS["X"] - np.sin(turn) * STARS["Y"] + 20.0 / 3600
+    y = np.sin(turn) * STARS["X"] + np.cos(turn) * STARS["Y"] - 5.0 / 3600
+    moved["RA"], moved["DEC"] = Pointing(**POINTING).sky_of(np.asarray(x), np.asarray(y))
+    for k, name in ((1, "E1"), (0, "O1")):  # the first camera is no better than others
+        files[k].unlink()
+        ldac(files[k], of_camera(moved, k, np.random.default_rng(0)))
+        caplog.clear()
+        made, said = remarks(caplog, files)
+        assert re.search(
+            rf"{name} is shifted by \+(19|20).\d and -(4|5).\d arcsec .* rotated by \+3.?0? arcmin", said
+        )
+        assert said.count("is shifted") == 1
+        np.testing.assert_allclose(by_source(made)["X"], STARS["X"], atol=0.5 / 3600)
+        files[k].unlink()
+        ldac(files[k], of_camera(STARS, k, np.random.default_rng(0)))
+
+
+def test_a_wcs_that_is_off_by_ten_minutes_and_another_field_are_refused(tmp_path):
+    files = four(STARS, tmp_path)
+    shifted = STARS.copy()
+    shifted["DEC"] = STARS["DEC"] + 10.0 / 60.0
+    files[2].unlink()
+    ldac(files[2], of_camera(shifted, 2, np.random.default_rng(0)))
+    with pytest.raises(
+        DataError, match=r"O2.fits.*no stars in common with .*O1.fits within 5 arcmin.*10 arcmin apart"
+    ):
+        walop.gather(files)
+    with pytest.raises(
+        DataError, match=r"O1.fits.*stars lie 16.* deg from the field centre RA 97.5, DEC -60"
+    ):
+        walop.gather(files, dec=-60.0)
+    other = stars(seed=9)
+    files[2].unlink()
+    ldac(files[2], of_camera(other, 2, np.random.default_rng(0)))
+    with pytest.raises(DataError, match=r"O2.fits.*no stars in common"):
+        walop.gather(files)
+
+
+def test_half_of_the_stars_missing_in_one_camera_is_said(tmp_path, caplog):
+    files = four(STARS, tmp_path)
+    files[3].unlink()
+    ldac(files[3], of_camera(STARS, 3, np.random.default_rng(0), keep=np.arange(300) % 2 == 0))
+    made, said = remarks(caplog, files)
+    assert "E2 lacks 150 of the 300 stars" in said
+    assert np.isnan(made["N"]).sum(axis=0).tolist() == [0, 0, 0, 150]
+    assert len(made) == 300
+
+
+def test_stars_that_two_cameras_see_are_left_out_and_close_ones_are_marked(tmp_path, caplog):
+    close = STARS.copy()
+    close["DEC"][1], close["RA"][1] = close["DEC"][0] + 0.7 / 3600, close["RA"][0]
+    keep = np.arange(300) != 7
+    rng = np.random.default_rng(2)
+    files = [
+        ldac(tmp_path / f"{name}.fits", of_camera(close, k, rng, 0.05, keep if k > 1 else None))
+        for k, name in enumerate(CAMERAS)
+    ]
+    made, said = remarks(caplog, files)
+    assert "1 stars that too few cameras see are left out of 300" in said
+    assert "2 stars have two candidates within 1 arcsec" in said
+    made = by_source(made)
+    assert made["N_FLAG"][:2].tolist() == [[8] * 4] * 2
+    assert not made["N_FLAG"][2:].any()
+    np.testing.assert_allclose(made["N"][:2], STARS["N"][:2])
+
+
+def test_flags_are_those_of_the_package_and_others_are_refused(tmp_path):
+    columns = of_camera(STARS, 0, np.random.default_rng(0))
+    columns["FLAGS"][:6] = [3, 4, 8, 16, 32, 5]
+    one = read_camera_catalogue(ldac(tmp_path / "a.fits", columns))
+    assert one.flag[:7].tolist() == [8, 1, 4, 2, 0, 9, 0]
+    columns["FLAGS"][3] = 1024
+    with pytest.raises(DataError, match=r"FLAGS: is 1024 in row 3 .*no flag of SExtractor; .*--columns"):
+        read_camera_catalogue(ldac(tmp_path / "b.fits", columns))
+    del columns["FLAGS"]
+    columns["MASK_FLAG"] = np.zeros(300, int)
+    said = "; ".join(read_camera_catalogue(ldac(tmp_path / "c.fits", columns)).remarks)
+    assert "no flags of the stars" in said
+    assert "MASK_FLAG: flags are read from" in said
+
+
+def test_magnitudes_are_refused_whatever_their_name(tmp_path):
+    columns = of_camera(STARS, 0, np.random.default_rng(0))
+    columns["MAG_AUTO"] = 25.0 - 2.5 * np.log10(columns.pop("FLUX_AUTO"))
+    columns["MAGERR_AUTO"] = 0.01 * columns.pop("FLUXERR_AUTO") / columns["MAG_AUTO"]
+    file = ldac(tmp_path / "a.fits", columns)
+    with pytest.raises(
+        DataError, match=r"has magnitudes and no fluxes with errors \(MAG_AUTO\); write FLUX_APER"
+    ):
+        read_camera_catalogue(file)
+    own = tmp_path / "own.toml"
+    own.write_text(
+        'program = "mine"\nflux = [["MAG_AUTO", "MAGERR_AUTO"]]\nsky = [["ALPHA_J2000", "DELTA_J2000"]]\n'
+    )
+    with pytest.raises(DataError, match=r"MAG_AUTO: lies between .* these are magnitudes"):
+        read_camera_catalogue(file, own)
+
+
+def test_a_map_of_ones_own_with_an_aperture_of_several(tmp_path):
+    columns = of_camera(STARS, 0, np.random.default_rng(0))
+    flux, error = columns.pop("FLUX_AUTO"), columns.pop("FLUXERR_AUTO")
+    columns["FLUX_APER"], columns["FLUXERR_APER"] = (
+        np.stack([0.5 * flux, flux], 1),
+        np.stack([error, error], 1),
+    )
+    columns["QUALITY"] = columns.pop("FLAGS") + 2
+    file = ldac(tmp_path / "a.fits", columns)
+    with pytest.raises(DataError, match=r"FLUX_APER: has 2 apertures; say which .*FLUX_APER\[1\]"):
+        read_camera_catalogue(file)
+    own = tmp_path / "own.toml"
+    own.write_text(
+        'program = "mine"\nflux = [["FLUX_APER[2]", "FLUXERR_APER[2]"]]\nflag = ["QUALITY"]\n'
+        'sky = [["ALPHA_J2000", "DELTA_J2000"]]\n[bits]\n2 = 0\n'
+    )
+    one = read_camera_catalogue(file, own, gain=2.0)
+    np.testing.assert_allclose(one.flux, 2.0 * flux)
+    np.testing.assert_allclose(one.error, 2.0 * error)
+    assert not one.flag.any()
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ('flux = [["A", "B"]]', "program is missing"),
+        ('program = "x"', "flux is missing"),
+        ('program = "x"\nflux = ["A"]', "must be a list of names"),
+        ('program = "x"\nflux = [["A", "B"]]\nsyk = [["C", "D"]]', "did you mean 'sky'"),
+        ('program = "x"\nflux = [["A", "B"]]\n[bits]\n3 = 1', "'3' is no single bit"),
+        ('program = "x"\nflux = [["A", "B"]]\n[bits]\n4 = 3', "give a bit of FLAG"),
+        ('program = "x', "x.toml"),
+    ],
+)
+def test_a_map_that_is_wrong_is_refused(text, what, tmp_path):
+    (tmp_path / "x.toml").write_text(text)
+    with pytest.raises(DataError, match=re.escape(what)):
+        read_map(tmp_path / "x.toml")
+
+
+def test_pixels_go_to_the_sky_by_the_wcs_of_the_image_which_gives_the_pointing_too(tmp_path, caplog):
+    plane = WCS(naxis=2)
+    plane.wcs.ctype, plane.wcs.crval, plane.wcs.crpix = (
+        ["RA---TAN", "DEC--TAN"],
+        [97.5, -44.0],
+        [1000.5, 1000.5],
+    )
+    r = np.deg2rad(35.0)
+    plane.wcs.cd = 0.3 / 1000 * np.array([[np.sin(r), np.cos(r)], [np.cos(r), -np.sin(r)]])
+    header = {**plane.to_header(), "NAXIS1": 2000, "NAXIS2": 2000}
+    files = []
+    for k, name in enumerate(CAMERAS):
+        columns = of_camera(STARS, k, np.random.default_rng(k))
+        x, y = plane.wcs_world2pix(columns.pop("ALPHA_J2000"), columns.pop("DELTA_J2000"), 1)
+        columns["X_IMAGE"], columns["Y_IMAGE"] = x, y
+        files.append(ldac(tmp_path / f"{name}.fits", columns, header))
+    with pytest.raises(DataError, match="neither ALPHAWIN_J2000"):
+        read_camera_catalogue(ascii_head(tmp_path / "x.cat", columns))
+    made, said = remarks(caplog, files)
+    assert "RA 97.5, DEC -44, ROTATOR 35 deg from the WCS" in said
+    np.testing.assert_allclose(by_source(made)["X"], STARS["X"], atol=0.5 / 3600)
+    np.testing.assert_allclose(by_source(made)["Y"], STARS["Y"], atol=0.5 / 3600)
+
+
+def test_unknown_colours_are_named(tmp_path):
+    columns = of_camera(STARS, 0, np.random.default_rng(0))
+    for name in ("T_EFF", "BP-RP", "g-r", "COLOR"):
+        columns[name] = columns["BP_RP"]
+    del columns["BP_RP"]
+    said = "; ".join(read_camera_catalogue(ldac(tmp_path / "a.fits", columns)).remarks)
+    for name in ("T_EFF", "BP-RP", "G-R", "COLOR"):
+        assert f"{name}: the colour of a star is read from TEFF (K) or BP_RP" in said
+
+
+def test_a_table_of_gaia_says_who_the_stars_are(tmp_path, caplog):
+    known = STARS["RA", "DEC", "SOURCE_ID", "BP_RP"][:280]
+    known["PHOT_G_MEAN_MAG"] = 25 - 2.5 * np.log10(STARS["N"][:280].sum(axis=1))
+    known["parallax"] = 1.5
+    bare = STARS["RA", "DEC", "N", "N_ERR"]
+    bare["DEC"] = bare["DEC"] + 4.0 / 3600
+    made, said = remarks(caplog, four(bare, tmp_path), gaia=known)
+    assert "280 of 300 stars are in" in said
+    assert re.search(r"all cameras are shifted by .* arcsec along X and Y against", said)
+    named = made["SOURCE_ID"] > 0
+    assert named.sum() == 280
+    assert set(made["SOURCE_ID"][named].tolist()) == set(known["SOURCE_ID"].tolist())
+    assert np.all(made["PARALLAX"][named] == 1.5)
+    assert made["PARALLAX"].unit == "mas"
+
+
+def test_the_number_of_catalogues_and_a_missing_pointing_are_said(tmp_path):
+    files = four(STARS, tmp_path, ascii_head)
+    with pytest.raises(
+        ValueError, match="3 catalogues for the 4 cameras of WALOP-SOUTH: give those of O1, E1, O2, E2"
+    ):
+        walop.gather(files[:3])
+    with pytest.raises(
+        DataError, match=r"has no RA and no DEC and no ROTATOR .* give --ra … --dec … --rotator …"
+    ):
+        walop.gather(files)

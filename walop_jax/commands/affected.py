@@ -1,0 +1,80 @@
+"""`walop-jax affected`: which catalogues must be made again when a calibration is replaced?"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from walop_jax.commands.apply import calibration_for
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
+from walop_jax.commands.inputs import Effects, PathLike, table_of
+
+if TYPE_CHECKING:
+    from walop_jax import Calibration, FitResult, Run
+    from walop_jax.science.affected import Affected
+
+OLD = Argument("Calibration that the catalogues were reduced with, or its run.", "OLD", Path)
+NEW = Argument("Calibration that takes its place.", "NEW", Path)
+CATALOGUES = Argument("Catalogues, as apply reads or writes them.", "CATALOGUE...", list[Path])
+LIMIT = Option("Shift (standard errors) from which a result is made again (default: 0.5).", "SIGMA", float)
+
+
+@command(stages=("reading", "tabulating"))
+def affected(
+    job: Job,
+    old: Annotated[Calibration | FitResult | Run | PathLike, OLD],
+    new: Annotated[Calibration | FitResult | Run | PathLike, NEW],
+    catalogues: Annotated[Any, CATALOGUES],
+    *,
+    limit: Annotated[float, LIMIT] = 0.5,
+    effects: Effects = None,
+) -> Outcome[Affected]:
+    """Say which catalogues a new calibration changes, and by how much.
+
+    The stars are reduced from their rows by both calibrations; the shift of q and u is told in standard errors of the
+    old result, by catalogue and night. A night must be made again where more than 5 % of its stars shift by more than
+    the limit, or gain or lose their result. OLD and NEW may be surveys (walop-jax stack), with stars of one night in a
+    catalogue: the calibrations at their time are taken.
+
+    Exit code 0 where nothing has to be made again, 3 where something has.
+
+    In Python: an `Affected`; `catalogues` is a path, an astropy table, columns by name, or several of them in a list.
+
+    >>> walop.affected("OLD", "NEW", ["night1.fits", "night2.fits"]).again  # doctest: +SKIP
+    """
+    from walop_jax.io.errors import errors_naming
+    from walop_jax.science.affected import Affected
+    from walop_jax.science.affected import affected as nights_of
+    from walop_jax.science.catalogue import read_catalogue
+
+    if not limit > 0:
+        raise UsageError(f"{limit} must be above 0 standard errors", "limit")
+    given = list(catalogues) if isinstance(catalogues, list | tuple) else [catalogues]
+    nights, warnings, replaced, replacing = [], [], list[str](), list[str]()
+    for number, entry in enumerate(given, start=1):
+        job.tell(f"catalogue {number} of {len(given)}", "reading")
+        name = str(entry) if isinstance(entry, str | os.PathLike) else f"catalogue {number}"
+        table = table_of(entry, {})
+        before, after = (calibration_for(one, table, effects, force=True) for one in (old, new))
+        replaced.append(before.content_hash())
+        replacing.append(after.content_hash())
+        rows = read_catalogue(
+            table, before.model.template.patched(), always_in=before.always_in, never_in=before.never_in
+        )
+        made_with = str(table.table.meta.get("CALHASH", ""))
+        if made_with == replacing[-1] != replaced[-1]:
+            warnings.append(f"{name}: was made with the new calibration already")
+        elif made_with and made_with != replaced[-1]:
+            warnings.append(f"{name}: was made with a calibration that is neither the old nor the new one")
+        job.tell(f"{len(rows)} rows of {name}", "tabulating")
+        with errors_naming(table.path):
+            here = list(nights_of(before, after, rows, name, limit))
+        nights += here
+        if beyond := sum(night.beyond for night in here):
+            warnings.append(
+                f"{name}: {beyond} stars have a filter or temperature that the new one does not cover"
+            )
+    first, second = (", ".join(dict.fromkeys(one)) for one in (replaced, replacing))
+    found = Affected(first, second, limit, tuple(nights), tuple(warnings))
+    return Outcome(found, warnings=found.warnings, trusted=not found.again)

@@ -1,0 +1,130 @@
+"""`walop-jax gather`: the catalogues of single cameras, as programs of photometry write them, made into one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
+from walop_jax.commands.inputs import InstrumentLike, PathLike, TableFile, design_of
+
+if TYPE_CHECKING:
+    from walop_jax.data.camera_catalogues import CameraCatalogue
+    from walop_jax.sky.directions import Pointing
+
+CATALOGUES = Argument("Catalogues of the cameras, in their order: O1 E1 O2 E2.", "CATALOGUE...", list[Path])
+COLUMNS = Option("Names of the columns of another program than SExtractor and photutils.", "FILE.toml", Path)
+CENTRE = "of the field centre (deg); without it that of the header, or of the WCS."
+RA, DEC = Option(f"Right ascension {CENTRE}", kind=float), Option(f"Declination {CENTRE}", kind=float)
+ROTATOR = Option(
+    "Position angle of +X (deg); without it that of the header, or of the axis x of the WCS.", kind=float
+)
+TOLERANCE = Option("Stars farther apart than that are not one (arcsec).", "ARCSEC", least=0.01)
+GAIN = Option("Electrons per count, where fluxes are in counts.", kind=float)
+GAIA = Option("Table with RA, DEC, SOURCE_ID, BP_RP: who the stars are.", "TABLE", Path)
+
+
+@command(stages=("reading", "matching", "writing"), writes="file", jax=False)
+def gather(
+    job: Job,
+    catalogues: Annotated[Sequence[PathLike], CATALOGUES],
+    *,
+    output: TableFile = None,
+    columns: Annotated[PathLike | None, COLUMNS] = None,
+    ra: Annotated[float | None, RA] = None,
+    dec: Annotated[float | None, DEC] = None,
+    rotator: Annotated[float | None, ROTATOR] = None,
+    tolerance: Annotated[float, TOLERANCE] = 1.0,
+    gain: Annotated[float | None, GAIN] = None,
+    gaia: Annotated[Any, GAIA] = None,
+    instrument: InstrumentLike = None,
+) -> Outcome[Any]:
+    """Make one catalogue, a row a star, of those of the cameras.
+
+    Catalogues of SExtractor (FITS_LDAC, FITS, ASCII_HEAD) or photutils (ECSV) are read as they are, of other programs
+    with a small file that names their columns. Positions of the cameras are registered, stars matched on the sky; a
+    camera whose positions are shifted or rotated, or that lacks stars, is named. X and Y are made of right ascension,
+    declination and the pointing, ROTATOR is that at the star. SOURCE_ID, BP_RP, TEFF and parallaxes go with the stars.
+
+    In Python: an astropy table.
+
+    >>> stars = walop.gather(["O1.fits", "E1.fits", "O2.fits", "E2.fits"], rotator=0.0)  # doctest: +SKIP
+    """
+    from walop_jax.data.camera_catalogues import read_camera_catalogue
+    from walop_jax.io.plain_tables import astropy_table, table_format, write_table
+    from walop_jax.model.instrument import nominal_instrument
+    from walop_jax.science.gathering import gather as gathered
+    from walop_jax.science.gathering import identified
+
+    if output is not None:
+        table_format(output)
+    if isinstance(catalogues, str | os.PathLike):
+        catalogues = [catalogues]
+    design = design_of(instrument) or nominal_instrument()
+    names = design.cameras.names
+    if len(catalogues) != len(names):
+        what = f"{len(catalogues)} catalogues for the {len(names)} cameras of {design.name}"
+        raise UsageError(f"{what}: give those of {', '.join(names)}, in this order", "catalogues")
+    job.begin("reading")
+    each = [read_camera_catalogue(path, columns, gain) for path in catalogues]
+    pointing, said = _pointing(each, {"RA": ra, "DEC": dec, "ROTATOR": rotator})
+    job.begin("matching")
+    made = gathered(each, names, pointing, tolerance)
+    if gaia is not None:
+        made = identified(made, gaia, tolerance)
+    remarks = [*said, *made.remarks]
+    job.begin("writing")
+    cards = {"INSTRUME": design.name, "RA": pointing.ra, "DEC": pointing.dec, "ROTATOR": pointing.rotator}
+    table = astropy_table(made.columns, {**cards, "RADESYS": "ICRS"})
+    if output is not None:
+        write_table(output, table, overwrite=job.overwrite)
+    seen = [int((made.matched == count).sum()) for count in range(len(names) + 1)]
+    document = {
+        "output": output,
+        "stars": len(table),
+        "in_all_cameras": seen[-1],
+        "pointing": cards,
+        "registrations": [
+            {"camera": name, "shift_arcsec": move.shift.tolist(), "rotation_deg": move.rotation}
+            for name, move in zip(names, made.registrations, strict=True)
+        ],
+        "remarks": remarks,
+    }
+    text = f"{output}: {len(table)} stars, {seen[-1]} of them in all {len(names)} cameras"
+    return Outcome(
+        table, document, text, warnings=remarks, next=(f"walop-jax apply RUN {output} -o OUT.fits",)
+    )
+
+
+def _pointing(
+    catalogues: Sequence[CameraCatalogue], given: dict[str, float | None]
+) -> tuple[Pointing, list[str]]:
+    """The pointing, as given, of the header, or of the WCS of an image, with a remark on the last."""
+    from walop_jax.data.camera_catalogues import centre_of
+    from walop_jax.io.errors import fail
+    from walop_jax.sky.directions import Pointing
+
+    first, remarks = catalogues[0], []
+    numbers = {
+        name: _number(first.header.get(name)) if value is None else value for name, value in given.items()
+    }
+    missing = [name for name, value in numbers.items() if value is None]
+    if missing and (seen := centre_of(first.header)) is not None:
+        numbers |= {name: seen[name] for name in missing}
+        stated = ", ".join(f"{name} {seen[name]:.6g}" for name in missing)
+        remarks.append(f"{first.path}: {stated} deg from the WCS: centre of the image, and its axis x as +X")
+        missing = []
+    if missing:
+        raise fail(
+            f"has no {' and no '.join(missing)} in its header, and no WCS of an image",
+            file=first.path,
+            advice=f"give {' '.join(f'--{name.lower()} …' for name in missing)} (deg)",
+        )
+    return Pointing(*(float(numbers[name]) for name in ("RA", "DEC", "ROTATOR"))), remarks  # pyright: ignore[reportArgumentType]
+
+
+def _number(value: Any) -> float | None:
+    """A number of a header; None where there is none, or a text (sexagesimal)."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None

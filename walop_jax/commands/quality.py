@@ -1,0 +1,107 @@
+"""`walop-jax quality`: a row of quality numbers for each night, kept in a table, with limits and a figure."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, command
+from walop_jax.commands.inputs import Effects, PathLike, calibration_of
+from walop_jax.io.display import Display
+
+if TYPE_CHECKING:
+    from walop_jax import Calibration, FitResult, Run
+
+RUNS = Argument("Runs or calibrations, one for each night.", "RUN...", list[Path])
+TABLE = Option(
+    "Table that the nights are added to (.ecsv, .csv, .fits).", "QUALITY.ecsv", Path, "-o", required=True
+)
+LIMITS = Option("Limits in place of those of the package.", "LIMITS.toml", Path)
+FIGURE = Option("Draw all nights of the table: .png, .pdf, .svg.", "FILE", Path)
+SHOWN = ("CHI2DOF", "ANGLE", "P_RATIO", "ZERO_Q", "ZERO_U", "ACCURACY")
+
+
+@command(stages=("reading", "writing"))
+def quality(
+    job: Job,
+    runs: Annotated[Calibration | FitResult | Run | PathLike | Sequence[Any], RUNS],
+    *,
+    output: Annotated[PathLike | None, TABLE] = None,
+    limits: Annotated[PathLike | None, LIMITS] = None,
+    figure: Annotated[PathLike | None, FIGURE] = None,
+    effects: Effects = None,
+) -> Outcome[Any]:
+    """Add a row of quality numbers for each night to a table, and say which lie outside their limits.
+
+    Angle and p of polarised standards and q, u of unpolarised ones against their catalogue (each as all other data see
+    it), χ², gains of the cameras, the accuracy of p and what could hide. A night that is there already is replaced, the
+    same calibration is not added twice; the table is whole whenever it is read.
+
+    Exit code 3 if a number of these nights is outside its limits, or a fit is not trusted.
+
+    In Python: the astropy table, of all nights where `output` is given.
+
+    >>> walop.quality("RUN")["CHI2DOF", "OUTSIDE"]  # doctest: +SKIP
+    """
+    from walop_jax import Run
+    from walop_jax.io.atomic import check_output
+    from walop_jax.io.run_folder import RunFolder
+    from walop_jax.reports.posterior_figures import save_figure
+    from walop_jax.reports.survey_figures import quality_figure
+    from walop_jax.science.quality import (
+        OUTSIDE,
+        append,
+        joined,
+        judge,
+        quality_row,
+        read_limits,
+        table_of_nights,
+    )
+
+    allowed = read_limits(limits)
+    if figure is not None:
+        check_output(figure, overwrite=True)
+    given: list[Any] = list(runs) if isinstance(runs, list | tuple) else [runs]
+    rows, remarks = [], []
+    for number, one in enumerate(given, start=1):
+        job.tell(f"run {number} of {len(given)}", "reading")
+        held = calibration_of(one, effects)
+        folder = (
+            one.folder if isinstance(one, Run) else Path(one) if isinstance(one, str | os.PathLike) else None
+        )
+        documents = RunFolder(folder).documents if folder is not None and folder.is_dir() else {}
+        rows.append(
+            quality_row(held, str(folder or held.path), documents.get("summary", {}).get("accuracy_of_p"))
+        )
+        if rows[-1]["NIGHTS"] > 1:
+            remarks.append(
+                f"{rows[-1]['RUN']}: holds {rows[-1]['NIGHTS']} nights, its row is that of the last"
+            )
+    job.begin("writing")
+    new = table_of_nights(rows)
+    table, more = joined(new[:0], new) if output is None else append(output, new, allowed)
+    table = judge(table, allowed)
+    if figure is not None:
+        save_figure(figure, quality_figure(table, allowed), overwrite=True)
+    hashes = {row["CALHASH"] for row in rows}
+    mine = [row for row in table if str(row["CALHASH"]) in hashes]
+    out = [f"night {row['NIGHT']:.0f}: {row[OUTSIDE]} outside the limits" for row in mine if row[OUTSIDE]]
+    shown = tuple(
+        (f"{row['NIGHT']:.0f}", *(f"{row[name]:.4g}" for name in SHOWN), str(row[OUTSIDE])) for row in mine
+    )
+    title = f"{output or 'Quality numbers'}: {len(table)} night{'s' if len(table) != 1 else ''}"
+    return Outcome(
+        table,
+        {
+            "output": output,
+            "nights": [{name: row[name] for name in table.colnames} for row in mine],
+            "limits": {name: list(pair) for name, pair in allowed.items()},
+            "outside": out,
+            "remarks": [*remarks, *more],
+        },
+        display=Display(title, head=("night", *(f">{name}" for name in SHOWN), "outside"), rows=shown),
+        warnings=(*remarks, *more, *out),
+        trusted=not out,
+    )

@@ -1,0 +1,346 @@
+"""Catalogues of single cameras as programs of photometry write them, by a map of the names of their columns.
+
+A map is a small TOML file: those of SExtractor and photutils stand beside this file, others are the user's. It says
+which columns are fluxes with their errors, positions on the sky or in pixels, and flags, and what the bits of the flags
+mean here. What a catalogue has under several names is read from the first that is there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import typing
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS
+from jaxtyping import Float, Int
+
+from walop_jax.data.schema import Column
+from walop_jax.data.table_files import read_table_file
+from walop_jax.data.units import Place, unit_of
+from walop_jax.data.user_tables import OF_STARS, InputTable, hints, in_memory, numeric_column
+from walop_jax.io.errors import DataError, rows_text
+from walop_jax.io.fits_reading import open_fits
+from walop_jax.io.text import parse_toml, read_text, some
+from walop_jax.io.toml import Reader
+
+SHIPPED = ("sextractor", "photutils")
+BITS = (1, 2, 4, 8, 16)
+"""Bits of FLAG that a catalogue may set."""
+BAD_PIXEL = 2
+OF_EXPOSURES = ("FILTER", "MJD", "TEMP", "HA", "CHWP_ANGLE", "CHWP_IN")
+"""Columns, or words of a header, about the exposure: they go with its stars."""
+_LDAC, _HEADER = "LDAC_OBJECTS", "LDAC_IMHEAD"
+_FAINTEST_MAGNITUDE = 40.0
+_COUNTS = ("", "ct", "count", "adu", "electron")
+
+
+@dataclasses.dataclass(frozen=True)
+class ColumnMap:
+    """Names of the columns of a program.
+
+    `flux` are pairs of a flux and its error, `sky` pairs of right ascension and declination (or a column of
+    coordinates of astropy), `pixel` pairs of coordinates that count from `first_pixel`. `bits` gives each bit of `flag`
+    the bit of FLAG that it stands for, 0 for none. `magnitude` are columns that are no fluxes. `unit` is that of fluxes
+    without one.
+    """
+
+    program: str
+    flux: tuple[tuple[str, str], ...]
+    sky: tuple[tuple[str, ...], ...] = ()
+    pixel: tuple[tuple[str, str], ...] = ()
+    first_pixel: int = 1
+    flag: tuple[str, ...] = ()
+    bits: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    magnitude: tuple[str, ...] = ()
+    unit: str = "count"
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraCatalogue:
+    """The stars of one camera: positions (deg), fluxes with errors (counts), and bits of FLAG.
+
+    `of_stars` are columns that go with the stars, `of_exposure` what is the same for all of them; `header` is that of
+    the image, empty where the file has none. Fluxes that were not measured are NaN.
+    """
+
+    path: Path
+    ra: Float[np.ndarray, " n"]
+    dec: Float[np.ndarray, " n"]
+    flux: Float[np.ndarray, " n"]
+    error: Float[np.ndarray, " n"]
+    flag: Int[np.ndarray, " n"]
+    of_stars: Mapping[str, np.ndarray]
+    of_exposure: Mapping[str, Any]
+    header: Mapping[str, Any]
+    remarks: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.ra)
+
+
+def read_map(source: str | os.PathLike[str]) -> ColumnMap:
+    """A map of columns: one that comes with the package, by name, or a TOML file.
+
+    Raises `DataError` naming the key that is wrong.
+    """
+    shipped = str(source) in SHIPPED
+    text = (files("walop_jax.data") / f"{source}.toml").read_text("utf-8") if shipped else read_text(source)
+    reader = Reader(str(source))
+    try:
+        table = parse_toml(text)
+    except ValueError as error:
+        raise DataError(f"{source}: {error}") from None
+    values = reader.values(typing.get_type_hints(ColumnMap), table, "")
+    for key in ("program", "flux"):
+        if not values.get(key):
+            raise reader.fault(
+                "", f"{key} is missing: it names {'the program' if key == 'program' else 'columns'}"
+            )
+    for bit, meaning in values.get("bits", {}).items():
+        if not bit.isdigit() or int(bit).bit_count() != 1:
+            raise reader.fault("bits", f"{bit!r} is no single bit: 1, 2, 4, 8, …")
+        if meaning != 0 and meaning not in BITS:
+            raise reader.fault(
+                "bits", f"{bit} = {meaning}: give a bit of FLAG ({', '.join(map(str, BITS))}), or 0"
+            )
+    for pair in values.get("sky", ()):
+        if len(pair) > 2:
+            raise reader.fault("", f"sky = {list(pair)} must be two columns, or one of coordinates")
+    return ColumnMap(**values)
+
+
+def read_camera_catalogue(
+    path: str | os.PathLike[str], columns: str | os.PathLike[str] | None = None, gain: float | None = None
+) -> CameraCatalogue:
+    """The catalogue of a camera, by a map of columns (None: the one of those that come with the package that fits).
+
+    `gain` is in electrons per count (None: that of the column's unit, else 1, with a remark). Fluxes are in electrons
+    then.
+
+    Raises `DataError` for a file without fluxes, for magnitudes in their place, for flags whose bits the map does not
+    know, and where there is neither a position on the sky nor a WCS.
+    """
+    source, header = _table(Path(path))
+    place = Place(source.path, "")
+    maps = [read_map(columns)] if columns is not None else [read_map(name) for name in SHIPPED]
+    known = next((one for one in maps if _pair(source, one.flux)), None)
+    if known is None:
+        raise _no_flux(source, maps, place)
+    flux, error = _fluxes(source, known, gain, place)
+    ra, dec = _positions(source, known, header, place)
+    flag, remark = _flags(source, known, place)
+    bad = ~(np.isfinite(flux) & np.isfinite(error) & (error > 0))
+    of_stars = {}
+    for name, (unit, _) in OF_STARS.items():
+        kind = "str" if name == "SOURCE_ID" and source.column(name) is not None else "float"
+        if name in source.names:
+            missing = "" if kind == "str" else np.nan
+            of_stars[name] = numeric_column(source, name, Column(kind, unit, missing=missing))  # pyright: ignore[reportArgumentType]
+    of_exposure = {
+        name: value for name in OF_EXPOSURES if (value := _of_all(source, header, name, place)) is not None
+    }
+    if bad.any():
+        source.remarks.append(f"{int(bad.sum())} of {len(bad)} fluxes have no error above 0: not used")
+    unused = [name for name in source.names if name not in source.used]
+    return CameraCatalogue(
+        path=source.path,
+        ra=ra,
+        dec=dec,
+        flux=np.where(bad, np.nan, flux),
+        error=np.where(bad, np.nan, error),
+        flag=np.where(bad, flag | BAD_PIXEL, flag),
+        of_stars=of_stars,
+        of_exposure=of_exposure,
+        header=header,
+        remarks=(*source.remarks, *remark, *hints(unused, ("TEFF", "N_FLAG"), unsure=False)),
+    )
+
+
+def _table(path: Path) -> tuple[InputTable, Any]:
+    """The table of a file, and the header of the image that it was made from, or of the table."""
+    header: Any = {}
+    remarks: list[str] = []
+    try:
+        with open_fits(path) as opened:
+            names = [hdu.name for hdu in opened.hdus]
+            if _HEADER in names:
+                cards = np.asarray(opened.hdus[names.index(_HEADER)].data[0][0]).astype(str).ravel()
+                header = fits.Header.fromstring("".join(card.ljust(80) for card in cards))
+            elif len(opened.hdus) > 1:
+                header = dict(opened.hdus[1].header)
+            if _LDAC in names:
+                path = Path(f"{path}[{_LDAC}]")
+    except DataError:
+        if path.suffix.lower() in (".fits", ".fit", ".ldac"):
+            raise
+    there, table, how = read_table_file(path, ())
+    remarks.extend(how)
+    read = in_memory(table, str(there))
+    read.remarks.extend(remarks)
+    return read, header or {str(key).upper(): value for key, value in read.table.meta.items()}
+
+
+def _pair(source: InputTable, pairs: Sequence[Sequence[str]]) -> Sequence[str]:
+    """The first of pairs of columns that are both there; none: ()."""
+    there = set(source.names)
+    return next((pair for pair in pairs if {_plain(name)[0] for name in pair} <= there), ())
+
+
+def _plain(name: str) -> tuple[str, int]:
+    """A name in capitals, and which of the values in a row is meant, from 1: FLUX_APER[2]; 0: not said."""
+    parts = re.fullmatch(r"(.+)\[(\d+)\]", name)
+    return (parts[1].upper(), int(parts[2])) if parts else (name.upper(), 0)
+
+
+def _one(source: InputTable, name: str, place: Place) -> Any:
+    """A column with one value in a row."""
+    plain, number = _plain(name)
+    column = source.column(plain)
+    values = getattr(column, "shape", (0,))[1:]
+    if values and values != (1,):
+        if not 1 <= number <= values[0]:
+            advice = f"say which in a map of columns (--columns): {plain}[1] … {plain}[{values[0]}]"
+            raise place.fail(f"has {values[0]} apertures", plain, advice)
+        return column[:, number - 1]
+    return column
+
+
+def _no_flux(source: InputTable, maps: Sequence[ColumnMap], place: Place) -> Exception:
+    """The error for a catalogue without fluxes: magnitudes, or names that no map has."""
+    given = [name for name in source.names if any(name in map(str.upper, one.magnitude) for one in maps)]
+    if given or any(unit_of(source.table[name]) == "mag" for name in source.table.colnames):
+        listed = some(given or list(source.names), 4)
+        advice = f"write {maps[0].flux[0][0]} and {maps[0].flux[0][1]} as well: intensities add up, magnitudes do not"
+        return place.fail(f"has magnitudes and no fluxes with errors ({listed})", "", advice)
+    wanted = " or ".join(f"{one.flux[0][0]}, {one.flux[0][1]} of {one.program}" for one in maps)
+    lone = [pair[0] for one in maps for pair in one.flux if pair[0].upper() in source.names]
+    what = f"has {lone[0]} without its error" if lone else f"has no fluxes with errors, such as {wanted}"
+    advice = "name the columns of another program in a TOML file: --columns FILE.toml (walop-jax docs files)"
+    return place.fail(f"{what}; it has {some(list(source.names), 8)}", "", advice)
+
+
+def _fluxes(
+    source: InputTable, known: ColumnMap, gain: float | None, place: Place
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    names = _pair(source, known.flux)
+    others = [pair[0] for pair in known.flux if pair != names and pair[0].upper() in source.names]
+    values = []
+    for name in names:
+        column = _one(source, name, place)
+        unit = unit_of(column).strip().lower()
+        per_time = unit.endswith(("/ s", "/s", "s-1", "s**-1"))
+        if "mag" in unit or per_time or unit not in _COUNTS:
+            advice = {True: "multiply by the exposure time"}.get(
+                per_time, "counts or electrons are needed, not magnitudes"
+            )
+            raise place.fail(f"has the unit {unit}", _plain(name)[0], advice)
+        plain = Column("float", missing=np.nan)
+        one = in_memory({name: np.ma.asarray(column)}, str(source.path))  # without its unit
+        values.append(numeric_column(one, name.upper(), plain))
+    flux, error = values
+    unit = unit_of(_one(source, names[0], place)).strip().lower() or known.unit
+    seen = np.isfinite(flux) & np.isfinite(error) & (error > 0)
+    if (
+        seen.any()
+        and np.abs(flux[seen]).max() < _FAINTEST_MAGNITUDE
+        and np.median(error[seen] / np.abs(flux[seen])) < 0.1
+    ):
+        low, high, typical = flux[seen].min(), flux[seen].max(), np.median(error[seen])
+        what = f"lies between {low:.3g} and {high:.3g} with errors of {typical:.2g}: these are magnitudes"
+        raise place.fail(what, _plain(names[0])[0], "name a column of fluxes")
+    if gain is None and unit != "electron":
+        source.remarks.append(
+            f"{names[0]} is in counts: taken as electrons; --gain gives electrons per count"
+        )
+    if others:
+        source.remarks.append(f"fluxes are {names[0]}, not {some(others, 3)}")
+    factor = 1.0 if gain is None or unit == "electron" else gain
+    return factor * flux, factor * error
+
+
+def _positions(
+    source: InputTable, known: ColumnMap, header: Mapping[str, Any], place: Place
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Right ascension and declination (deg): from the sky, or from pixels by the WCS of the header."""
+    names = _pair(source, (*known.sky, ("RA", "DEC")))
+    if len(names) == 1:
+        directions = source.column(_plain(names[0])[0])
+        if hasattr(directions, "icrs"):
+            return np.asarray(directions.icrs.ra.deg, float), np.asarray(directions.icrs.dec.deg, float)
+        raise place.fail("holds no coordinates of astropy", names[0], "name two columns, in degrees")
+    if names:
+        rule = Column("float", "deg", missing=np.nan)
+        ra, dec = (numeric_column(source, _plain(name)[0], rule) for name in names)
+        place.refuse(
+            ~(np.isfinite(ra) & np.isfinite(dec)), "is not finite", ", ".join(names), "remove these rows"
+        )
+        place.refuse(np.abs(dec) > 90.0, "is beyond ±90°", names[1], "declinations in degrees are needed")
+        if np.all(ra <= 24.0) and "h" in unit_of(
+            source.table.columns[source.names.index(_plain(names[0])[0])]
+        ):
+            ra = ra * 15.0
+        return ra, dec
+    pixels = _pair(source, known.pixel)
+    if not pixels or "CRVAL1" not in header:
+        wanted = known.sky[0] if known.sky else ("RA", "DEC")
+        what = f"has neither {' and '.join(wanted)} nor pixels with the WCS of their image"
+        raise place.fail(
+            what, "", "write the positions on the sky, or a catalogue with the header (FITS_LDAC)"
+        )
+    plane = WCS(fits.Header(header) if not isinstance(header, fits.Header) else header)
+    x, y = (numeric_column(source, _plain(name)[0], Column("float", missing=np.nan)) for name in pixels)
+    ra, dec = plane.celestial.all_pix2world(x, y, known.first_pixel)
+    return np.mod(np.asarray(ra, float), 360.0), np.asarray(dec, float)
+
+
+def _flags(
+    source: InputTable, known: ColumnMap, place: Place
+) -> tuple[Int[np.ndarray, " n"], tuple[str, ...]]:
+    """Bits of FLAG, and remarks."""
+    name = next((name.upper() for name in known.flag if name.upper() in source.names), None)
+    flag = np.zeros(source.rows, np.int64)
+    if name is None:
+        return flag, ("no flags of the stars: blends and saturated ones are not known",)
+    values = numeric_column(source, name, Column("int", missing=0)).astype(np.int64)
+    rest = values.copy()
+    for bit, meaning in known.bits.items():
+        flag |= np.where(values & int(bit) > 0, meaning, 0)
+        rest &= ~int(bit)
+    odd = np.flatnonzero((rest != 0) | (values < 0))
+    if odd.size:
+        what = f"is {values[odd[0]]} in {rows_text(odd)}, which is no flag of {known.program}"
+        raise place.fail(
+            what, name, "say what its bits mean in a map of columns: --columns FILE.toml, table [bits]"
+        )
+    return flag, ()
+
+
+def _of_all(source: InputTable, header: Mapping[str, Any], name: str, place: Place) -> Any:
+    """The value of a column, or of a word of the header, of the exposure; None: none. Refuses several values."""
+    if name not in source.names:
+        value = header.get(name)
+        return value.strip() if isinstance(value, str) else value
+    values = np.unique(np.ma.compressed(np.ma.asarray(source.column(name))))
+    if len(values) > 1:
+        raise place.fail("is not the same in all rows", name, "give the catalogue of one exposure")
+    return values[0] if len(values) else None
+
+
+def centre_of(header: Mapping[str, Any]) -> dict[str, float] | None:
+    """RA and DEC of the centre of an image and the position angle of its axis x (deg), by its WCS; None: no WCS."""
+    if "CRVAL1" not in header or "NAXIS1" not in header or not header.get("CTYPE1", "").startswith("RA"):
+        return None
+    plane = WCS(fits.Header(header) if not isinstance(header, fits.Header) else header).celestial
+    middle = [0.5 * (float(header[f"NAXIS{k}"]) + 1.0) for k in (1, 2)]
+    here: Any = plane.pixel_to_world(middle[0] - 1.0, middle[1] - 1.0)
+    beside: Any = plane.pixel_to_world(middle[0], middle[1] - 1.0)
+    centre = here.icrs
+    angle = float(centre.position_angle(beside.icrs).deg)
+    return {"RA": float(centre.ra.deg), "DEC": float(centre.dec.deg), "ROTATOR": angle}

@@ -1,0 +1,241 @@
+"""The end of a search: additions that the final model does not need, and what remains without a name."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+from walop_jax.calibration.accuracy import largest_change
+from walop_jax.calibration.matrix import instrument_matrices
+from walop_jax.diagnosis import thresholds
+from walop_jax.diagnosis.design import held_out, strata
+from walop_jax.diagnosis.exact import Trial, evidence_of_presence, try_effect
+from walop_jax.diagnosis.examination import Examination
+from walop_jax.diagnosis.findings import Unexplained, describe
+from walop_jax.diagnosis.predictions import predicts_unseen
+from walop_jax.diagnosis.refits import Refits, contradicting, refitted_in_order, settled, without
+from walop_jax.diagnosis.search import State
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood import limits
+from walop_jax.model.effects import Described, FreeForm, OtherDescription
+
+Remainder = tuple[State, Unexplained | None]
+
+
+def concluded(first: State, state: State, judge: Refits) -> Remainder:
+    """The state without what it does not need, and what remains without a name (None: nothing).
+
+    What predicts exposures worse than the first model is not adopted. More descriptions than
+    `thresholds.MOST_SENTENCES` can be one thing that none of them holds.
+    """
+    state, remainder = _leftover(first, prune(first, state, judge), judge)
+    if state.steps and (worse := _worse(first.evidence, state.evidence)):
+        return _not_adopted(first, state, worse)
+    said = _descriptions(state)
+    if remainder is not None:
+        parts = tuple(text for name, text in _contradicted(state).items() if name not in said)
+        return state, dataclasses.replace(remainder, parts=(*remainder.parts, *parts))
+    if len(said) <= thresholds.MOST_SENTENCES:
+        return state, None
+    text = f"{len(said)} descriptions were needed: they say where it sits, no single one of them what it is"
+    remainder = Unexplained(state.evidence.table.p_global, f"{text} ({' | '.join(said)})", ())
+    columns = [first.evidence.said[name] for name in said]
+    if predicts_unseen(first.evidence.design, columns, thresholds.USEFUL):
+        return state, remainder
+    state = _without(first, state, [Described.name], judge)
+    remainder = dataclasses.replace(remainder, p_value=state.evidence.table.p_global)
+    return state, _and(remainder, _LEFT_OUT)
+
+
+def prune(first: State, state: State, judge: Refits) -> State:
+    """The state without additions that its model does not need, the least needed first."""
+    result = state.evidence.result
+    kept, steps = _needed(result, state.steps, judge)
+    return state if kept is result else _refitted(first, state, kept, steps, judge)
+
+
+def _needed(result: FitResult, steps: Sequence[Trial], judge: Refits) -> tuple[FitResult, tuple[Trial, ...]]:
+    """A fit without additions that are not worth `thresholds.LEAST_EVIDENCE` to it, and the others."""
+    steps = tuple(steps)
+    while steps and len(result.model.template.effects) > 1:
+        worth = {step.effect.name: evidence_of_presence(result, step.effect.name) for step in steps}
+        least = min(worth, key=lambda name: worth[name])
+        if worth[least] >= thresholds.LEAST_EVIDENCE:
+            break
+        judge.tell(f"{least} is no longer needed")
+        steps = tuple(step for step in steps if step.effect.name != least)
+        result = without(result, least, [step.effect.name for step in steps])
+    return result, steps
+
+
+def _without(first: State, state: State, names: Sequence[str], judge: Refits) -> State:
+    """The state without some of its additions."""
+    result, steps = state.evidence.result, state.steps
+    for name in names:
+        steps = tuple(step for step in steps if step.effect.name != name)
+        result = without(result, name, [step.effect.name for step in steps])
+    return _refitted(first, state, result, steps, judge)
+
+
+def _refitted(first: State, state: State, result: FitResult, steps: Sequence[Trial], judge: Refits) -> State:
+    """The state with a smaller model, and its additions as they lead to that one after the other."""
+    state = judge.adopt(state, result, steps, first.evidence)
+    in_order = refitted_in_order(steps, first.evidence.design, state.evidence.design)
+    return dataclasses.replace(state, steps=tuple(in_order))
+
+
+# ---------------------------------------------------------------------------------------- what remains
+
+
+def _leftover(first: State, state: State, judge: Refits) -> Remainder:
+    """Remainder of a state, with a free-form term for it where that is of use."""
+    parts: tuple[str, ...] = ()
+    while True:
+        result = state.evidence.result
+        # Errors that are a few per cent too small are no effect: nothing but their size is wrong.
+        if not state.evidence.alarm and (result.explains_data or result.nearly_explains_data):
+            return state, None
+        judge.tell("an unidentified residual remains")
+        if not parts and (names := _parts(first, state)):
+            parts = tuple(names.values())
+            for name in names:
+                judge.tell(f"{name} explains a part only: not added")
+            state = _without(first, state, list(names), judge)
+            continue
+        remainder, with_term = _with_free_form(state, judge)
+        if parts:
+            text = "explains a part and may stand in for something else, not added"
+            remainder = dataclasses.replace(_and(remainder, f"{text}: {'; '.join(parts)}"), parts=parts)
+        if with_term is None:
+            return state, remainder
+        kept, steps = _needed(with_term, state.steps, judge)
+        if kept is with_term:
+            return judge.adopt(state, kept, steps), remainder
+        # Those names only stood in for what has none: what is it without them?
+        bare = without(kept, FreeForm.name, [step.effect.name for step in steps])
+        state = _refitted(first, state, bare, steps, judge)
+
+
+def _parts(first: State, state: State) -> dict[str, str]:
+    """Names that leave a poor fit nearly as poor, with what each of them explains in words.
+
+    Such a name explains no more than it can borrow from what is missing, and the matrix between the points is worse
+    with it. Other descriptions of the instrument stay: they have no amplitude that could bend.
+    """
+    names = [step for step in state.steps if step.effect is not OtherDescription]
+    left, missing = (
+        one.chi2 / max(one.dof, 1) - 1.0 for one in (state.evidence.result, first.evidence.result)
+    )
+    if not names or left < thresholds.POOR_FIT - 1.0 or left * thresholds.PART < missing:
+        return {}
+    found = {}
+    for step in names:
+        before, after = (
+            step.compared[f"chi2_{when}"] / max(first.evidence.dof, 1) for when in ("before", "after")
+        )
+        found[step.effect.name] = f"{step.effect.name} (χ²/dof {before:.3g} → {after:.3g})"
+    return found
+
+
+def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult | None]:
+    """Remainder, and a fit with a free-form term for it (None: it would be of no use)."""
+    evidence = state.evidence
+    result, measured = evidence.result, evidence.design.measured
+    patterns = tuple(evidence.patterns_needed())
+    remainder = _unexplained(evidence, patterns)
+    blocks = dict.fromkeys(block for name, _ in patterns if (block := evidence.blocks[name]) is not None)
+    if len(result.calset.exposures) > limits.FREE_EXPOSURES:
+        blocks.pop("exposures", None)
+    if FreeForm.name in result.model.effect_names or not blocks or judge.over(state.fits):
+        return remainder, None
+    # A block has all patterns of its kind: those that are not needed cost errors as well.
+    every = {
+        block: [measured.candidate(one) for one in strata(measured) if one.block == block] for block in blocks
+    }
+    useful = tuple(
+        block for block in blocks if predicts_unseen(evidence.design, every[block], thresholds.USEFUL)
+    )
+    if not useful:
+        return _and(remainder, _LEFT_OUT), None
+    trial = try_effect(result, FreeForm.of(judge.context, blocks=useful), judge.context)
+    if trial.fit is None or not trial.fit.converged:
+        return remainder, None
+    after = settled(trial.fit, [step.effect.name for step in state.steps])
+    change = largest_change(instrument_matrices(result), instrument_matrices(after))
+    remainder = dataclasses.replace(
+        remainder, term=useful, chi2_before=result.chi2, chi2_after=after.chi2, change_of_qu=change
+    )
+    return remainder, after
+
+
+def _unexplained(evidence: Examination, patterns: tuple[tuple[str, float], ...]) -> Unexplained:
+    """Remainder of an examination without a name: its patterns, and where the residuals sit."""
+    if not evidence.alarm:
+        ratio = evidence.chi2 / evidence.dof
+        text = f"residuals scatter more than N_ERR says (χ²/dof = {ratio:.3g}) without a known pattern"
+    elif patterns:
+        text = f"unidentified patterns: {'; '.join(f'{name} (p = {p:.1g})' for name, p in patterns)}"
+    else:
+        text = "something is missing, but no single pattern is significant by itself"
+    leading = [*evidence.significant[:1], *evidence.significant_sentences[:1]] if evidence.alarm else []
+    if leading:
+        nearest = max(leading, key=lambda item: item.log_bayes)
+        p = evidence.table.corrected(nearest.score)
+        text += f". Nearest comes '{nearest.probe.name}' (p = {p:.1g}), which was not confirmed"
+    where = describe(evidence.design, evidence.design.residual)
+    words = {"cameras": "camera", "kinds": "kind", "field": "field"}
+    words |= {prefix: prefix for prefix in evidence.design.measured.likelihood.plan.moving}
+    told = (f"{name} {where[key]}" for name, key in words.items() if where.get(key) is not None)
+    text += f". Residuals sit in: {'; '.join(told)}"
+    return Unexplained(evidence.table.p_global, text, patterns)
+
+
+# ------------------------------------------------------------------------------------- what is not adopted
+
+
+def _worse(first: Examination, last: Examination) -> str:
+    """Exposures that the final model predicts worse than the first, in words; empty: none."""
+    if kinds := contradicting(first.design, last.design):
+        return f"exposures of {kinds}, as all others predict them"
+    before, after = (held_out(one.design, "exposures") for one in (first, last))
+    if after > (1.0 + thresholds.HELD_OUT_WORSE) * before:
+        return f"exposures that are left out (mean squared residual {before:.3g} → {after:.3g})"
+    return ""
+
+
+def _not_adopted(first: State, state: State, worse: str) -> Remainder:
+    """The first model again: what was found is told as parts."""
+    parts = tuple(
+        f"{step.effect.name} (χ² {step.compared['chi2_before']:.4g} → {step.compared['chi2_after']:.4g})"
+        for step in state.steps
+    )
+    text = f"with what was found the model predicts worse {worse}, so nothing was adopted: {'; '.join(parts)}"
+    remainder = _and(_unexplained(first.evidence, tuple(first.evidence.patterns_needed())), text)
+    remainder = dataclasses.replace(remainder, parts=(*parts, *_contradicted(state).values()))
+    return back_to(first, state), remainder
+
+
+def back_to(first: State, state: State) -> State:
+    """The first state, with the reasons of a later one."""
+    return dataclasses.replace(state, evidence=first.evidence, steps=first.steps)
+
+
+def _contradicted(state: State) -> dict[str, str]:
+    """Everything that exposures of another KIND speak against, in words."""
+    return {
+        one.name: f"{one.name} ({one.reason})" for turn in state.rounds for one in turn.asked if one.against
+    }
+
+
+def _descriptions(state: State) -> tuple[str, ...]:
+    """Names of the groups of sentences that were added."""
+    return tuple(name for step in state.steps for name in step.said)
+
+
+_LEFT_OUT = (
+    "a free-form term was left out: it does not predict settings and field points that it was not fitted to"
+)
+
+
+def _and(remainder: Unexplained, text: str) -> Unexplained:
+    return dataclasses.replace(remainder, description=f"{remainder.description}. {text}")

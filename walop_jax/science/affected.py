@@ -1,0 +1,158 @@
+"""Results that a new calibration changes: the shift of every star in its standard errors, by catalogue and night.
+
+Equation    z = √(δᵀ C⁻¹ δ),  δ = (q, u) by the new calibration − (q, u) by the old one, from the same rows
+Symbols     C covariance of (q, u) by the old calibration: photons, calibration, colour
+Limits      The same calibration: z = 0. z is the largest of |shift| / standard error over all directions of (q, u).
+
+Photons are the same in both, so that z has no noise of theirs: it is what becomes of a result, not a test.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.fit.verdict import Quality
+from walop_jax.io.display import Display, Displayed
+from walop_jax.io.text import some, two_digits
+from walop_jax.science.apply import Stars, results_of
+from walop_jax.science.catalogue import Catalogue
+from walop_jax.sky.nights import night_of
+
+LIMIT = 0.5
+"""Standard errors; a result that is off by a quarter of its variance is made again."""
+MOST = 0.95  # share of the stars of a night that may shift by no more than the limit
+
+
+class NightShift(NamedTuple):
+    """Stars of a night in one catalogue: their shift (standard errors), and the mean shift of q and u themselves.
+
+    `night` is the MJD of the evening, NaN where the catalogue has no times. `lost` stars have a result by the old
+    calibration alone, `gained` ones by the new one alone, `beyond` ones have settings that the new one does not cover.
+    """
+
+    catalogue: str
+    night: float
+    stars: int
+    median: float
+    most: float
+    largest: float
+    q: float
+    u: float
+    above: int
+    lost: int
+    gained: int
+    beyond: int
+    again: bool
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Affected(Displayed):
+    """Nights with the shift of their stars by another calibration; `old` and `new` are content hashes."""
+
+    old: str
+    new: str
+    limit: float
+    nights: tuple[NightShift, ...]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def again(self) -> tuple[str, ...]:
+        """The catalogues that must be made again, each once."""
+        return tuple(dict.fromkeys(night.catalogue for night in self.nights if night.again))
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "old": self.old,
+            "new": self.new,
+            "limit": self.limit,
+            "again": list(self.again),
+            "nights": [night._asdict() for night in self.nights],
+            "warnings": list(self.warnings),
+        }
+
+    def display(self) -> Display:
+        """A line for each night, and what must be made again."""
+        rows = tuple(
+            (
+                night.catalogue,
+                f"{night.night:.0f}" if np.isfinite(night.night) else "",
+                f"{night.stars}",
+                *map(two_digits, (night.median, night.most, night.largest)),
+                *(f"{100 * one:+.4f} %" for one in (night.q, night.u)),
+                "again" if night.again else "",
+            )
+            for night in self.nights
+        )
+        head = ("catalogue", ">night", ">stars", ">median", ">95 %", ">largest", ">q", ">u", "")
+        again = some(list(self.again), 10) if self.again else "nothing"
+        facts = (("to be made again", again), ("limit", f"{self.limit:g} standard errors, 95 % of the stars"))
+        return Display("Shift of q, u by the new calibration, in standard errors", facts, head, rows)
+
+
+def affected(
+    old: Calibration, new: Calibration, catalogue: Catalogue, name: str, limit: float = LIMIT
+) -> Iterator[NightShift]:
+    """The nights of a catalogue, called `name`, with the shift of its stars when `new` takes the place of `old`."""
+    before, after = results_of(old, catalogue), results_of(new, catalogue)
+    beyond = np.zeros(len(before.qu), bool)
+    beyond[catalogue.star[new.beyond_settings(catalogue.points.settings)]] = True
+    time = np.full(len(before.qu), np.nan)
+    np.fmin.at(time, catalogue.star, catalogue.time)
+    evening = night_of(time, old.site.longitude)
+    for night in np.unique(evening):
+        here = evening == night if np.isfinite(night) else np.isnan(evening)
+        yield _night(before, after, here, beyond, (name, float(night)), limit)
+
+
+def _night(
+    before: Stars,
+    after: Stars,
+    here: Bool[np.ndarray, " s"],
+    beyond: Bool[np.ndarray, " s"],
+    which: tuple[str, float],
+    limit: float,
+) -> NightShift:
+    there, then = (~np.isnan(one.qu).any(axis=1) & here for one in (before, after))
+    both = there & then
+    z = shift(before, after)[both]
+    mean = (after.qu - before.qu)[both].mean(axis=0) if both.any() else np.zeros(2)
+    median, most, largest = np.quantile(z, [0.5, MOST, 1.0]) if z.size else np.zeros(3)
+    lost, gained = int((there & ~then).sum()), int((then & ~there).sum())
+    return NightShift(
+        *which,
+        stars=int(here.sum()),
+        median=float(median),
+        most=float(most),
+        largest=float(largest),
+        q=float(mean[0]),
+        u=float(mean[1]),
+        above=int((z > limit).sum()),
+        lost=lost,
+        gained=gained,
+        beyond=int((beyond & here).sum()),
+        again=bool(most > limit) or lost + gained > 0 or verdicts_differ(before, after),
+    )
+
+
+def shift(before: Stars, after: Stars) -> Float[np.ndarray, " s"]:
+    """Shift of every star in standard errors of `before`, in the worst direction of (q, u); NaN without a result."""
+    change = after.qu - before.qu
+    known = np.isfinite(change).all(axis=1)
+    square = np.full(len(change), np.nan)
+    inverse = np.linalg.inv(before.covariance[known])
+    square[known] = np.einsum("si,sij,sj->s", change[known], inverse, change[known])
+    return np.sqrt(square)
+
+
+def verdicts_differ(before: Stars, after: Stars) -> bool:
+    """True where one of the calibrations says of all stars that it is not to be trusted, and the other does not."""
+    bad = Quality.NOT_CONVERGED | Quality.UNEXPLAINED
+    first, second = (int(np.bitwise_and.reduce(one.flag)) & bad for one in (before, after))
+    return first != second

@@ -1,0 +1,267 @@
+"""The common table of stellar polarisation: written from the output of `apply`, and checked.
+
+Panopoulou et al. 2025 (ApJS 276, 15) ask that catalogues of stellar polarisation share one tabular format. The names of
+columns that their compilation has at CDS (J/ApJS/276/15: Name, RAJ2000, DEJ2000, Gmag, Pol, e_Pol, PA, e_PA) are taken
+as they are there, p as a fraction; what a calibrated survey has beyond them (q, u with covariances, the part of the
+calibration, Galactic values) has names of the same kind. Every column has a unit (or is a pure number), a UCD and a
+description.
+
+    Galactic    (q + iu)_gal = (q + iu) exp(−2iψ),    PA_gal = PA − ψ,    C_gal = R C Rᵀ
+                ψ position angle of Galactic north at the star, R the rotation of (q, u) by −2ψ
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.data.schema import Column
+from walop_jax.data.user_tables import InputTable, numeric_column, read_input_table
+from walop_jax.io.errors import fail
+from walop_jax.io.plain_tables import astropy_table, faults_of_ucds
+from walop_jax.sky.directions import designations, galactic
+
+REFERENCE = "Panopoulou et al. 2025, ApJS 276, 15"
+MJD_ZERO = 2400000.5
+_ERROR, _SYSTEMATIC = "stat.error;phys.polarization.stokes", "stat.error.sys;phys.polarization.stokes"
+_SAME = 1e-6  # of fractions that are computed in two ways
+_SAME_ANGLE = 1e-3  # deg, likewise
+
+
+class CommonColumn(NamedTuple):
+    """A column of the common table; `of` is the column of `apply` that it is, "" where it is made of others."""
+
+    unit: str
+    ucd: str
+    about: str
+    of: str = ""
+    needed: bool = True
+
+
+COLUMNS: Mapping[str, CommonColumn] = {
+    "Name": CommonColumn("", "meta.id;meta.main", "designation by the position, ICRS"),
+    "GaiaID": CommonColumn("", "meta.id", "source identifier, of Gaia", "SOURCE_ID", False),
+    "RAJ2000": CommonColumn("deg", "pos.eq.ra;meta.main", "right ascension, ICRS", "RA"),
+    "DEJ2000": CommonColumn("deg", "pos.eq.dec;meta.main", "declination, ICRS", "DEC"),
+    "GLON": CommonColumn("deg", "pos.galactic.lon", "Galactic longitude"),
+    "GLAT": CommonColumn("deg", "pos.galactic.lat", "Galactic latitude"),
+    "Gmag": CommonColumn("mag", "phot.mag;em.opt", "magnitude G of Gaia", "PHOT_G_MEAN_MAG", False),
+    "Plx": CommonColumn("mas", "pos.parallax.trig", "parallax", "PARALLAX", False),
+    "e_Plx": CommonColumn("mas", "stat.error;pos.parallax.trig", "standard error of Plx", "PARALLAX_ERROR", False),
+    "Filter": CommonColumn("", "meta.id;instr.filter", "filter", "FILTER"),
+    "Inst": CommonColumn("", "meta.id;instr", "instrument"),
+    "JD": CommonColumn("d", "time.epoch", "Julian date of mid-exposure, UTC", "", False),
+    "q": CommonColumn("", "phys.polarization.stokes.Q", "Q/I, north through east, IAU"),
+    "u": CommonColumn("", "phys.polarization.stokes.U", "U/I, north through east, IAU"),
+    "e_q": CommonColumn("", f"{_ERROR}.Q", "standard error of q: photons and calibration"),
+    "e_u": CommonColumn("", f"{_ERROR}.U", "standard error of u: photons and calibration"),
+    "cov_qu": CommonColumn("", "stat.covariance;phys.polarization.stokes", "covariance of q and u"),
+    "e_q_sys": CommonColumn("", f"{_SYSTEMATIC}.Q", "share of the calibration in e_q, colours included"),
+    "e_u_sys": CommonColumn("", f"{_SYSTEMATIC}.U", "share of the calibration in e_u, colours included"),
+    "cov_qu_sys": CommonColumn("", "stat.covariance;phys.polarization.stokes", "share of the calibration in cov_qu"),
+    "q_hid": CommonColumn("", f"{_SYSTEMATIC}.Q", "shift by a mistake that may hide, not in e_q", "Q_HIDDEN"),
+    "u_hid": CommonColumn("", f"{_SYSTEMATIC}.U", "shift by a mistake that may hide, not in e_u", "U_HIDDEN"),
+    "Pol": CommonColumn("", "phys.polarization.linear", "degree of polarisation, as measured", "P"),
+    "e_Pol": CommonColumn("", "stat.error;phys.polarization.linear", "standard error of Pol", "P_ERR"),
+    "PolDeb": CommonColumn("", "phys.polarization.linear", "degree of polarisation without its bias", "P_DEBIASED"),
+    "PA": CommonColumn("deg", "pos.posAng;phys.polarization.linear", "position angle, north through east, IAU", "EVPA"),
+    "e_PA": CommonColumn("deg", "stat.error;pos.posAng", "standard error of PA", "EVPA_ERR"),
+    "q_gal": CommonColumn("", "phys.polarization.stokes.Q", "q from Galactic north through Galactic east"),
+    "u_gal": CommonColumn("", "phys.polarization.stokes.U", "u from Galactic north through Galactic east"),
+    "e_q_gal": CommonColumn("", f"{_ERROR}.Q", "standard error of q_gal"),
+    "e_u_gal": CommonColumn("", f"{_ERROR}.U", "standard error of u_gal"),
+    "cov_qu_gal": CommonColumn("", "stat.covariance;phys.polarization.stokes", "covariance of q_gal and u_gal"),
+    "PA_gal": CommonColumn("deg", "pos.posAng;phys.polarization.linear", "position angle from Galactic north"),
+    "chi2": CommonColumn("", "stat.fit.chi2", "chi squared of the measurements of the star", "CHI2"),
+    "dof": CommonColumn("", "stat.fit.dof", "degrees of freedom of chi2", "DOF"),
+    "Nobs": CommonColumn("", "meta.number", "measurements that were combined", "NROWS"),
+    "Flag": CommonColumn("", "meta.code.qual", "quality bits of walop-jax, 0 is good", "FLAG"),
+}  # fmt: skip
+UNITS = {entry.of: entry.unit for entry in COLUMNS.values()} | {"ROTATOR": "deg", "MJD": "d"}
+"""Units of columns of `apply`."""
+_WHOLE = ("dof", "Nobs", "Flag")
+_TEXTS = ("Name", "Filter", "Inst")
+
+
+def to_galactic(
+    qu: Float[np.ndarray, "n 2"], covariance: Float[np.ndarray, "n 2 2"], north: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
+    """(q, u) and covariance from Galactic north, which has the position angle `north` (deg) at each star."""
+    cos, sin = np.cos(2.0 * np.deg2rad(north)), np.sin(2.0 * np.deg2rad(north))
+    turn = np.moveaxis(np.array([[cos, sin], [-sin, cos]]), 2, 0)
+    return np.einsum("nij,nj->ni", turn, qu), turn @ covariance @ turn.swapaxes(1, 2)
+
+
+def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
+    """The common table of the output of `apply`, an astropy table with one row a star, and remarks.
+
+    Stars without a result, and those in the frame of the instrument, are left out, with a remark.
+    Raises `DataError` where RA, DEC or a column of `apply` is missing.
+    """
+    given = source.names
+    for name, why in (("RA", "the sky"), ("DEC", "the sky"), ("QU_PHOTON", "walop-jax apply")):
+        if name not in given:
+            advice = (
+                "give RA and DEC of the stars to apply (walop-jax gather does)"
+                if why == "the sky"
+                else "apply anew"
+            )
+            raise fail(
+                "the column is missing: it comes from " + why, file=source.path, column=name, advice=advice
+            )
+
+    def number(name: str) -> np.ndarray:
+        return numeric_column(source, name, Column("float", UNITS.get(name, ""), missing=np.nan))
+
+    values = {
+        name: number(name)
+        for name in ("Q", "U", "Q_ERR", "U_ERR", "QU_COV", "Q_PHOTON", "U_PHOTON", "QU_PHOTON")
+    }
+    rotator = number("ROTATOR")
+    good = np.isfinite(values["Q"]) & np.isfinite(values["U"])
+    sky = np.isfinite(rotator)
+    key = np.stack([*values.values(), number("CHI2"), number("NROWS")], axis=1)
+    first = np.unique(key, axis=0, return_index=True)[1]
+    keep = np.sort(first[(good & sky)[first]])
+    remarks = []
+    if not keep.size:
+        raise fail("has no star with a result on the sky", file=source.path, advice="give ROTATOR to apply")
+    if lost := int(np.sum(~good)):
+        remarks.append(f"{lost} rows without a result are left out")
+    if inside := int(np.sum(good & ~sky)):
+        remarks.append(f"{inside} rows in the frame of the instrument (no ROTATOR) are left out")
+    ra, dec = number("RA")[keep], number("DEC")[keep]
+    remarks += _about_north(ra, dec, rotator[keep])
+    rows = {name: column[keep] for name, column in values.items()}
+    qu = np.stack([rows["Q"], rows["U"]], axis=1)
+    covariance = _covariance(rows["Q_ERR"], rows["U_ERR"], rows["QU_COV"])
+    systematic = covariance - _covariance(rows["Q_PHOTON"], rows["U_PHOTON"], rows["QU_PHOTON"])
+    longitude, latitude, north = galactic(ra, dec)
+    qu_gal, covariance_gal = to_galactic(qu, covariance, north)
+    made: dict[str, np.ndarray] = {
+        "Name": designations(ra, dec), "GLON": longitude, "GLAT": latitude,
+        "Inst": np.full(len(keep), str(source.table.meta.get("INSTRUME", "WALOP"))),
+        "PA_gal": np.mod(number("EVPA")[keep] - north, 180.0),
+    }  # fmt: skip
+    if "MJD" in given and np.isfinite(number("MJD")[keep]).any():
+        made["JD"] = number("MJD")[keep] + MJD_ZERO
+    for end, matrix in (("", covariance), ("_sys", systematic), ("_gal", covariance_gal)):
+        made[f"e_q{end}"], made[f"e_u{end}"] = np.sqrt(np.maximum(np.einsum("nii->in", matrix), 0.0))
+        made[f"cov_qu{end}"] = matrix[:, 0, 1]
+    for end, pair in (("", qu), ("_gal", qu_gal)):
+        made[f"q{end}"], made[f"u{end}"] = pair.T
+    for name, entry in COLUMNS.items():
+        if name == "Filter":
+            rule = Column("str", missing="SDSS-r")
+            made[name] = numeric_column(source, entry.of, rule)[keep]
+        elif name == "GaiaID" and entry.of in given:
+            made[name] = np.asarray(source.table.columns[given.index(entry.of)])[keep]
+        elif entry.of in given:
+            column = number(entry.of)[keep]
+            made[name] = column.astype(np.int64) if name in _WHOLE else column
+    columns = {name: (made[name], entry.unit, entry.about) for name, entry in COLUMNS.items() if name in made}
+    carried = ("CALHASH", "PESTIM", "HOLDS", "TRUSTED", "ERRFROM")
+    meta = {key: source.table.meta[key] for key in carried if key in source.table.meta}
+    cards = {"POLCCONV": "IAU", "TIMESYS": "UTC", "RADESYS": "ICRS", "REFERENC": REFERENCE}
+    table = astropy_table(columns, {**cards, **meta})
+    for name, column in table.columns.items():
+        column.meta["ucd"] = COLUMNS[name].ucd
+    return table, tuple(remarks)
+
+
+def _covariance(
+    q: Float[np.ndarray, " n"], u: Float[np.ndarray, " n"], both: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 2 2"]:
+    return np.moveaxis(np.array([[q**2, both], [both, u**2]]), 2, 0)
+
+
+def _about_north(
+    ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"], rotator: Float[np.ndarray, " n"]
+) -> list[str]:
+    """A sentence where one ROTATOR for all stars leaves meridian convergence, RA times sin DEC, in their angles."""
+    away = np.mod(ra - ra[0] + 180.0, 360.0) - 180.0
+    off = float(np.ptp(away)) * float(np.abs(np.sin(np.deg2rad(dec))).max()) / 2.0
+    if len(ra) < 2 or np.ptp(rotator) > 0.0 or off < 0.05:
+        return []
+    return [
+        f"ROTATOR is the same for all stars: their angles refer to north at the field centre, up to {off:.2g} deg from "
+        "their own; give that at each star (walop-jax gather does)"
+    ]
+
+
+def check_common_table(table: Any) -> tuple[str, ...]:
+    """Faults of a common table of stellar polarisation, in sentences; none: it is one.
+
+    `table` is an astropy table or a path. Asked are columns, units, UCDs and descriptions, and whether the numbers
+    agree with each other: Pol and PA with q and u (IAU, not COSMO), Galactic with equatorial values, errors with
+    covariances.
+
+    >>> walop.check_common_table("stars.vot")  # doctest: +SKIP
+    ()
+    """
+    if isinstance(table, str | os.PathLike):
+        table = read_input_table(table, ("Pol",)).table
+    found = [
+        f"{name}: the column is missing"
+        for name, entry in COLUMNS.items()
+        if entry.needed and name not in table.colnames
+    ]
+    for name in table.colnames:
+        column, entry = table[name], COLUMNS.get(name)
+        if not column.description:
+            found.append(f"{name}: has no description")
+        if entry is not None and str(column.unit or "") != entry.unit:
+            found.append(f"{name}: the unit is {column.unit or 'none'}, not {entry.unit or 'none'}")
+        if entry is not None and column.meta.get("ucd", entry.ucd) != entry.ucd:
+            found.append(f"{name}: the UCD is {column.meta['ucd']}, not {entry.ucd}")
+    found += faults_of_ucds({name: table[name].meta.get("ucd", "") for name in table.colnames})
+    for card, value in (("POLCCONV", "IAU"), ("TIMESYS", "UTC")):
+        if str(table.meta.get(card, value)) != value:
+            found.append(f"{card} is {table.meta[card]}, not {value}: is the sign of u that of the IAU?")
+    return tuple(found) if found else _wrong_numbers(table)
+
+
+def _wrong_numbers(table: Any) -> tuple[str, ...]:
+    """Sentences on rows whose numbers contradict each other."""
+    texts = (*_TEXTS, "GaiaID")
+    c = {
+        name: np.ma.filled(np.ma.asarray(table[name], float), np.nan)
+        for name in COLUMNS
+        if name in table.colnames and name not in texts
+    }
+    qu, p = np.stack([c["q"], c["u"]], axis=1), np.hypot(c["q"], c["u"])
+    longitude, latitude, north = galactic(c["RAJ2000"], c["DEJ2000"])
+    turned, _ = to_galactic(qu, np.zeros((len(qu), 2, 2)), north)
+    seen, more = p > _SAME, 1.0 + _SAME
+    wrong = {
+        "q, u: not finite": ~np.isfinite(p),
+        "q, u: polarised by more than 1: in per cent?": p > 1.0 + 5.0 * np.hypot(c["e_q"], c["e_u"]),
+        "e_q, e_u: not above 0": ~((c["e_q"] > 0) & (c["e_u"] > 0)),
+        "cov_qu: larger than e_q e_u": np.abs(c["cov_qu"]) > more * c["e_q"] * c["e_u"],
+        "e_q_sys, e_u_sys: larger than e_q, e_u": (c["e_q_sys"] > more * c["e_q"])
+        | (c["e_u_sys"] > more * c["e_u"]),
+        "Pol: not the length of (q, u): in per cent, or debiased?": np.abs(c["Pol"] - p) > _SAME,
+        "PA: not half the angle of (q, u): is the sign of u that of the IAU?": seen
+        & (_apart(c["PA"], np.rad2deg(0.5 * np.arctan2(c["u"], c["q"]))) > _SAME_ANGLE),
+        "PA_gal: not PA from Galactic north": seen & (_apart(c["PA_gal"], c["PA"] - north) > _SAME_ANGLE),
+        "q_gal, u_gal: not q, u from Galactic north": np.abs(c["q_gal"] - turned[:, 0])
+        + np.abs(c["u_gal"] - turned[:, 1])
+        > _SAME,
+        "GLON, GLAT: not those of RAJ2000, DEJ2000": _apart(c["GLON"], longitude, 360.0)
+        + np.abs(c["GLAT"] - latitude)
+        > _SAME_ANGLE,
+    }
+    return tuple(
+        f"{what} ({int(rows.sum())} rows, the first {int(np.argmax(rows))}, counted from 0)"
+        for what, rows in wrong.items()
+        if rows.any()
+    )
+
+
+def _apart(one: np.ndarray, other: np.ndarray, turn: float = 180.0) -> np.ndarray:
+    """Difference of angles (deg), that of whole turns apart."""
+    return np.abs(np.mod(one - other + turn / 2.0, turn) - turn / 2.0)

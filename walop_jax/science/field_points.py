@@ -1,0 +1,154 @@
+"""Tables of field points that an instrument is asked about, with the optical settings there (docs: files)."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Collection, Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.data.schema import EXPOSURES, Column, check, finite
+from walop_jax.data.settings import TEMPERATURE, Settings
+from walop_jax.data.units import Place
+from walop_jax.data.user_tables import (
+    InputTable,
+    empty_cells,
+    numeric_column,
+    read_input_table,
+)
+from walop_jax.io.errors import rows_text
+from walop_jax.model.instrument import Instrument
+
+_SINGLE = 1  # point: it may lie outside without a doubt about its unit
+_WHOLE = 1e-4  # deg: angles in radians that are so close to whole degrees are not read as degrees
+_FINITE = finite("correct or remove these rows")
+
+
+def _also_finite(column: Column, missing: object) -> Column:
+    """A column of a calibration set in a table of field points, where a number is needed in every row."""
+    return dataclasses.replace(column, missing=missing, rules=(_FINITE, *column.rules))
+
+
+POINT_COLUMNS: Mapping[str, Column] = {
+    "X": Column("float", "deg", rules=(_FINITE,)),
+    "Y": Column("float", "deg", rules=(_FINITE,)),
+    "TEFF": EXPOSURES["TEFF"],
+    "FILTER": EXPOSURES["FILTER"],
+    "TEMP": _also_finite(EXPOSURES["TEMP"], TEMPERATURE),
+    "HA": _also_finite(EXPOSURES["HA"], 0.0),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldPoints:
+    """Field points, and the optical settings there, for which an instrument matrix is asked.
+
+    `x`, `y` in degrees; `outside` marks points beyond the field of the instrument.
+    """
+
+    x: Float[np.ndarray, " n"]
+    y: Float[np.ndarray, " n"]
+    settings: Settings
+    outside: Bool[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+
+def field_points(
+    source: InputTable,
+    instrument: Instrument,
+    always_in: Collection[str] = (),
+    never_in: Collection[str] = (),
+) -> FieldPoints:
+    """The X, Y and optional settings of a table of field points of an instrument.
+
+    A moving element has the columns `<P>_ANGLE` and `<P>_IN`; without the latter it is in the beam where it has an
+    angle. Of column prefixes, those `always_in` must have an angle, and those `never_in`, in the beam in no exposure of
+    the calibration, are in it only where `<P>_IN` says so. Single points outside the field are marked; if most of
+    them lie outside, the unit must be wrong.
+
+    Raises `DataError` naming file, column and row for anything that cannot be meant.
+    """
+    place = Place(source.path, "")
+    columns = {name: numeric_column(source, name, rule) for name, rule in POINT_COLUMNS.items()}
+    check(columns, POINT_COLUMNS, place)
+    x, y = columns["X"], columns["Y"]
+    positions = {}
+    for prefix in instrument.moving():
+        name = f"{prefix}_ANGLE"
+        if prefix in always_in and name not in source.names:
+            what = (
+                f"the angle of {prefix} is missing, which was in the beam in all exposures of the calibration"
+            )
+            advice = (
+                f"give the column {name} (deg, NaN: out); for all points of walop-jax matrix --at {prefix}=0"
+            )
+            raise place.fail(what, name, advice)
+        angle = numeric_column(source, name, EXPOSURES["CLP_ANGLE"])
+        doubt_radians(source, name, angle, place)
+        inside, unstated = np.isfinite(angle), np.ones(source.rows, bool)
+        if f"{prefix}_IN" in source.names:
+            rule = EXPOSURES["CHWP_IN"]
+            unstated = empty_cells(source, f"{prefix}_IN", rule)
+            inside = np.where(unstated, inside, numeric_column(source, f"{prefix}_IN", rule))
+        if prefix in never_in:
+            what = f"has values, but no exposure of the calibration had {prefix} in the beam: was it, in"
+            advice = f"add {prefix}_IN: F where it was out, T where it was in"
+            place.refuse(inside & unstated, what, name, advice)
+        advice = f"{prefix}_IN is true: give the angle"
+        place.refuse(inside & ~np.isfinite(angle), "is not finite", name, advice)
+        check({name: angle}, {name: EXPOSURES["CLP_ANGLE"]}, place)
+        positions[prefix] = np.where(inside, angle, np.nan)
+    limit = instrument.field_limit
+    outside = np.maximum(np.abs(x), np.abs(y)) > limit
+    if len(x) > _SINGLE and np.mean(outside) > 0.5:
+        raise place.fail(
+            f"most points lie outside ±{limit:g}° of {instrument.name}: {rows_text(np.flatnonzero(outside))}",
+            "X, Y",
+            "field coordinates are in degrees: are these arcmin or pixels?",
+        )
+    settings = Settings(
+        filter=columns["FILTER"],
+        teff=columns["TEFF"],
+        temperature=columns["TEMP"],
+        hour_angle=columns["HA"],
+        positions=positions,
+    )
+    return FieldPoints(x=x, y=y, settings=settings, outside=outside)
+
+
+def doubt_radians(source: InputTable, name: str, angle: Float[np.ndarray, " n"], place: Place) -> None:
+    """Refuse angles without a unit that are whole degrees if they are radians; remark on others within ±2π."""
+    column = source.column(name)
+    if column is None or getattr(column, "unit", None):
+        return
+    turned = angle[np.isfinite(angle) & (angle != 0)]
+    if not turned.size or np.abs(turned).max() > 6.2832 or np.all(turned == np.round(turned)):
+        return
+    degrees = np.rad2deg(turned)
+    if np.all(np.abs(degrees - np.round(degrees)) < _WHOLE):
+        what = (
+            f"has no unit and is a whole number of degrees in radians ({turned[0]:.6g} = {degrees[0]:.0f}°)"
+        )
+        raise place.fail(what, name, "give degrees, or state the unit of the column")
+    source.remarks.append(f"{name} has no unit and lies within ±2π: taken to be degrees; are these radians?")
+
+
+def true_matrices(
+    path: str | os.PathLike[str], instrument: Instrument
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
+    """X, Y (deg) and M21, M22, … of a table of true matrices, three for each arm.
+
+    Raises `DataError` for what is missing or not finite.
+    """
+    source = read_input_table(path)
+    points = field_points(source, instrument)
+    names = [f"M{arm + 2}{column}" for arm in range(len(instrument.cameras.pairs)) for column in (1, 2, 3)]
+    matrix = np.stack([numeric_column(source, name, Column("float")) for name in names], axis=1)
+    Place(path, "").refuse(
+        ~np.isfinite(matrix), "not finite", f"{names[0]} … {names[-1]}", "remove these rows"
+    )
+    return points.x, points.y, matrix

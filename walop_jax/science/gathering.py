@@ -1,0 +1,293 @@
+"""Catalogues of single cameras made into one: a row a star, matched on the sky.
+
+Positions of each camera are registered against those of the first: a shift or a rotation that a camera has and most
+others have not is an error of its WCS, is taken out, and is remarked on. Then stars are matched that are nearest to
+each other in both lists, within a tolerance; one with two candidates is ambiguous, marked as a blend in that camera.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from walop_jax.data.camera_catalogues import CameraCatalogue
+from walop_jax.data.schema import Column
+from walop_jax.data.user_tables import OF_STARS, in_memory, numeric_column, read_input_table
+from walop_jax.io.errors import fail
+from walop_jax.sky.directions import NOT_MOVED, REACH, Pointing, Registration, mutual, registered
+
+BLEND = 8  # bit of N_FLAG
+FEWEST = 0.2  # of the stars of a camera must be those of the others
+MISSING = 0.2  # of the stars that all others see, from which on a camera is remarked on
+FARTHEST = 1.0  # deg: the median star of the field is nearer to its centre
+Columns = dict[str, tuple[np.ndarray, str, str]]
+"""Values, unit and description of columns by name."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Gathered:
+    """Columns of a catalogue with a row a star (files: catalogues), and remarks on how it came about.
+
+    `registrations` are the shift and rotation of each camera against most others; `matched` counts cameras of each
+    star.
+    """
+
+    columns: Columns
+    pointing: Pointing
+    registrations: tuple[Registration, ...]
+    matched: Int[np.ndarray, " n"]
+    remarks: tuple[str, ...]
+
+
+def gather(
+    catalogues: Sequence[CameraCatalogue],
+    names: Sequence[str],
+    pointing: Pointing,
+    tolerance: float = 1.0,
+) -> Gathered:
+    """One catalogue of the stars of all cameras; `names` are those of the cameras, `tolerance` is in arcsec.
+
+    Raises `DataError` for catalogues of different fields, and for those that have too few stars in common.
+    """
+    places = [_place(one, pointing) for one in catalogues]
+    moves = _registrations(catalogues, places, tolerance)
+    texts = dict.fromkeys(text for one in catalogues for text in one.remarks)
+    remarks = [
+        f"{', '.join(str(one.path) for one in catalogues if text in one.remarks)}: {text}" for text in texts
+    ]
+    remarks += _about_moves(moves, names, tolerance)
+    places = [move.apply(place) for move, place in zip(moves, places, strict=True)]
+    index, ambiguous, place = _matched(places, tolerance)
+    seen = index >= 0
+    _check_common(catalogues, seen, tolerance)
+    keep = seen.sum(axis=1) >= max(len(catalogues) - 1, min(len(catalogues), 2))
+    if dropped := int(np.sum(~keep)):
+        remarks.append(f"{dropped} stars that too few cameras see are left out of {len(keep)}")
+    index, ambiguous, place, seen = index[keep], ambiguous[keep], place[keep], seen[keep]
+    for k, name in enumerate(names):
+        others = np.delete(seen, k, axis=1).all(axis=1)
+        lost = int(np.sum(others & ~seen[:, k]))
+        if lost > MISSING * max(int(others.sum()), 1):
+            remarks.append(
+                f"{name} lacks {lost} of the {int(others.sum())} stars that all other cameras see: is its detection "
+                "threshold that of the others? Their q and u come from the others alone (FLAG 128)"
+            )
+    if doubtful := int(ambiguous.any(axis=1).sum()):
+        remarks.append(
+            f"{doubtful} stars have two candidates within {tolerance:g} arcsec: not used in that camera"
+        )
+    columns, about = _columns(catalogues, pointing, index, ambiguous, place)
+    return Gathered(columns, pointing, moves, seen.sum(axis=1), (*remarks, *about))
+
+
+def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
+    """The same with the columns of a table of known stars (RA, DEC and any of `OF_STARS`) that are matched with them.
+
+    `table` is a path, an astropy table, or columns by name. Positions are registered first, as between cameras.
+    """
+    source = (
+        read_input_table(table, ("RA", "DEC")) if isinstance(table, str | os.PathLike) else in_memory(table)
+    )
+    rule = Column("float", "deg")
+    ra, dec = (numeric_column(source, name, rule) for name in ("RA", "DEC"))
+    near = made.pointing.separation(ra, dec) < FARTHEST
+    known = np.stack(made.pointing.field_of(ra[near], dec[near]), axis=1)
+    place = np.stack([made.columns[name][0] for name in "XY"], axis=1)
+    bright = np.nan_to_num(np.nansum(made.columns["N"][0], axis=1))
+    magnitude = numeric_column(source, "PHOT_G_MEAN_MAG", Column("float", missing=np.nan))[near]
+    move = registered(place, known, bright, np.nan_to_num(-magnitude, nan=-np.inf), tolerance)
+    if not move.pairs:
+        what = f"has no stars in common with the cameras within {REACH / 60.0:g} arcmin"
+        raise fail(what, file=source.path, advice="is it of this field? RA and DEC are in degrees")
+    _, stars, rows = mutual(move.apply(place), known, tolerance)
+    columns = dict(made.columns)
+    for name, (unit, about) in OF_STARS.items():
+        if name in source.names:
+            texts = name == "SOURCE_ID"
+            rule = Column("str", missing="") if texts else Column("float", unit, missing=np.nan)
+            values = np.full(len(place), "" if texts else np.nan, object if texts else float)
+            values[stars] = numeric_column(source, name, rule)[near][rows]
+            columns[name] = (_whole(values) if texts else values, unit, about)
+    remarks = [f"{len(stars)} of {len(place)} stars are in {source.path}"]
+    if np.hypot(*move.shift) > 0.5 * tolerance:
+        shift = f"{move.shift[0]:+.1f} and {move.shift[1]:+.1f} arcsec along X and Y"
+        remarks.append(f"all cameras are shifted by {shift} against {source.path}: is their WCS right?")
+    return dataclasses.replace(made, columns=columns, remarks=(*made.remarks, *remarks))
+
+
+def _place(catalogue: CameraCatalogue, pointing: Pointing) -> Float[np.ndarray, "n 2"]:
+    """Positions on the tangent plane (deg). Refuses a catalogue of another field."""
+    away = pointing.separation(catalogue.ra, catalogue.dec)
+    if (typical := float(np.median(away))) > FARTHEST:
+        raise fail(
+            f"its stars lie {typical:.3g} deg from the field centre RA {pointing.ra:.5g}, DEC {pointing.dec:.5g} deg",
+            file=catalogue.path,
+            advice="is it of another field? Is the centre in degrees (--ra, --dec)?",
+        )
+    near = away < 60.0
+    place = np.full((len(catalogue), 2), np.inf)
+    place[near] = np.stack(pointing.field_of(catalogue.ra[near], catalogue.dec[near]), axis=1)
+    return place
+
+
+def _registrations(
+    catalogues: Sequence[CameraCatalogue], places: Sequence[Float[np.ndarray, "_ 2"]], tolerance: float
+) -> tuple[Registration, ...]:
+    """Shift and rotation of each camera, against the median of all."""
+    first, moves = catalogues[0], [NOT_MOVED]
+    for one, place in zip(catalogues[1:], places[1:], strict=True):
+        move = registered(place, places[0], _brightness(one), _brightness(first), tolerance)
+        if not move.pairs:
+            apart = 60.0 * np.hypot(*(np.median(place, axis=0) - np.median(places[0], axis=0)))
+            what = f"has no stars in common with {first.path} within {REACH / 60.0:g} arcmin"
+            where = f" (their centres are {apart:.2g} arcmin apart)" if apart > 1.0 else ""
+            raise fail(what + where, file=one.path, advice="is it of the same field, and is its WCS right?")
+        moves.append(move)
+    shift = np.median([move.shift for move in moves], axis=0)
+    rotation = float(np.median([move.rotation for move in moves]))
+    return tuple(Registration(move.shift - shift, move.rotation - rotation, move.pairs) for move in moves)
+
+
+def _brightness(catalogue: CameraCatalogue) -> Float[np.ndarray, " n"]:
+    return np.nan_to_num(catalogue.flux, nan=-np.inf)
+
+
+def _about_moves(moves: Sequence[Registration], names: Sequence[str], tolerance: float) -> list[str]:
+    """Sentences on cameras that are shifted, or rotated by what moves the edge of the field."""
+    edge = np.deg2rad([move.rotation for move in moves]) * 0.25 * 3600.0
+    return [
+        f"{name} is shifted by {move.shift[0]:+.1f} and {move.shift[1]:+.1f} arcsec along X and Y and rotated by "
+        f"{60.0 * move.rotation:+.2g} arcmin against the others: taken out; its WCS is off"
+        for name, move, turned in zip(names, moves, edge, strict=True)
+        if np.hypot(*move.shift) > 0.5 * tolerance or abs(turned) > 0.5 * tolerance
+    ]
+
+
+def _matched(
+    places: Sequence[Float[np.ndarray, "_ 2"]], tolerance: float
+) -> tuple[Int[np.ndarray, "s k"], Bool[np.ndarray, "s k"], Float[np.ndarray, "s 2"]]:
+    """The row of each star in every camera (-1: none), where that is ambiguous, and the mean position.
+
+    The camera with the most stars begins; stars that only others see are added.
+    """
+    cameras = len(places)
+    index = np.full((0, cameras), -1)
+    ambiguous, place = np.zeros((0, cameras), bool), np.zeros((0, 2))
+    for k in sorted(range(cameras), key=lambda k: -len(places[k])):
+        doubtful, rows, stars = mutual(places[k], place, tolerance)
+        doubtful |= _crowded(places[k], tolerance)
+        new = np.setdiff1d(np.arange(len(places[k])), rows)
+        count = (index[stars] >= 0).sum(axis=1, keepdims=True)
+        place[stars] = (count * place[stars] + places[k][rows]) / (count + 1)
+        index[stars, k], ambiguous[stars, k] = rows, doubtful[rows]
+        more = np.full((len(new), cameras), -1)
+        more[:, k] = new
+        unsure = np.zeros((len(new), cameras), bool)
+        unsure[:, k] = doubtful[new]
+        index, ambiguous = np.concatenate([index, more]), np.concatenate([ambiguous, unsure])
+        place = np.concatenate([place, places[k][new]])
+    return index, ambiguous, place
+
+
+def _crowded(place: Float[np.ndarray, "n 2"], tolerance: float) -> Bool[np.ndarray, " n"]:
+    """Stars with another one of the same camera within the tolerance."""
+    return mutual(place, place, tolerance)[0]
+
+
+def _check_common(
+    catalogues: Sequence[CameraCatalogue], seen: Bool[np.ndarray, "s k"], tolerance: float
+) -> None:
+    """Refuse a camera that hardly shares stars with the others."""
+    both = seen & (seen.sum(axis=1, keepdims=True) > 1)
+    for one, here, common in zip(catalogues, seen.sum(axis=0), both.sum(axis=0), strict=True):
+        if common < FEWEST * here:
+            raise fail(
+                f"{common} of its {here} stars are matched with those of other cameras within {tolerance:g} arcsec",
+                file=one.path,
+                advice="is it of the same field and WCS? --tolerance is in arcsec",
+            )
+
+
+def _columns(
+    catalogues: Sequence[CameraCatalogue],
+    pointing: Pointing,
+    index: Int[np.ndarray, "s k"],
+    ambiguous: Bool[np.ndarray, "s k"],
+    place: Float[np.ndarray, "s 2"],
+) -> tuple[Columns, list[str]]:
+    def of_cameras(values: Sequence[np.ndarray], missing: Any) -> np.ndarray:
+        seen = index >= 0
+        return np.stack(
+            [np.where(seen[:, k], one[index[:, k]], missing) for k, one in enumerate(values)], axis=1
+        )
+
+    ra, dec = pointing.sky_of(*place.T)
+    flag = of_cameras([one.flag for one in catalogues], 0)
+    columns: Columns = {
+        "RA": (ra, "deg", "right ascension, ICRS"),
+        "DEC": (dec, "deg", "declination, ICRS"),
+        "X": (place[:, 0], "deg", "field coordinate"),
+        "Y": (place[:, 1], "deg", "field coordinate"),
+        "ROTATOR": (pointing.rotator_at(ra, dec), "deg", "position angle of +X at the star"),
+        "N": (of_cameras([one.flux for one in catalogues], np.nan), "", "electrons in each camera"),
+        "N_ERR": (of_cameras([one.error for one in catalogues], np.nan), "", "standard errors of N"),
+        "N_FLAG": (
+            (flag | np.where(ambiguous, BLEND, 0)).astype(np.int32),
+            "",
+            "bits of each camera, 0 is good",
+        ),
+    }
+    remarks = []
+    for name, (unit, about) in OF_STARS.items():
+        given = [k for k, one in enumerate(catalogues) if name in one.of_stars]
+        if not given:
+            continue
+        texts = name == "SOURCE_ID"
+        each = [catalogues[k].of_stars.get(name) if k in given else None for k in range(len(catalogues))]
+        empty = "" if texts else np.nan
+        filled = [
+            np.full(len(one), empty, object if texts else float) if v is None else v
+            for one, v in zip(catalogues, each, strict=True)
+        ]
+        values, differ = _agreed(of_cameras(filled, empty), texts)
+        if differ.any():
+            remarks.append(
+                f"{name} is not the same in all cameras for {int(differ.sum())} stars: taken as unknown"
+            )
+        columns[name] = (_whole(values) if texts else values, unit, about)
+    for name in sorted({name for one in catalogues for name in one.of_exposure}):
+        each = {str(one.of_exposure.get(name)) for one in catalogues}
+        if len(each) > 1 and name != "MJD":
+            raise fail(
+                f"{name} is {' and '.join(sorted(each))} in catalogues of one exposure", advice="correct it"
+            )
+        value = next(one.of_exposure[name] for one in catalogues if name in one.of_exposure)
+        columns[name] = (np.full(len(ra), value), "", "of the exposure")
+    return columns, remarks
+
+
+def _agreed(values: np.ndarray, texts: bool) -> tuple[np.ndarray, Bool[np.ndarray, " s"]]:
+    """The value that all cameras that have one agree on, and where they do not."""
+    known = values != "" if texts else np.isfinite(values.astype(float))
+    first = np.where(known.any(axis=1), known.argmax(axis=1), 0)
+    value = values[np.arange(len(values)), first]
+    same = (
+        values == value[:, None] if texts else np.isclose(values.astype(float), value.astype(float)[:, None])
+    )
+    differ = np.asarray(np.any(known & ~same, axis=1))
+    return np.where(differ, "" if texts else np.nan, value), differ
+
+
+def _whole(values: np.ndarray) -> np.ndarray:
+    """Identifiers as integers where all are such, -1 for unknown ones."""
+    texts = np.where(values == "", "-1", values.astype(str))
+    return (
+        texts.astype(np.int64)
+        if all(text.lstrip("-").isdigit() for text in texts.tolist())
+        else values.astype(str)
+    )

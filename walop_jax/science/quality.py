@@ -1,0 +1,300 @@
+"""Quality numbers of a night: standards against their catalogue, misfit, gains, accuracy; a table of nights, limits.
+
+Equations   A standard as the other data see it, its own catalogue value taken out of the fit: with the covariance C and
+            the value v of (q, u) in the fit, and the prior (c, W) of the catalogue,
+                M⁻¹ = C⁻¹ − W⁻¹,   m = M (C⁻¹ v − W⁻¹ c)
+            Angle ½ (m × c)/|c|² and ratio m·c/|c|² of the polarised ones, m − c of the others: means with weights
+            1/(their variance and that of the catalogue).
+Source      trending of polarised and unpolarised standards as in the quality reports of FORS2 (ESO)
+Limits      C = W (nothing but the catalogue is known of a star): M is infinite, the star is left out.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.data.table_files import read_table_file
+from walop_jax.io.errors import errors_naming, fail
+from walop_jax.io.folder import locked
+from walop_jax.io.plain_tables import astropy_table, stacked, table_format, write_table
+from walop_jax.io.text import parse_toml, read_text
+from walop_jax.io.toml import Reader
+from walop_jax.science.field_accuracy import field_accuracy
+from walop_jax.sky.nights import night_of
+
+POLARISED = 0.005
+"""Catalogued p from which a standard shows angle and p, and below which it shows the zero."""
+HELD = 1e-3  # share of the information of the catalogue that the data must add to a star
+BEYOND = 2.0  # standard errors beyond a limit
+
+NUMBERS: Mapping[str, tuple[str, str]] = {
+    "CHI2DOF": ("", "chi2 per degree of freedom of the fit"),
+    "NSTD": ("", "polarised standards that the data measure"),
+    "ANGLE": ("deg", "angle of polarised standards, measured less catalogue"),
+    "ANGLE_ERR": ("deg", "standard error of ANGLE"),
+    "P_RATIO": ("", "p of polarised standards over the catalogue"),
+    "P_RATIO_ERR": ("", "standard error of P_RATIO"),
+    "NZERO": ("", "unpolarised standards that the data measure"),
+    "ZERO_Q": ("", "q of unpolarised standards, measured less catalogue"),
+    "ZERO_U": ("", "u of unpolarised standards, measured less catalogue"),
+    "ZERO_ERR": ("", "standard error of ZERO_Q and ZERO_U"),
+    "STDCHI2": ("", "chi2 of all standards against their catalogue, per number"),
+    "ACCURACY": ("", "error of p of a star from the calibration, median over the field"),
+    "HIDDEN": ("", "largest error of q or u that could hide, median over the field"),
+}
+"""Quality numbers that every night has, with unit and description; NaN where the run does not hold it."""
+ERRORS = {"ANGLE": "ANGLE_ERR", "P_RATIO": "P_RATIO_ERR", "ZERO_Q": "ZERO_ERR", "ZERO_U": "ZERO_ERR"}
+GAIN = "GAIN"
+OUTSIDE = "OUTSIDE"
+SAME = ("INSTRUME", "NIGHT", "FILTERS")
+"""Columns that are alike in two rows of one night, of which the later one is kept."""
+Limits = Mapping[str, tuple[float, float]]
+
+
+class Standard(NamedTuple):
+    """(q, u) of a standard without its own catalogue value, its covariance, the catalogue's, and its variances."""
+
+    name: str
+    measured: Float[np.ndarray, " 2"]
+    covariance: Float[np.ndarray, "2 2"]
+    catalogue: Float[np.ndarray, " 2"]
+    variance: Float[np.ndarray, " 2"]
+
+
+def standards(calibration: Calibration) -> list[Standard]:
+    """The standards of a calibration as all else has measured them; none that the data do not measure."""
+    model, found = calibration.model, []
+    names = [model.names[i] for i in model.positions("standard")]
+    for name in (entry.removesuffix(".q") for entry in names if entry.endswith(".q")):
+        pair = [model.index(f"{name}.{axis}") for axis in "qu"]
+        priors = [model.parameters[i].prior for i in pair]
+        if not all(priors) or any(model.parameters[i].tie for i in pair):
+            continue
+        catalogue, width = np.array(priors, float).T
+        here = np.linalg.inv(calibration.covariance[np.ix_(pair, pair)])
+        added = here - np.diag(width**-2.0)
+        if np.linalg.eigvalsh(width[:, None] * added * width).min() < HELD:
+            continue
+        covariance = np.linalg.inv(added)
+        measured = covariance @ (here @ calibration.values[pair] - catalogue / width**2)
+        found.append(Standard(name, measured, covariance, catalogue, width**2))
+    return found
+
+
+def _mean(values: Sequence[float], variances: Sequence[float]) -> tuple[float, float]:
+    """Weighted mean and its standard error; NaN of nothing."""
+    if not values:
+        return np.nan, np.nan
+    weight = 1.0 / np.array(variances)
+    return float(np.sum(weight * values) / weight.sum()), float(weight.sum() ** -0.5)
+
+
+def numbers_of(stars: Sequence[Standard]) -> dict[str, float]:
+    """Quality numbers of standards."""
+    polarised = [star for star in stars if np.hypot(*star.catalogue) >= POLARISED]
+    zeros = [star for star in stars if np.hypot(*star.catalogue) < POLARISED]
+    angle, ratio = [], []
+    for star in polarised:
+        p = np.hypot(*star.catalogue)
+        along = star.catalogue / p
+        across = np.array([-along[1], along[0]])
+        total = star.covariance + np.diag(star.variance)
+        angle.append(
+            (np.rad2deg(0.5 * across @ star.measured / p), np.rad2deg(0.5 / p) ** 2 * across @ total @ across)
+        )
+        ratio.append((along @ star.measured / p, along @ total @ along / p**2))
+    zero = [
+        _mean(
+            [float((star.measured - star.catalogue)[k]) for star in zeros],
+            [float(star.covariance[k, k] + star.variance[k]) for star in zeros],
+        )
+        for k in range(2)
+    ]
+    chi2 = [
+        (d := star.measured - star.catalogue) @ np.linalg.solve(star.covariance + np.diag(star.variance), d)
+        for star in stars
+    ]
+    angles, ratios = (_mean([value for value, _ in each], [v for _, v in each]) for each in (angle, ratio))
+    return {
+        "NSTD": len(polarised),
+        "ANGLE": angles[0],
+        "ANGLE_ERR": angles[1],
+        "P_RATIO": ratios[0],
+        "P_RATIO_ERR": ratios[1],
+        "NZERO": len(zeros),
+        "ZERO_Q": zero[0][0],
+        "ZERO_U": zero[1][0],
+        "ZERO_ERR": float(np.hypot(zero[0][1], zero[1][1]) / np.sqrt(2.0)),
+        "STDCHI2": float(np.sum(chi2)) / (2 * len(stars)) if stars else np.nan,
+    }
+
+
+def quality_row(
+    calibration: Calibration, run: str, accuracy: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """The quality numbers of a calibration; `accuracy` is `accuracy_of_p` of its summary, if there is one.
+
+    Exposures of several nights are those of the last one.
+    """
+    exposures, verdict = calibration.exposures, calibration.verdict
+    if accuracy is None:
+        field = field_accuracy(calibration)
+        accuracy = {} if field is None else {"median": field.median, "hidden": field.hidden}
+    known = {
+        name: np.nan if (value := accuracy.get(name)) is None else float(value)
+        for name in ("median", "hidden")
+    }
+    mjd = exposures.mjd[np.isfinite(exposures.mjd)]
+    night = night_of(mjd, calibration.site.longitude)
+    series = np.asarray(calibration.model.instrument(calibration.values).throughput.coefficients)[:, 0]
+    gains = zip(calibration.model.template.cameras.names, series / series.mean(), strict=True)
+    return {
+        "NIGHT": float(night.max()) if night.size else np.nan,
+        "MJD_BEG": float(mjd.min()) if mjd.size else np.nan,
+        "MJD_END": float(mjd.max()) if mjd.size else np.nan,
+        "NIGHTS": len(np.unique(night)),
+        "INSTRUME": calibration.instrument,
+        "FILTERS": ",".join(np.unique(exposures.filter).tolist()),
+        "RUN": run,
+        "CALHASH": calibration.content_hash(),
+        "TRUSTED": verdict.trusted,
+        "CHI2DOF": verdict.chi2 / max(verdict.dof, 1),
+        **numbers_of(standards(calibration)),
+        "ACCURACY": known["median"],
+        "HIDDEN": known["hidden"],
+        **{f"{GAIN}_{name.upper()}": float(gain) for name, gain in gains},
+    }
+
+
+# ---------------------------------------------------------------------------------------------- the table of nights
+
+
+def read_limits(path: str | os.PathLike[str] | None = None) -> Limits:
+    """Limits by the name of a column (GAIN: of all cameras): those of a file, beside those of the package."""
+    shipped = (resources.files("walop_jax.science") / "quality.toml").read_text(encoding="utf-8")
+    limits = _limits(shipped)
+    if path is not None:
+        with errors_naming(path):
+            limits |= _limits(read_text(path))
+    return limits
+
+
+def _limits(text: str) -> dict[str, tuple[float, float]]:
+    read = Reader("")
+    content = read.values(dict.fromkeys((*NUMBERS, GAIN), tuple[float, float]), parse_toml(text), "")
+    for name, (low, high) in content.items():
+        if not low < high:
+            raise read.fault("", f"{name} = [{low:g}, {high:g}]: the lowest value must be below the highest")
+    return content
+
+
+def table_of_nights(rows: Sequence[Mapping[str, Any]]) -> Any:
+    """Rows as an astropy table with units and descriptions."""
+    plain = {
+        "NIGHT": ("d", "MJD of the evening"),
+        "MJD_BEG": ("d", "first exposure"),
+        "MJD_END": ("d", "last exposure"),
+        "NIGHTS": ("", "nights in the run"),
+        "INSTRUME": ("", "instrument"),
+        "FILTERS": ("", "filters"),
+        "RUN": ("", "folder or file of the calibration"),
+        "CALHASH": ("", "content hash of the calibration"),
+        "TRUSTED": ("", "verdict on the fit"),
+        **NUMBERS,
+    }
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    of_camera = ("", "throughput of a camera over the mean of all")
+    return astropy_table(
+        {
+            name: (np.array([row.get(name, np.nan) for row in rows]), *plain.get(name, of_camera))
+            for name in names
+        }
+    )
+
+
+def read_nights(path: Path) -> Any:
+    """The table of nights in a file; `DataError` for one that is none."""
+    _, table, _ = read_table_file(path, (*SAME, "CALHASH"))
+    for name in (*SAME, "CALHASH"):
+        if name not in table.colnames:
+            advice = "name the table that walop-jax quality has made, or a new one"
+            raise fail(
+                "the column is missing: this is no table of quality numbers",
+                file=path,
+                column=name,
+                advice=advice,
+            )
+    return table
+
+
+def joined(old: Any, new: Any) -> tuple[Any, list[str]]:
+    """Both tables as one, in the order of the nights, and remarks; the later row of a night is kept."""
+    rows = stacked(old, new)
+    kept: dict[tuple[str, ...], int] = {}
+    seen, remarks = set[str](), []
+    for number, row in enumerate(rows):
+        key, content = tuple(str(row[name]) for name in SAME), str(row["CALHASH"])
+        if content in seen:
+            remarks.append(f"{row['RUN']}: this calibration is in the table already")
+            continue
+        if key in kept:
+            remarks.append(f"{row['RUN']}: takes the place of {rows[kept[key]]['RUN']} in night {key[1]}")
+        seen.add(content)
+        kept[key] = number
+    made = rows[sorted(kept.values())]
+    made.sort(["NIGHT", "FILTERS"])
+    return made, remarks
+
+
+def judge(table: Any, limits: Limits) -> Any:
+    """The table with the column OUTSIDE: names of the numbers of each night that lie outside their limits."""
+    outside: list[list[str]] = [[] for _ in range(len(table))]
+    for name in table.colnames:
+        camera = name.startswith(f"{GAIN}_")
+        low, high = limits.get(GAIN if camera else name, (-np.inf, np.inf))
+        if not (camera or name in NUMBERS):
+            continue
+        values, error = _plain(table[name]), _plain(table[ERRORS[name]]) if name in ERRORS else 0.0
+        if camera:
+            values = values / _medians_before(values)
+        beyond = np.maximum(low - values, values - high) > BEYOND * np.nan_to_num(error)
+        for row in np.flatnonzero(beyond):
+            outside[row].append(name)
+    for row in np.flatnonzero(~np.asarray(table["TRUSTED"], bool)):
+        outside[row].append("TRUSTED")
+    table[OUTSIDE] = [" ".join(names) for names in outside]
+    table[OUTSIDE].description = "numbers outside their limits"
+    return table
+
+
+def _plain(column: Any) -> Float[np.ndarray, " n"]:
+    return np.ma.filled(np.ma.asarray(column, float), np.nan)
+
+
+def _medians_before(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Median of all earlier rows; of the first one itself."""
+    return np.array([np.nanmedian(values[: max(n, 1)]) for n in range(len(values))])
+
+
+def append(path: str | os.PathLike[str], new: Any, limits: Limits) -> tuple[Any, list[str]]:
+    """Add nights to the table in a file, which is made if it is not there; the whole table, and remarks.
+
+    Nothing is lost where it is killed, and of two processes the second one is told of the first.
+    """
+    table_format(path)
+    there = Path(path)
+    if not there.parent.is_dir():
+        raise fail(f"the folder {there.parent} does not exist", file=path, advice="create it first")
+    with locked(there.parent / f".walop-quality-{there.name}-lock", path):
+        table, remarks = joined(read_nights(there), new) if there.exists() else joined(new[:0], new)
+        table = judge(table, limits)
+        write_table(there, table, overwrite=True)
+    return table, remarks

@@ -1,0 +1,206 @@
+"""Directions of stars: field coordinates, position angles, Galactic coordinates, and stars that are the same.
+
+    east = X sin R + Y cos R,    north = X cos R − Y sin R      on the tangent plane (deg), R = ROTATOR
+
+X and Y are coordinates on the sky: what the optics distort between sky and detector is in the WCS of an image, not in
+them. The axes of the instrument are carried along great circles from the field centre to a star (docs: conventions), so
+that +X has at the star the position angle
+
+    R + φ' − φ        φ, φ' position angles, at the field centre and at the star, of the great circle through both
+
+Astropy does the spherical trigonometry.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from astropy import units
+from astropy.coordinates import SkyCoord
+from astropy.wcs import WCS
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+
+@dataclasses.dataclass(frozen=True)
+class Pointing:
+    """Right ascension and declination of a field centre, and the position angle of +X there (deg)."""
+
+    ra: float
+    dec: float
+    rotator: float
+
+    def _plane(self) -> WCS:
+        """The tangent plane, its coordinates X and Y in degrees."""
+        sin, cos = np.sin(np.deg2rad(self.rotator)), np.cos(np.deg2rad(self.rotator))
+        plane = WCS(naxis=2)
+        plane.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+        plane.wcs.crval = [self.ra, self.dec]
+        plane.wcs.crpix = [0.0, 0.0]
+        plane.wcs.cd = [[sin, cos], [cos, -sin]]
+        return plane
+
+    def field_of(
+        self, ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """X and Y (deg) of stars in the hemisphere about the field centre."""
+        x, y = self._plane().wcs_world2pix(ra, dec, 1)
+        return np.asarray(x, float), np.asarray(y, float)
+
+    def sky_of(
+        self, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Right ascension and declination (deg) of field points."""
+        ra, dec = self._plane().wcs_pix2world(x, y, 1)
+        return np.mod(np.asarray(ra, float), 360.0), np.asarray(dec, float)
+
+    def separation(
+        self, ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """Distance of directions from the field centre (deg)."""
+        return np.asarray(_directions(self.ra, self.dec).separation(_directions(ra, dec)).deg, float)
+
+    def rotator_at(
+        self, ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """Position angle of +X (deg) at stars, from their own north."""
+        centre, stars = _directions(self.ra, self.dec), _directions(ra, dec)
+        there = np.asarray(centre.position_angle(stars).deg)
+        back = np.asarray(stars.position_angle(centre).deg) + 180.0
+        return np.mod(self.rotator + np.where(self.separation(ra, dec) > 0.0, back - there, 0.0), 360.0)
+
+
+def galactic(
+    ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Galactic longitude and latitude of directions, and the position angle of Galactic north there (deg).
+
+    A position angle from Galactic north is that from equatorial north less the last one.
+    """
+    stars: Any = _directions(ra, dec)
+    pole: Any = SkyCoord(0.0, 90.0, unit="deg", frame="galactic")
+    there = stars.galactic
+    longitude, latitude, north = (
+        np.asarray(angle.deg, float) for angle in (there.l, there.b, stars.position_angle(pole.icrs))
+    )
+    return longitude, latitude, north
+
+
+def designations(ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"]) -> np.ndarray:
+    """Names of directions (deg) by their coordinates, Jhhmmss.ss+ddmmss.s, cut off as the IAU asks."""
+    seconds = np.floor(np.mod(ra, 360.0) / 15.0 * 360000.0 + 1e-6).astype(int)  # hundredths
+    arcsec = np.floor(np.abs(dec) * 36000.0 + 1e-6).astype(int)  # tenths
+    sign = np.where(np.asarray(dec) < 0, "-", "+")
+    return np.array(
+        [
+            f"J{s // 360000:02d}{s // 6000 % 60:02d}{s % 6000 / 100:05.2f}"
+            f"{plus}{a // 36000:02d}{a // 600 % 60:02d}{a % 600 / 10:04.1f}"
+            for s, plus, a in zip(seconds.tolist(), sign.tolist(), arcsec.tolist(), strict=True)
+        ]
+    )
+
+
+def same_stars(
+    ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"], tolerance: float
+) -> Int[np.ndarray, " n"]:
+    """The number of the star of every position (deg): chains of those within a tolerance (arcsec) are one star."""
+    stars = _directions(ra, dec)
+    one, other, *_ = stars.search_around_sky(stars, tolerance * units.arcsec)
+    pairs = coo_array((np.ones(len(one)), (one, other)), shape=(len(ra), len(ra)))
+    return connected_components(pairs, directed=False)[1]
+
+
+@dataclasses.dataclass(frozen=True)
+class Registration:
+    """A shift (arcsec, towards X and Y) and a rotation (deg, from X to Y) of positions on a plane about its origin.
+
+    `pairs` is the number of stars that it comes from; 0: the positions have nothing in common.
+    """
+
+    shift: Float[np.ndarray, " 2"]
+    rotation: float
+    pairs: int
+
+    def apply(self, place: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Positions (deg) that were shifted and rotated so, put back."""
+        angle = np.deg2rad(self.rotation)
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        return (place - self.shift / 3600.0) @ turn.T
+
+
+NOT_MOVED = Registration(np.zeros(2), 0.0, 0)
+BRIGHTEST = 300
+"""Stars by which positions are registered."""
+REACH = 300.0  # arcsec: a larger shift is taken for another field
+_CELL = 4.0  # arcsec, of the histogram of differences
+_ROUNDS = 4
+
+
+def registered(
+    place: Float[np.ndarray, "n 2"],
+    reference: Float[np.ndarray, "m 2"],
+    brightness: Float[np.ndarray, " n"],
+    of_reference: Float[np.ndarray, " m"],
+    tolerance: float,
+) -> Registration:
+    """The shift and rotation of positions (deg, on the tangent plane) against others of the same stars.
+
+    Differences of all pairs of bright stars within `REACH` have a peak at the shift; the pairs there give shift and
+    rotation by least squares, each round with those that are closer. No peak above chance: `pairs` is 0.
+    """
+    some = place[np.argsort(-brightness, kind="stable")[:BRIGHTEST]]
+    others = reference[np.argsort(-of_reference, kind="stable")[:BRIGHTEST]]
+    difference = 3600.0 * (some[:, None] - others[None]).reshape(-1, 2)
+    difference = difference[np.abs(difference).max(axis=1) < REACH]
+    if not len(difference):
+        return NOT_MOVED
+    edges = np.arange(-REACH, REACH + _CELL, _CELL)
+    count = np.histogram2d(*difference.T, bins=[edges, edges])[0]
+    count = count + np.roll(count, 1, 0)  # a peak may lie on the edges of four cells
+    count = count + np.roll(count, 1, 1)
+    peak, chance = np.unravel_index(count.argmax(), count.shape), count.mean()
+    if count.max() < max(3.0, chance + 6.0 * np.sqrt(chance), 0.05 * min(len(some), len(others))):
+        return NOT_MOVED
+    found = Registration(np.array([edges[k] for k in peak]), 0.0, int(count.max()))
+    for radius in np.geomspace(2.0 * _CELL, max(3.0 * tolerance, 1.0), _ROUNDS):
+        _, one, other = mutual(found.apply(some), others, radius)
+        if len(one) < 3:
+            break
+        found = _fitted(some[one], others[other])
+    return found
+
+
+def _fitted(place: Float[np.ndarray, "n 2"], reference: Float[np.ndarray, "n 2"]) -> Registration:
+    """Shift and rotation by least squares, small rotations: place = reference + shift + angle × (−Y, X)."""
+    x, y = reference.T
+    one, none = np.ones(len(x)), np.zeros(len(x))
+    design = np.concatenate([np.stack([one, none, -y], 1), np.stack([none, one, x], 1)])
+    along_x, along_y, angle = np.linalg.lstsq(design, (place - reference).T.ravel(), rcond=None)[0]
+    return Registration(3600.0 * np.array([along_x, along_y]), float(np.rad2deg(angle)), len(x))
+
+
+def mutual(
+    place: Float[np.ndarray, "n 2"], reference: Float[np.ndarray, "m 2"], tolerance: float
+) -> tuple[Bool[np.ndarray, " n"], Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Pairs of positions (deg, within a few degrees of the origin) that are nearest to each other within a tolerance.
+
+    The tolerance is in arcsec. First comes which positions are ambiguous, a second one of the reference being within it
+    as well; then the pairs, by their numbers in the two lists.
+    """
+    if not len(place) or not len(reference):
+        return np.zeros(len(place), bool), np.zeros(0, int), np.zeros(0, int)
+    one, other = (_directions(*each.T) for each in (place, reference))
+    there, apart, _ = one.match_to_catalog_sky(other)
+    back, *_ = other.match_to_catalog_sky(one)
+    pairs = np.flatnonzero((back[there] == np.arange(len(place))) & (apart.arcsec <= tolerance))
+    ambiguous = np.zeros(len(place), bool)
+    if len(reference) > 1:
+        ambiguous = one.match_to_catalog_sky(other, nthneighbor=2)[1].arcsec <= tolerance
+    return np.asarray(ambiguous), pairs, np.asarray(there)[pairs]
+
+
+def _directions(ra: float | Float[np.ndarray, " n"], dec: float | Float[np.ndarray, " n"]) -> Any:
+    return SkyCoord(ra, dec, unit="deg", frame="icrs")
