@@ -3,43 +3,25 @@
 import dataclasses
 import json
 
+import class_scene
 import numpy as np
 import pytest
-from small_run import SMALL
+from class_scene import TOLD
 
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.certify import certify
 from walop_jax.calibration.matrix import instrument_matrices
-from walop_jax.diagnosis import grammar
-from walop_jax.diagnosis.class_members import classes_of
-from walop_jax.diagnosis.class_product import averaged, only_a_class
-from walop_jax.diagnosis.examination import examine
+from walop_jax.diagnosis.class_product import _with_ties, averaged, only_a_class
 from walop_jax.fit.model_file import base_model
-from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
-from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described
-from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.model.specification import with_effects
 from walop_jax.posterior.run import Run
-from walop_jax.simulation.simulate import simulate
-
-TOLD = "gain of O1 * kind moon"
 
 
 @pytest.fixture(scope="module")
 def told():
-    """A camera is brighter on the Moon by 0.3 %: the fit, the context, and the class of that description."""
-    context = SMALL.context()
-    calset = simulate(SMALL, seed=3, effects=[Described.saying([TOLD], [3e-3])]).calset
-    context = effect_context(base_model(calset).template, calset.exposures)
-    model = with_effects(base_model(calset), [Described.saying([TOLD], [0.0])], context)
-    result = fit(Likelihood.of(calset, model))
-    said = [
-        probe
-        for probe in grammar.sentences(model.template, calset.exposures, len(calset.points))
-        if probe.name.startswith("gain of")
-    ]
-    state = examine(result, (), np.random.default_rng(0), sentences=said)
-    return result, context, classes_of(state, context, {Described.name}, [TOLD])
+    return class_scene.told()
 
 
 def test_what_one_kind_has_against_the_others_the_others_have_against_it(told):
@@ -67,6 +49,33 @@ def test_the_product_lies_between_and_its_errors_hold_both(told):
     sentence = " ".join(only_a_class(classes))
     assert "only a class of causes was named" in sentence
     assert "plan --criterion apart" in sentence
+
+
+def test_one_amplitude_of_two_kinds_is_one_parameter(told):
+    """The polariser and the standards are wrong by the same: a covariance of both as two would be singular."""
+    result, context, classes = told
+    product = averaged(Calibration.from_fit(result.judged()), classes, context)
+    clp, standard = (f"described.gain_of_O1_*_kind_{kind}" for kind in ("clp", "standard"))
+    assert product.model[standard].tie == clp
+    values = dict(zip(product.model.names, product.values, strict=True))
+    assert values[clp] == pytest.approx(values[standard], rel=1e-12)
+    checks = {check.name: check for check in certify(product.product)}
+    assert checks["covariance"].passed, checks["covariance"].found
+    assert checks["maps"].passed
+
+
+def test_sentences_in_a_fixed_ratio_have_one_error(told):
+    """Amplitudes a, b: s₁ = a, s₂ = a + b, s₃ = b, s₄ = a. Two of the four are free."""
+    result, context, _ = told
+    texts = [f"gain of {camera} * hours" for camera in ("O1", "E1", "O2", "E2")]
+    model = with_effects(base_model(result.calset), [Described.saying(texts, [0.0, 0.0, 0.0, 0.0])], context)
+    new = [model.index(f"described.{text.replace(' ', '_')}") for text in texts]
+    amplitudes = np.zeros((len(model.parameters), 2))
+    amplitudes[new] = [[1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [1.0, 0.0]]
+    made = _with_ties(model, new, amplitudes)
+    one, two, three, four = (made.parameters[i] for i in new)
+    assert [one.free, two.free, three.free] == [True, True, False]
+    assert four.tie == one.name
 
 
 def test_a_class_of_one_changes_nothing(told):

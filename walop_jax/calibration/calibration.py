@@ -230,13 +230,13 @@ class Calibration(Contents, Fitted):
 
     @classmethod
     def from_fit(cls, result: FitResult, residuals: ResidualMap | None = None) -> Calibration:
-        """The calibration that a fit gives, with the verdict on it.
+        """The calibration that a fit gives, with the verdict on it: of a diagnosis the mean over what it leaves open.
 
         `residuals` is what the model leaves over the field (`residual_map`), worth its pass for large sets.
         Raises RuntimeError for a fit that nobody has examined.
         """
         calset = result.calset
-        return cls(
+        made = cls(
             model=result.model,
             values=result.values,
             covariance=0.5 * (result.covariance + result.covariance.T),
@@ -251,6 +251,7 @@ class Calibration(Contents, Fitted):
             residuals=residuals,
             hidden=result.hidden,
         )
+        return made if result.averaged is None else result.averaged(made)
 
     def with_covariance(self, covariance: Matrix, errors_from: str) -> Calibration:
         """The calibration with the covariance of a posterior, made of errors from `errors_from`, as made now."""

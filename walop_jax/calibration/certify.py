@@ -87,7 +87,8 @@ def _verdict(product: Product) -> list[Check]:
     v, bits = product.verdict, product.verdict.quality
     unexplained, ill = bool(bits & Quality.UNEXPLAINED), bool(bits & Quality.ILL_CONDITIONED)
     reached = "the minimum was reached" if v.converged else "no"
-    found = (f"χ²/dof = {v.chi2 / max(v.dof, 1):.4g}", *(() if unexplained else v.doubts[:1]))
+    why = [doubt.sentence for doubt in v.against if doubt.blocking and doubt.sentence]
+    found = (f"χ²/dof = {v.chi2 / max(v.dof, 1):.4g}", *(() if unexplained else why[:1]))
     return [
         Check("converged", v.converged and not bits & Quality.NOT_CONVERGED, reached),
         Check("explains the data", v.trusted and not unexplained, "; ".join(found)),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Job, Option, Outcome, command
-from walop_jax.commands.inputs import IN_MEMORY, Effects, PathLike, Product, catalogue_of, folder_of
+from walop_jax.commands.inputs import IN_MEMORY, Effects, PathLike, Product, catalogue_of, fit_of, folder_of
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, errors_naming
 
@@ -110,16 +110,17 @@ def certify(
     from walop_jax.calibration.product import product_path, read_product
 
     job.tell("checking")
-    if isinstance(calibration, Calibration | FitResult):
-        there = Calibration.from_fit(calibration) if isinstance(calibration, FitResult) else calibration
+    given: Any = fit_of(calibration)
+    if isinstance(given, Calibration | FitResult):
+        there = Calibration.from_fit(given) if isinstance(given, FitResult) else given
         path, product, catalogue = Path(IN_MEMORY), there.product, there.model.catalogue
     else:
-        path = product_path(folder_of(calibration))
+        path = product_path(folder_of(given))
         product, catalogue = read_product(path), catalogue_of(effects)
     with errors_naming(path):
         checks = tuple(checks_of(product, catalogue))
     rebuilt = any(check.name == "model" and check.passed for check in checks)
-    asked = _requirements(job, calibration, path, catalogue) if rebuilt else ()
+    asked = _requirements(job, given, path, catalogue) if rebuilt else ()
     parents = tuple(entry.sha256 for entry in product.inputs)
     made = Certificate(path, checks, asked, validity(product), product.content_hash(), parents)
     why = "; ".join(f"{check.name} ({check.found})" for check in made.failed)

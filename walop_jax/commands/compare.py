@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from walop_jax.commands.command import Job, Option, Outcome, Writers, command, figure_file
 from walop_jax.commands.inputs import (
     NOT_CARRIED_OVER,
+    Diagnosed,
     Effects,
     Folder,
     InstrumentLike,
@@ -37,7 +38,7 @@ TRUTH = Option("True X, Y, M21 … M33 (FITS, CSV), for simulated sets.", "TABLE
 def compare(
     job: Job,
     data: Sets,
-    calibration: Calibration | FitResult | Run | PathLike | None = None,
+    calibration: Calibration | FitResult | Diagnosed | Run | PathLike | None = None,
     *,
     output: Folder = None,
     truth: Annotated[Truth | PathLike | None, TRUTH] = None,

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import (
     Job,
     Option,
     Outcome,
-    PathLike,
     UsageError,
     Writers,
     command,
@@ -20,6 +19,7 @@ from walop_jax.commands.inputs import (
     Effects,
     InstrumentLike,
     ModelLike,
+    PathLike,
     Sets,
     paths_of,
     set_and_model,
@@ -62,7 +62,7 @@ def diagnose(
     effects: Effects = None,
     minutes: Annotated[float | None, MINUTES] = None,
     why: Annotated[str | None, WHY] = None,
-) -> Outcome[Diagnosis | str]:
+) -> Outcome[Diagnosis]:
     """Say what is missing from the model, add it, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
 
     The verdict is consistent, effect_found or unexplained. Effects that the data cannot tell apart are listed
@@ -78,14 +78,7 @@ def diagnose(
 
     >>> walop.diagnose("night.fits", progress=print).verdict  # doctest: +SKIP
     """
-    from walop_jax.calibration.product import write_calibration
-    from walop_jax.calibration.summary import summary
-    from walop_jax.diagnosis.figure_data import figure_data, write_figure_data
-    from walop_jax.diagnosis.findings import document
     from walop_jax.diagnosis.workflow import diagnose as diagnosis_of
-    from walop_jax.fit.misfit import describe
-    from walop_jax.fit.model_file import render
-    from walop_jax.science.field_accuracy import answered
 
     if why is not None:
         return _why(why, data)
@@ -95,16 +88,27 @@ def diagnose(
     calset, chosen = set_and_model(data, model, instrument, effects, output=output)
     with job.repeated() as say:
         found = diagnosis_of(calset, chosen, seed=job.seed, minutes=minutes, progress=say)
+    return outcome_of(job, found, output)
 
-    product = found.calibration()
-    after = answered(found.after, product)
+
+def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[Diagnosis]:
+    """Outcome of a diagnosis: all that is printed and written of it."""
+    from walop_jax.calibration.product import write_calibration
+    from walop_jax.calibration.summary import summary
+    from walop_jax.diagnosis.figure_data import figure_data, write_figure_data
+    from walop_jax.diagnosis.findings import document
+    from walop_jax.fit.misfit import describe
+    from walop_jax.fit.model_file import render
+    from walop_jax.science.field_accuracy import answered
+
+    product, after = found.calibration(), answered(found.after)
     usable = after.trusted and found.verdict != "unexplained"
 
     def files() -> Writers:
         job.tell("mapping the field", "mapping")
         drawn_from = figure_data(found)
         misfit = None if after.explains_data else describe(after)
-        fitted = summary(after, seconds=job.seconds, misfit=misfit) | {"seed": job.seed}
+        fitted = summary(after, seconds=found.seconds, misfit=misfit) | {"seed": job.seed}
         return {
             PRODUCT: lambda path: write_calibration(path, product),
             SUMMARY: text_file(json_text(fitted | {"shown": after.display().document()})),
@@ -125,7 +129,7 @@ def diagnose(
     )
 
 
-def _why(name: str, data: Sets) -> Outcome[Diagnosis | str]:
+def _why(name: str, data: Sets) -> Outcome[Any]:
     """The answer of a run to why something was not named."""
     from walop_jax.diagnosis.reasons import why
     from walop_jax.io.run_folder import RunFolder
@@ -137,6 +141,14 @@ def _why(name: str, data: Sets) -> Outcome[Diagnosis | str]:
     run.wanted(DIAGNOSIS, "give the RUN of walop-jax diagnose")
     answer = why(run.document(DIAGNOSIS, ("steps", "candidates")), name)
     return Outcome(answer, {"name": name, "answer": answer.splitlines()}, answer)
+
+
+def write(found: Diagnosis, folder: PathLike, *, overwrite: bool = False) -> None:
+    """Write a diagnosis as the folder that the command makes."""
+    from walop_jax.io.folder import output_folder
+
+    with output_folder(folder, OUTPUTS, overwrite=overwrite) as out:
+        outcome_of(Job(), found, folder).save(out)
 
 
 def _with_answer(found: Diagnosis, after: FitResult) -> Display:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import SETS, Effects, PathLike, calibration_of, catalogue_of, set_of
+from walop_jax.commands.inputs import SETS, Diagnosed, Effects, PathLike, calibration_of, catalogue_of, set_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ OUTPUTS = ("calibration.fits", "epoch.json")
 @command(stages=("reading", "fitting", "lacking"), writes=OUTPUTS, random=True)
 def epoch(
     job: Job,
-    old: Annotated[Calibration | FitResult | Run | PathLike, OLD],
+    old: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike, OLD],
     new: Annotated[CalibrationSet | PathLike | Sequence[PathLike], SETS],
     *,
     output: Annotated[PathLike | None, FOLDER] = None,

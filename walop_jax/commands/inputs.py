@@ -11,7 +11,7 @@ import os
 import reprlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError
 from walop_jax.io.errors import DataError, errors_naming, fail
@@ -22,6 +22,16 @@ if TYPE_CHECKING:
     from walop_jax.data.user_tables import InputTable
     from walop_jax.fit.verdict import Quality
     from walop_jax.model.effects import EffectKind
+
+
+class Diagnosed(Protocol):
+    """A result with a last fit: a diagnosis."""
+
+    @property
+    def after(self) -> FitResult:
+        """That fit, of which the calibration is that of the diagnosis."""
+        ...
+
 
 GIGABYTE = 1e9
 IN_MEMORY = "in memory"
@@ -55,7 +65,7 @@ InstrumentLike = Annotated[
 ]
 Effects = Annotated["PathLike | Sequence[EffectKind] | None", EFFECTS]
 Product = Annotated[
-    "Calibration | FitResult | Run | PathLike",
+    "Calibration | FitResult | Diagnosed | Run | PathLike",
     Argument("Calibration product, or the folder of a run.", "RUN/calibration.fits", Path),
 ]
 DataOf = Annotated[
@@ -226,18 +236,27 @@ def set_and_model(
         return calset, model_for(calset, text, design, catalogue_of(effects))
 
 
+def fit_of(given: Any) -> Any:
+    """The last fit of a diagnosis, whose calibration is that of the diagnosis; anything else as it is."""
+    from walop_jax import FitResult
+
+    after = getattr(given, "after", None)
+    return after if isinstance(after, FitResult) else given
+
+
 def calibration_of(given: Product, effects: Effects = None) -> Calibration:
-    """A calibration: as given, that of a fit, or that of a product or run, with what its file says.
+    """A calibration: as given, that of a fit or a diagnosis, or that of a product or run, with what its file says.
 
     Raises `DataError` for a file that cannot be read.
     """
     from walop_jax import Calibration, FitResult
     from walop_jax.calibration.product import read_calibration
 
-    if isinstance(given, Calibration | FitResult):
-        there = given if isinstance(given, Calibration) else Calibration.from_fit(given)
+    held: Any = fit_of(given)
+    if isinstance(held, Calibration | FitResult):
+        there = held if isinstance(held, Calibration) else Calibration.from_fit(held)
         return there if there.path is not None else dataclasses.replace(there, path=Path(IN_MEMORY))
-    return read_calibration(folder_of(given), catalogue_of(effects))
+    return read_calibration(folder_of(held), catalogue_of(effects))
 
 
 def save(

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command, figure_file
 from walop_jax.commands.inputs import (
+    Diagnosed,
     Effects,
     InstrumentLike,
     ModelLike,
     PathLike,
     catalogue_of,
+    fit_of,
     paths_of,
     set_and_model,
 )
@@ -38,7 +40,9 @@ OUTPUTS = ("limits.json", "limits_protection.png", "limits_separation.png")
 )
 def limits(
     job: Job,
-    data: Annotated[FitResult | ObservingPlan | CalibrationSet | PathLike | Sequence[PathLike], DATA],
+    data: Annotated[
+        FitResult | Diagnosed | ObservingPlan | CalibrationSet | PathLike | Sequence[PathLike], DATA
+    ],
     model: ModelLike = None,
     *,
     output: Annotated[PathLike | None, FOLDER] = None,
@@ -65,6 +69,7 @@ def limits(
     from walop_jax.simulation.simulate import as_planned
 
     job.begin("reading")
+    data = fit_of(data)
     plan = data if isinstance(data, ObservingPlan) else None
     if isinstance(data, str | os.PathLike | Sequence):
         paths = paths_of(data)

@@ -92,7 +92,6 @@ def plan(
     from walop_jax import ObservingPlan
     from walop_jax.data.records import CALIBRATION_PLATE
     from walop_jax.data.user_tables import read_input_table
-    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.io.names import PLANNED
     from walop_jax.plans.available import Available
     from walop_jax.plans.criteria import check_wishes
@@ -104,8 +103,7 @@ def plan(
         available != "" and Path(str(available)).is_dir()
     ):
         after, available = available, ""
-    held = after.after if isinstance(after, Diagnosis) else after
-    known = None if held is None else calibration_of(held, effects)
+    known = None if after is None else calibration_of(after, effects)
     catalogue = catalogue_of(effects) if effects is not None or known is None else known.model.catalogue
     alike = (apart,) if isinstance(apart, str) else tuple(apart or ())
     if criterion == "apart" and not alike:

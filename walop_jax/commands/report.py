@@ -8,7 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, command_of
-from walop_jax.commands.inputs import DataOf, Effects, PathLike, catalogue_of, folder_of, save
+from walop_jax.commands.inputs import (
+    DataOf,
+    Diagnosed,
+    Effects,
+    PathLike,
+    catalogue_of,
+    fit_of,
+    folder_of,
+    save,
+)
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:
@@ -40,7 +49,7 @@ class Page(Displayed):
 @command(stages=("reading", "drawing"), writes=())
 def report(
     job: Job,
-    run: Annotated[FitResult | Run | PathLike, RUN],
+    run: Annotated[FitResult | Diagnosed | Run | PathLike, RUN],
     output: Annotated[PathLike | None, FILE] = None,
     *,
     data: DataOf = None,
@@ -55,23 +64,27 @@ def report(
     epoch, limits, plan, stack, watch and certify have pages of their own. A page that exists is made anew; another file
     of that name is left alone unless --overwrite is given.
 
-    In Python: a `Page`; of a fit in memory, which needs an `output`.
+    In Python: a `Page`; of a fit or a diagnosis in memory, which needs an `output`.
 
     >>> walop.report(result, "page.html")  # doctest: +SKIP
     """
     from walop_jax import FitResult, Run
+    from walop_jax.commands.diagnose import write
     from walop_jax.io.atomic import atomic_path, check_output
     from walop_jax.io.text import encodable
     from walop_jax.reports.page import kind_of_run, render, render_other
     from walop_jax.reports.run import read_run
 
-    if isinstance(run, FitResult):
+    if isinstance(fit_of(run), FitResult):
         if output is None:
             raise UsageError("say where the page of a fit in memory is to be written", "output")
         with tempfile.TemporaryDirectory() as temporary:
-            save(run, Path(temporary) / "fit")
+            if isinstance(run, FitResult):
+                save(run, Path(temporary) / "fit")
+            else:
+                write(run, Path(temporary) / "fit")  # pyright: ignore[reportArgumentType]
             return command_of(report).body(job, Path(temporary) / "fit", output, effects=effects)
-    folder = folder_of(run)
+    folder = folder_of(run)  # pyright: ignore[reportArgumentType]
     target = folder / PAGE if output is None else Path(output)
     job.begin("reading")
     kind = kind_of_run(folder)

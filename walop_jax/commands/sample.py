@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command, text_file
-from walop_jax.commands.inputs import DataOf, Effects, ModelLike, PathLike, catalogue_of, folder_of
+from walop_jax.commands.inputs import (
+    DataOf,
+    Diagnosed,
+    Effects,
+    ModelLike,
+    PathLike,
+    catalogue_of,
+    fit_of,
+    folder_of,
+)
 from walop_jax.io.errors import fail
 from walop_jax.io.text import read_text
 
@@ -30,7 +39,7 @@ OUTPUTS = (
 @command(writes=(), random=True)
 def sample(
     job: Job,
-    fit: Annotated[FitResult | Run | PathLike, RUN],
+    fit: Annotated[FitResult | Diagnosed | Run | PathLike, RUN],
     *,
     resume: Annotated[bool, Option("Go on from the chain in RUN/sampling (emcee).")] = False,
     model: ModelLike = None,
@@ -82,13 +91,14 @@ def sample(
     anew = () if not resume or options.make_sampler().resumes else (
         f"the chain of {name} is not kept: it started anew, resume was of no use",
     )  # fmt: skip
+    fit = fit_of(fit)
     if isinstance(fit, FitResult):
         if resume or model is not None:
             raise ValueError("a fit in memory has its model and keeps no chain: leave model and resume out")
         posterior = sample_fit(fit, options, report=tell)
         where = "the fit"
     else:
-        where = folder_of(fit)
+        where = folder_of(fit)  # pyright: ignore[reportArgumentType]
         run = Run(where, catalogue_of(effects), tuple(data or ()))
         posterior = _sampled_run(job, run, options, tell, model, resume)
     return Outcome(

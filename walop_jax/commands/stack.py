@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import Effects, PathLike, calibration_of, catalogue_of
+from walop_jax.commands.inputs import Diagnosed, Effects, PathLike, calibration_of, catalogue_of, fit_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -30,7 +30,7 @@ def stack(
     nights: Annotated[Any, NIGHTS],
     laws: Annotated[Any, LAWS] = None,
     *,
-    like: Annotated[Calibration | FitResult | Run | PathLike | None, LIKE] = None,
+    like: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike | None, LIKE] = None,
     events: Annotated[Any, EVENTS] = None,
     no_breaks: Annotated[bool, KNOWN] = False,
     workers: Annotated[int | None, WORKERS] = None,
@@ -68,6 +68,7 @@ def stack(
             "workers and scheduler exclude each other: a cluster has its own workers", "scheduler"
         )
     given: list[Any] = list(nights) if isinstance(nights, list | tuple) else [nights]
+    given = [fit_of(one) for one in given]
     with job.reserved(output, FILES) as job, executor_of(workers, scheduler) as executor:
         job.begin("reading")
         survey = stacked(

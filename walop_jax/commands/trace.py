@@ -12,6 +12,7 @@ from walop_jax.commands.inputs import (
     NOT_CARRIED_OVER,
     TEFF,
     Angles,
+    Diagnosed,
     Effects,
     InstrumentLike,
     PathLike,
@@ -32,7 +33,9 @@ ANGLE = Option("Polariser in, with its axis here (deg).", kind=float)
 @command()
 def trace(
     job: Job,
-    calibration: Annotated[Calibration | FitResult | Run | Instrument | PathLike | None, PRODUCT] = None,
+    calibration: Annotated[
+        Calibration | FitResult | Diagnosed | Run | Instrument | PathLike | None, PRODUCT
+    ] = None,
     *,
     instrument: InstrumentLike = None,
     effects: Effects = None,

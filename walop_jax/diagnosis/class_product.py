@@ -11,6 +11,7 @@ Limits       to first order; what was added to one and the other is taken as ind
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -21,10 +22,11 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.thresholds import GOAL
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_average import known_apart_from, mixture
+from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import some, two_digits
 from walop_jax.model.effects import Context, Described
 from walop_jax.model.effects.change import Change as Sentence
-from walop_jax.model.specification import Model, model_without, with_effects
+from walop_jax.model.specification import Model, effect_context, model_without, with_effects
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
@@ -32,6 +34,7 @@ Sum = tuple[tuple[float, Sentence], ...]
 """One amplitude: a sum of sentences with their coefficients."""
 
 FAR = 3.0  # errors of the product that no plausible member may lie from an element of it, in the median
+_SAME = 1e-9  # of a row of coefficients, which earlier rows must hold for it to be a combination of them
 _SHOWN = 4  # members that are told in a sentence
 
 
@@ -74,6 +77,15 @@ class ClassOf(NamedTuple):
         return tuple(member.name for member in self.members[1:])
 
 
+def with_average(result: FitResult, classes: Sequence[ClassOf]) -> FitResult:
+    """The fit whose calibration is the mean over the classes of what was added to its model."""
+    if not classes:
+        return result
+    context = effect_context(result.model.template, result.calset.exposures)
+    mean = functools.partial(averaged, classes=tuple(classes), context=context)
+    return dataclasses.replace(result, averaged=mean)
+
+
 def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Context) -> Calibration:
     """The calibration of a fit as the mean over the classes of what was added, with their spread in its covariance.
 
@@ -82,6 +94,8 @@ def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Cont
     if not classes:
         return calibration
     old, model = calibration.model, _holding(calibration, classes, context)
+    new = [i for i, name in enumerate(model.names) if name not in old.names]
+    model = _with_ties(model, new, np.concatenate(list(_amplitudes_of(model, classes)), axis=1))
     place = np.array([model.index(name) for name in old.names])
     count, free = len(model.parameters), old.free
     start, told = np.zeros(count), np.zeros((count, count))
@@ -92,17 +106,14 @@ def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Cont
     into = into @ old.selection()
     of_free = calibration.covariance[np.ix_(free, free)]
     values, covariance = start.copy(), told.copy()
+    own = _amplitudes_of(model, classes)
     for one in classes:
         rest = into @ known_apart_from(of_free, one.at) @ into.T
         each, errors = [start], [told]
         for member in one.members[1:]:
-            slopes = into @ member.slopes
-            for j, parts in enumerate(member.sums):
-                for size, sentence in parts:
-                    slopes[model.index(f"{Described.name}.{sentence.label}"), j] += size
-            moved_to = start + into @ member.values
-            own = slopes - into @ member.slopes
-            each.append(moved_to + own @ member.amplitudes)
+            amplitudes = next(own)
+            slopes = into @ member.slopes + amplitudes
+            each.append(start + into @ member.values + amplitudes @ member.amplitudes)
             errors.append(rest + slopes @ member.covariance @ slopes.T)
         found = mixture(np.array([member.probability for member in one.members]), np.stack(each), errors)
         values += found.mean - start
@@ -135,6 +146,36 @@ def _holding(calibration: Calibration, classes: Sequence[ClassOf], context: Cont
         wider = with_effects(model_without(model, Described.name), [earlier.joined(said)], context)
         return dataclasses.replace(wider, parameters=tuple(known.get(p.name, p) for p in wider.parameters))
     return with_effects(model, [said], context)
+
+
+def _amplitudes_of(model: Model, classes: Sequence[ClassOf]) -> Iterator[Float[np.ndarray, "n a"]]:
+    """Derivative of all parameters by the amplitudes of every member but the first of each class, in order."""
+    for member in (member for one in classes for member in one.members[1:]):
+        found = np.zeros((len(model.parameters), len(member.sums)))
+        for j, parts in enumerate(member.sums):
+            for size, sentence in parts:
+                found[model.index(f"{Described.name}.{sentence.label}"), j] += size
+        yield found
+
+
+def _with_ties(model: Model, new: Sequence[int], amplitudes: Float[np.ndarray, "n a"]) -> Model:
+    """The model in which the sentences `new` of one amplitude are one parameter, so that the covariance is proper.
+
+    What is the same multiple of the amplitudes as an earlier sentence is tied to it; any other combination of earlier
+    ones is held: its value and errors follow from theirs.
+    """
+    parameters, free = list(model.parameters), list[int]()
+    for i in new:
+        row, earlier = amplitudes[i], amplitudes[free]
+        same = next((k for k in free if np.allclose(amplitudes[k], row, rtol=_SAME, atol=0.0)), None)
+        left = row - np.linalg.lstsq(earlier.T, row, rcond=None)[0] @ earlier if free else row
+        if same is not None:
+            parameters[i] = dataclasses.replace(parameters[i], tie=parameters[same].name)
+        elif np.abs(left).max() <= _SAME * np.abs(row).max():
+            parameters[i] = dataclasses.replace(parameters[i], free=False)
+        else:
+            free.append(i)
+    return dataclasses.replace(model, parameters=tuple(parameters))
 
 
 def _positive(matrix: Matrix) -> Matrix:

@@ -96,7 +96,7 @@ def detection_limits(
     if (hidden := result.hidden) is None:
         hidden = hidden_mistakes(design, Singles.of(design))
     examined = result if result.verdict is not None else result.judged()
-    calibration = dataclasses.replace(Calibration.from_fit(examined), hidden=hidden)
+    calibration = Calibration.from_fit(dataclasses.replace(examined, hidden=hidden))
     found = _collected(examination, columns, errors, fitting, calibration)
     return dataclasses.replace(found, conditions=condition_limits(design), could_hide=could_hide(calibration))
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import Exposures
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import ClassOf, averaged
+from walop_jax.diagnosis.class_product import ClassOf
 from walop_jax.diagnosis.design import Design, positions_of
 from walop_jax.diagnosis.reasons import why
 from walop_jax.fit.refit import FitResult
@@ -23,7 +23,6 @@ from walop_jax.io.text import probability, some, value_and_error
 from walop_jax.model import legendre
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import Change
-from walop_jax.model.specification import effect_context
 
 HARMONICS = (0, 1, 2, 3, 4)
 FIELD_WORDS = ("uniform", "gradient", "quadratic", "cubic", "fourth order")
@@ -291,9 +290,7 @@ class Diagnosis(Drawn):
 
     def calibration(self) -> Calibration:
         """The calibration of the extended model: its mean over what these data cannot tell apart, with its spread."""
-        made = Calibration.from_fit(self.after)
-        context = effect_context(self.after.model.template, self.after.calset.exposures)
-        return averaged(made, self.members, context)
+        return Calibration.from_fit(self.after)
 
     @property
     def caution(self) -> str:

@@ -24,7 +24,7 @@ import numpy as np
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.class_members import classes_of
-from walop_jax.diagnosis.class_product import only_a_class
+from walop_jax.diagnosis.class_product import only_a_class, with_average
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
 from walop_jax.diagnosis.examination import Examination, most_points
@@ -149,6 +149,7 @@ def _examined(found: Diagnosis, seed: int) -> Diagnosis:
     after = examined(with_honest_errors(found.after), seed, as_written=True)
     for sentence in only_a_class(found.members):
         after = after.doubted(Quality.CLASS_ONLY, sentence)
+    after = with_average(after, found.members)
     if found.before is found.after:
         return dataclasses.replace(found, before=after, after=after)
     for sentence in rival_conditions(Design.of(found.before), found.after.chi2):

@@ -57,7 +57,8 @@ class FitResult(Fitted):
     until the residuals were examined (`diagnosis.trust.examined`); to ask for `trusted` before is an error.
     `errors_from` is what the covariance was made from, the stated errors of the data (`STATED`) or residuals; `hidden`
     are mistakes that the residuals would not show, None until these were examined. `answer` works out how well stars
-    are known with it (`science.field_accuracy.answered`), which is shown first.
+    are known with it (`science.field_accuracy.answered`), which is shown first. `averaged` makes of its calibration the
+    mean over models that its data cannot tell apart (`diagnosis.class_product`); None where there is one model alone.
 
     >>> result.value("pupil.magnification")[0].__round__(2)
     15.67
@@ -75,6 +76,7 @@ class FitResult(Fitted):
     verdict: Verdict | None = None
     hidden: Hidden | None = None
     answer: Callable[[], Any] | None = None
+    averaged: Callable[[Any], Any] | None = None
 
     @classmethod
     def of(cls, likelihood: Likelihood, *, noise_scale: float | None = None) -> FitResult:

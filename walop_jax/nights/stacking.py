@@ -214,7 +214,8 @@ def _opened(one: Given, catalogue: Sequence[EffectKind]) -> _Opened:
     if isinstance(one, Night):
         return _Opened([one])
     if isinstance(one, FitResult):
-        return _Opened([], Data(one.calset, data_hash(one.calset), one.model), one)
+        product = Calibration.from_fit(one)
+        return _Opened([], Data(one.calset, data_hash(one.calset), product.model), product)
     if isinstance(one, CalibrationSet):
         return _Opened([], Data(one, data_hash(one)))
     path = one.folder if isinstance(one, RunFolder) else Path(one)

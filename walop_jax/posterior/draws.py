@@ -30,6 +30,9 @@ DRAWS = 200  # of a posterior, that stand for it in matrices
 INFLATION = "noise.ln_f"
 _AGAIN = "run walop-jax sample again"
 
+A_MEAN = "is the mean over what its data cannot tell apart, and no fit of one model"
+"""Said of a calibration that cannot be sampled."""
+
 
 def as_arviz(groups: DataTree) -> Any:
     """Groups of a posterior as the installed ArviZ takes them: InferenceData (before ArviZ 1), or the tree itself."""

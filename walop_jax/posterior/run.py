@@ -27,7 +27,7 @@ from walop_jax.io.text import two_digits
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, EffectKind
-from walop_jax.posterior.draws import read_groups
+from walop_jax.posterior.draws import A_MEAN, read_groups
 
 VERDICTS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "diagnosis": lambda d: str(d["verdict"]),
@@ -119,7 +119,7 @@ class Run(RunFolder, Result):
         """
         if self.documents.get("diagnosis", {}).get("members"):
             raise fail(
-                "is the mean over what its data cannot tell apart, and no fit of one model",
+                A_MEAN,
                 file=self.folder,
                 advice=f"fit one: walop-jax refit --model {self.folder / MODEL}, and take that run",
             )

@@ -19,7 +19,7 @@ from walop_jax.fit.verdict import STATED
 from walop_jax.io.code import versions_of
 from walop_jax.io.errors import fail
 from walop_jax.model.specification import Model
-from walop_jax.posterior.draws import digest, digest_of_fit
+from walop_jax.posterior.draws import A_MEAN, digest, digest_of_fit
 from walop_jax.posterior.files import Chain
 from walop_jax.posterior.result import (
     BURN_IN,
@@ -204,6 +204,8 @@ def sample(
     Around a fit whose errors come from its residuals (`errors_from`), chains are those of the stated errors, and draws
     and covariance are `sandwich_adjusted`.
     """
+    if result.averaged is not None:
+        raise fail(A_MEAN, file="the fit", advice="fit one, refit(calset, result.model), and sample that")
     options, trusted = options or Options(), result.trusted
     report = report or (lambda progress: None)
     if result.errors_from != STATED:

@@ -74,16 +74,16 @@ class FigureSource:
             return cls(given, **options)
         if isinstance(given, PosteriorSample):
             return cls(held={POSTERIOR: given.groups()}, sample=given, **options)
+        if isinstance(given, Calibration):
+            return cls(held={PRODUCT: given}, **options)
+        result = given.after if isinstance(given, Diagnosis) else given
+        product = Calibration.from_fit(result)
+        data = result.likelihood
+        if product.model is not result.model:  # that of a mean over a class has its members as well
+            data = Likelihood.of(result.calset, product.model)
+        held = {DATA: data, PRODUCT: product}
         if isinstance(given, Diagnosis):
-            product = given.calibration()  # of a class its model has the members as well
-            data = given.after.likelihood
-            if product.model is not given.after.model:
-                data = Likelihood.of(given.after.calset, product.model)
-            held = {FIGURE_DATA: figure_data(given), DATA: data, PRODUCT: product}
-        elif isinstance(given, FitResult):
-            held = {DATA: given.likelihood, PRODUCT: Calibration.from_fit(given)}
-        else:
-            held = {PRODUCT: given}
+            held |= {FIGURE_DATA: figure_data(given)}
         return cls(held=held, **options)
 
     def __contains__(self, name: str) -> bool:

@@ -205,7 +205,8 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
     same = bool(files) and files == before
     if old.verdict.trusted and not result.trusted:
         return Epoch(None, False, result.warnings, added, same)
-    new, model = Calibration.from_fit(result), result.model
+    new = Calibration.from_fit(result)
+    model = new.model
     shared, beyond = shared_parameters(old.model, model), added_amplitudes(old.model, model)
     names = [*shared, *beyond]
     a = np.array([old.model.index(name) for name in shared])
@@ -223,6 +224,7 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
     largest = measured.largest()
     values = new.values.copy()
     values[b] = was
+    fitted = [model.index(name) for name in result.model.names]
     error = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     moved = [
         MovedParameter(n, unit, float(w), float(new.values[j]), float(s), float(d / s))
@@ -243,7 +245,7 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
         directions=measured.directions,
         largest=largest,
         visible=_visible(dataclasses.replace(new, covariance=of_all)),
-        chi2_old=result.likelihood.expand(values, near=result.posterior).chi2,
+        chi2_old=result.likelihood.expand(values[fitted], near=result.posterior).chi2,
         chi2_new=result.chi2,
         dof=result.dof,
         moved=tuple(sorted(moved, key=lambda entry: -abs(entry.z))),

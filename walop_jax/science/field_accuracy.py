@@ -136,12 +136,9 @@ def judged(without_u: float) -> str:
     )
 
 
-def answered(result: FitResult, calibration: Calibration | None = None) -> FitResult:
-    """The fit, able to say how well stars are known with it; worked out when it is first asked.
-
-    Of a `calibration` that holds more than the fit (`Diagnosis.calibration`), with that.
-    """
-    return dataclasses.replace(result, answer=_Answer(result, calibration))
+def answered(result: FitResult) -> FitResult:
+    """The fit, able to say how well stars are known with it; worked out when it is first asked."""
+    return dataclasses.replace(result, answer=_Answer(result))
 
 
 @dataclasses.dataclass
@@ -149,7 +146,6 @@ class _Answer:
     """The accuracy of p of a fit, worked out once; a class, so that fits can be pickled."""
 
     result: FitResult
-    calibration: Calibration | None = None
 
     def __call__(self) -> FieldAccuracy | None:
         return self.known
@@ -157,7 +153,7 @@ class _Answer:
     @functools.cached_property
     def known(self) -> FieldAccuracy | None:
         """See `field_accuracy`."""
-        return field_accuracy(self.calibration or Calibration.from_fit(self.result))
+        return field_accuracy(Calibration.from_fit(self.result))
 
 
 def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy | None:

@@ -1,0 +1,69 @@
+"""A camera that is brighter on the Moon, or everywhere else: the fit, its class, and a diagnosis that has found it."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+from small_run import SMALL
+
+from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis.class_members import classes_of
+from walop_jax.diagnosis.class_product import only_a_class, with_average
+from walop_jax.diagnosis.examination import examine
+from walop_jax.diagnosis.findings import Diagnosis, Step
+from walop_jax.fit.model_file import base_model
+from walop_jax.fit.refit import FitResult, fit
+from walop_jax.fit.verdict import Quality
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import Context, Described
+from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.simulation.simulate import simulate
+
+TOLD = "gain of O1 * kind moon"
+
+
+@functools.cache
+def told() -> tuple[FitResult, Context, Any]:
+    """A camera is brighter on the Moon by 0.3 %: the fit, the context, and the class of that description."""
+    calset = simulate(SMALL, seed=3, effects=[Described.saying([TOLD], [3e-3])]).calset
+    context = effect_context(base_model(calset).template, calset.exposures)
+    model = with_effects(base_model(calset), [Described.saying([TOLD], [0.0])], context)
+    result = fit(Likelihood.of(calset, model))
+    said = [
+        probe
+        for probe in grammar.sentences(model.template, calset.exposures, len(calset.points))
+        if probe.name.startswith("gain of")
+    ]
+    state = examine(result, (), np.random.default_rng(0), sentences=said)
+    return result, context, classes_of(state, context, {Described.name}, [TOLD])
+
+
+@functools.cache
+def diagnosed() -> Diagnosis:
+    """The diagnosis that has found that class, nothing searched for."""
+    result, _, classes = told()
+    after = result.judged()
+    for sentence in only_a_class(classes):
+        after = after.doubted(Quality.CLASS_ONLY, sentence)
+    residual = result.likelihood.residuals(result.values)[1]
+    step = Step(
+        Described.name, {}, 0.0, 0.0, 0.0, 2.0, 1.0, "exposures", 2.0, 1.0,
+        equivalent=("crosstalk",), residual_before=residual, residual_after=residual,
+    )  # fmt: skip
+    return Diagnosis(
+        verdict="effect_found",
+        steps=(step,),
+        candidates=(),
+        limits=(),
+        untestable=(),
+        unexplained=None,
+        p_value=0.0,
+        remaining_p=1.0,
+        before=result.judged(),
+        after=with_average(after, classes),
+        seconds=0.0,
+        points=len(result.calset.points),
+        members=classes,
+    )
