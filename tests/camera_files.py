@@ -8,10 +8,25 @@ import numpy as np
 from astropy import units
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
-from astropy.table import QTable
+from astropy.table import QTable, Table
+
+from walop_jax.sky.directions import Pointing
 
 CAMERAS = ("O1", "E1", "O2", "E2")
 CENTRE = {"RA": 97.5, "DEC": -44.0, "ROTATOR": 35.0}  # deg
+
+
+def some_stars(count=300, seed=1) -> Table:
+    """Stars over the field with made-up counts; their X, Y are those of the pointing `CENTRE`."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-0.3, 0.3, (2, count))
+    ra, dec = Pointing(*CENTRE.values()).sky_of(x, y)
+    n = 10 ** rng.uniform(4, 6, count)[:, None] * rng.uniform(0.8, 1.2, (count, 4))
+    table = Table(
+        {"SOURCE_ID": 5_000_000_000_000_000_000 + np.arange(count), "RA": ra, "DEC": dec, "X": x, "Y": y}
+    )
+    table["N"], table["N_ERR"], table["BP_RP"] = n, np.sqrt(n + 900), rng.uniform(0.5, 1.4, count)
+    return table
 
 
 def of_camera(stars, k: int, rng, scatter=0.1, keep=None) -> dict[str, np.ndarray]:

@@ -184,7 +184,7 @@ def test_the_core_is_reached_without_the_rest(entry):
 MOST_LINES = {
     "io": 1650,
     "instruments": 250,
-    "data": 4970,
+    "data": 5040,
     "sky": 450,
     "model": 9430,
     "likelihood": 3300,
@@ -198,7 +198,7 @@ MOST_LINES = {
     "plans": 2350,
     "paper": 860,
     "reports": 2980,
-    "commands": 4380,
+    "commands": 4470,
 }
 """Lines of each room: raising one is a decision of its own."""
 

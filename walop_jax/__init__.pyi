@@ -32,6 +32,7 @@ from walop_jax.commands.report import report as report
 from walop_jax.commands.sample import sample as sample
 from walop_jax.commands.simulate import simulate as simulate
 from walop_jax.commands.stack import stack as stack
+from walop_jax.commands.standards import standards as standards
 from walop_jax.commands.trace import trace as trace
 from walop_jax.commands.watch import watch as watch
 from walop_jax.data.calset import from_arrays as from_arrays

@@ -82,6 +82,7 @@ LINES = {
     "instrument": [Line("instrument WALOP-SOUTH")],
     "import-zemax": [Line("import-zemax exports -o design.fits", takes="minutes")],
     "trace": [Line("trace RUN --x 0.1 --y 0.2 --q 0.01")],
+    "standards": [Line("standards --near 308,41"), Line("standards --up 61041.9")],
     "cite": [Line("cite RUN"), Line("cite RUN --bibtex")],
     "conformance": [Line("conformance --make PACK")],
     "docs": [Line("docs files"), Line("docs")],

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from astropy.table import Table
+from camera_files import four, some_stars
 from zemax_exports import write_folder
 
 import walop_jax as walop
@@ -139,6 +140,7 @@ CASES = {
         lambda g, **k: walop.matrix(g.run, points=g.points, **k),
         "m.ecsv",
     ),
+    "gather": Case(lambda g: g.cameras, lambda g, **k: walop.gather(g.cameras, **k), "s.ecsv"),
     "apply": Case(lambda g: (g.run, g.stars), lambda g, **k: walop.apply(g.run, g.stars, **k), "s.ecsv"),
     "certify": Case(lambda g: (g.run,), lambda g, **k: walop.certify(g.run, **k), "RUN"),
     "epoch": Case(lambda g: (g.run, g.calset), lambda g, **k: walop.epoch(g.run, g.calset, **k), "RUN", True),
@@ -157,6 +159,9 @@ CASES = {
         lambda g: (g.exports,), lambda g, **k: walop.import_zemax(g.exports, **k), "set.fits"
     ),
     "trace": Case(lambda g: (g.run, "--x", 0.1), lambda g, **k: walop.trace(g.run, x=0.1, **k)),
+    "standards": Case(
+        lambda g: ("--near", "308,41"), lambda g, **k: walop.standards(near=(308.0, 41.0), **k)
+    ),
     "cite": Case(lambda g: (g.run,), lambda g, **k: walop.cite(g.run, **k)),
     "conformance": Case(lambda g: ("--make", g.pack), lambda g, **k: walop.conformance(make=g.pack, **k)),
     "docs": Case(lambda g: ("files",), lambda g, **k: walop.docs("files", **k)),
@@ -180,6 +185,7 @@ class Given(NamedTuple):
     stars: Path
     exports: Path
     pack: Path
+    cameras: tuple[Path, ...]
 
 
 @pytest.fixture
@@ -198,6 +204,7 @@ def given(fitted: FittedSet, tmp_path: Path) -> Given:
         tmp_path / "stars.fits",
         exports,
         tmp_path / "pack",
+        tuple(four(some_stars(), tmp_path)),
     )
 
 
@@ -219,7 +226,7 @@ def test_files_and_document_are_those_of_the_program(name: str, call, given: Giv
     assert_same_files(command, caller)
     if case.output.startswith("RUN"):
         assert_same_files(command / case.output, caller / case.output)
-    if name not in ("instrument", "docs", "trace", "cite", "model", "conformance"):
+    if name not in ("instrument", "docs", "trace", "cite", "standards", "model", "conformance"):
         assert told
     if isinstance(document, dict) and "seed" in document:
         assert isinstance(document["seed"], int)

@@ -8,29 +8,15 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from astropy.wcs import WCS
-from camera_files import CAMERAS, CENTRE, ascii_head, four, ldac, of_camera, photutils
+from camera_files import CAMERAS, CENTRE, ascii_head, four, ldac, of_camera, photutils, some_stars
 
 import walop_jax as walop
 from walop_jax.data.camera_catalogues import read_camera_catalogue, read_map
 from walop_jax.io.errors import DataError
 from walop_jax.sky.directions import Pointing
 
-POINTING = {"ra": 97.5, "dec": -44.0, "rotator": 35.0}
-
-
-def stars(count=300, seed=1) -> Table:
-    rng = np.random.default_rng(seed)
-    x, y = rng.uniform(-0.3, 0.3, (2, count))
-    ra, dec = Pointing(**POINTING).sky_of(x, y)
-    n = 10 ** rng.uniform(4, 6, count)[:, None] * rng.uniform(0.8, 1.2, (count, 4))
-    table = Table(
-        {"SOURCE_ID": 5_000_000_000_000_000_000 + np.arange(count), "RA": ra, "DEC": dec, "X": x, "Y": y}
-    )
-    table["N"], table["N_ERR"], table["BP_RP"] = n, np.sqrt(n + 900), rng.uniform(0.5, 1.4, count)
-    return table
-
-
-STARS = stars()
+POINTING = {name.lower(): value for name, value in CENTRE.items()}
+STARS = some_stars()
 
 
 def by_source(table) -> Table:
@@ -94,7 +80,7 @@ def test_a_wcs_that_is_off_by_ten_minutes_and_another_field_are_refused(tmp_path
         DataError, match=r"O1.fits.*stars lie 16.* deg from the field centre RA 97.5, DEC -60"
     ):
         walop.gather(files, dec=-60.0)
-    other = stars(seed=9)
+    other = some_stars(seed=9)
     files[2].unlink()
     ldac(files[2], of_camera(other, 2, np.random.default_rng(0)))
     with pytest.raises(DataError, match=r"O2.fits.*no stars in common"):

@@ -36,6 +36,7 @@ COMMANDS = {
     "instrument": "Print and check an instrument.",
     "import-zemax": "Make a calibration set (KIND flux) of the transmissions that an optical design program gives.",
     "trace": "Follow the light of one source through the instrument.",
+    "standards": "List standard stars with band, errors, variability and source.",
     "cite": "List the sources of the physics in a fitted model, effects included.",
     "conformance": "Put another program to the test.",
     "docs": "Print a reference page, or the list of pages.",

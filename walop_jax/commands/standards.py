@@ -1,0 +1,83 @@
+"""`walop-jax standards`: standard stars that come with the package."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from walop_jax.commands.command import Job, Option, Outcome, UsageError, command
+from walop_jax.commands.inputs import InstrumentLike
+
+NEAR = Option("Sorted by the distance from a direction (deg); one number for each.", "RA,DEC", str)
+UP = Option("Those above 30° at a time (UTC) at the site of the instrument, the highest first.", "MJD", float)
+LOWEST = 30.0  # deg
+
+
+@command(jax=False)
+def standards(
+    job: Job,
+    *,
+    near: Annotated[str | tuple[float, float] | None, NEAR] = None,
+    up: Annotated[float | None, UP] = None,
+    instrument: InstrumentLike = None,
+) -> Outcome[Any]:
+    """List standard stars with band, errors, variability and source.
+
+    The table is dated; its columns are those of SOURCES, and more. Errors of angles hold how much they vary.
+
+    In Python: an astropy QTable.
+
+    >>> table = walop.standards(near=(308.0, 41.0))
+    >>> str(table["NAME"][0]), str(table["FILTER"][0])
+    ('VI Cyg 12', 'R')
+    """
+    import numpy as np
+
+    from walop_jax.data.records import Site
+    from walop_jax.data.standards import distances, in_degrees, shipped_standards
+    from walop_jax.instruments.description import default_name, read_description
+    from walop_jax.sky.moon import altitude
+
+    table = shipped_standards()
+    if near is not None:
+        away = distances(table, *_direction(near))
+        table = in_degrees(table, "DISTANCE", away)[np.argsort(away, kind="stable")]
+    if up is not None:
+        given: Any = default_name() if instrument is None else instrument
+        place: Any = given.site if hasattr(given, "site") else read_description(given).place
+        ra, dec = (np.asarray(table[name].to_value("deg"), float) for name in ("RA", "DEC"))
+        height = altitude(np.full(len(ra), up), ra, dec, Site(*place[:4]))
+        order = np.arange(len(ra)) if near is not None else np.argsort(-height, kind="stable")
+        table = in_degrees(table, "ALTITUDE", height)[order[height[order] >= LOWEST]]
+    rows = [{name: _plain(row[name]) for name in table.colnames} for row in table]
+    return Outcome(table, {**table.meta, "standards": rows}, _lines(table))
+
+
+def _direction(near: str | tuple[float, float]) -> tuple[float, float]:
+    try:
+        ra, dec = (float(part) for part in (near.split(",") if isinstance(near, str) else near))
+    except ValueError:
+        raise UsageError(
+            f"near = {near!r} must be right ascension and declination in degrees: 308.2,41.2"
+        ) from None
+    if not -90.0 <= dec <= 90.0:
+        raise UsageError(f"near = {near!r}: a declination is between -90 and 90 degrees")
+    return ra, dec
+
+
+def _plain(value: Any) -> Any:
+    """A cell as JSON has it; what is not known is null."""
+    plain = getattr(value, "value", value)
+    plain = plain.item() if hasattr(plain, "item") else plain
+    return None if plain != plain else plain
+
+
+def _lines(table: Any) -> str:
+    """The table for a terminal: per cent and degrees."""
+    shown = table["NAME", "RA", "DEC", "FILTER", "P", "P_ERR", "ANGLE", "SCATTER"].copy()
+    for name in ("P", "P_ERR"):
+        shown[name] = 100.0 * shown[name]
+        shown[name].info.format = ".3f"
+    shown.rename_columns(("P", "P_ERR"), ("P (%)", "error (%)"))
+    shown["REFERENCE"] = [str(text).split(",")[0] for text in table["REFERENCE"]]
+    head = f"standards of {table.meta['date']}, version {table.meta['version']}; {table.meta['source']}"
+    return "\n".join([*shown.pformat(max_lines=-1, max_width=-1, show_unit=True), "", head])

@@ -1,0 +1,72 @@
+"""Standard stars that come with the package: a dated table of published values, and what SOURCES needs of them.
+
+Equation    Q + iU = P exp(2i ANGLE); along it the error is P_ERR, across it 2 P √(ANGLE_ERR² + SCATTER²)
+Limits      Of stars that are polarised by less than three errors the angle is not known: both errors are P_ERR. Where
+            no angle is stated Q = U = 0, with the error √((P² + P_ERR²)/2).
+            Stars that nobody has monitored are taken to vary by `USUAL_SCATTER`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+USUAL_SCATTER = 0.27
+"""Degrees, the smallest variability of an angle that was found (Cotton et al. 2024, arXiv:2410.23466)."""
+
+POLARISED = 3.0  # errors
+
+
+def shipped_standards() -> Any:
+    """The table as an astropy QTable, with the columns of SOURCES: rows can be taken over as they are.
+
+    Rows of one star have one SOURCE; TEFF is not known. Version and date are in `meta`.
+    """
+    from astropy.table import QTable
+
+    table = QTable.read(Path(__file__).with_suffix(".ecsv"), format="ascii.ecsv")
+    names = [str(name) for name in table["NAME"]]
+    order = list(dict.fromkeys(names))
+    degree, error = (np.asarray(table[name], float) for name in ("P", "P_ERR"))
+    angle, stated, scatter = (
+        np.deg2rad(np.asarray(table[name].to_value("deg"), float))
+        for name in ("ANGLE", "ANGLE_ERR", "SCATTER")
+    )
+    scatter = np.where(np.isfinite(scatter), scatter, np.deg2rad(USUAL_SCATTER))
+    across = 2.0 * degree * np.hypot(np.nan_to_num(stated), scatter)
+    across = np.where(degree > POLARISED * error, across, error)
+    known = np.isfinite(angle)
+    either = np.sqrt(0.5 * (degree**2 + error**2))
+    error, across = np.where(known, error, either), np.where(known, across, either)
+    degree, angle = np.where(known, degree, 0.0), np.where(known, angle, 0.0)
+    cos, sin = np.cos(2.0 * angle), np.sin(2.0 * angle)
+    columns = {
+        "SOURCE": np.array([order.index(name) for name in names]),
+        "Q": degree * cos,
+        "U": degree * sin,
+        "Q_ERR": np.hypot(error * cos, across * sin),
+        "U_ERR": np.hypot(error * sin, across * cos),
+        "TEFF": np.full(len(table), np.nan),
+    }
+    for number, (name, values) in enumerate(columns.items()):
+        table.add_column(values, index=number if number == 0 else number + 1, name=name)
+    return table
+
+
+def distances(table: Any, ra: float, dec: float) -> Float[np.ndarray, " n"]:
+    """Angles (deg) between the stars of a table and a direction (deg)."""
+    from astropy.coordinates import angular_separation
+
+    there = (np.deg2rad(np.asarray(table[name].to_value("deg"), float)) for name in ("RA", "DEC"))
+    return np.rad2deg(angular_separation(*there, np.deg2rad(ra), np.deg2rad(dec)))
+
+
+def in_degrees(table: Any, name: str, values: Float[np.ndarray, " n"]) -> Any:
+    """The table with one more column of angles (deg)."""
+    from astropy import units
+
+    table[name] = values * units.deg
+    return table
