@@ -199,7 +199,7 @@ _at_points = compiled(
     jax.vmap(_at_point, (None, None, 0)), optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="responses"
 )
 _fringes_at = compiled(_fringes, optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="fringes")
-_visible = compiled(_visibilities, kept_as="visibilities")
+_visible = compiled(_visibilities, optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="visibilities")
 _detectors = compiled(_pushed, kept_as="detector_slopes")
 
 

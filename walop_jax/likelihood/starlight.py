@@ -19,7 +19,7 @@ from walop_jax.likelihood import limits
 from walop_jax.likelihood.columns import Change, Columns, ResponseBlock
 from walop_jax.model.effects.change import InExposures, SlotTerm
 from walop_jax.model.effects.factors import FIELD, Units, factor
-from walop_jax.model.slots import Slot, generator_ahead
+from walop_jax.model.slots import Slot, generators_ahead
 
 
 def added_to_starlight(
@@ -28,7 +28,8 @@ def added_to_starlight(
     """Analysis vectors at the field points in the setting of an exposure, and what one unit of each change adds."""
     each = [columns.terms_of(change) for change in changes]
     slots = {part.slot for parts in each for part in parts}
-    ahead = {s: generator_ahead(columns.patched, s) for s in slots if s[0] == "light" and s[2] == "ahead of"}
+    light = sorted(slot for slot in slots if slot[0] == "light" and slot[2] == "ahead of")
+    ahead = generators_ahead(columns.patched, light)
     points, size, found = len(columns.likelihood.used), limits.RESPONSES_TOGETHER, []
     for start in range(0, points, size):
         parts = _at_points(ResponseBlock(columns, start, ()), each, exposure, ahead)

@@ -40,21 +40,22 @@ def plan_for(
     """
     own = Settings.of(exposures, instrument.patched().moving())
     each, stars = np.arange(len(exposures)), 0 if sources is None else len(sources)
-    # A row for every exposure, for light of no star; then those of the stars, which may have a colour of their own.
-    of_stars = np.flatnonzero(exposures.direct("standard")) if stars else each[:0]
-    row = np.concatenate([each, np.repeat(of_stars, stars)])
-    teff = own.teff[row]
-    if sources is not None and of_stars.size:
-        colour = np.tile(sources.teff, of_stars.size)
-        teff[len(each) :] = np.where(np.isfinite(colour), colour, teff[len(each) :])
-    sloping = of_stars if instrument.standard.bands else each[:0]
-    last = len(row)
+    # A row for every exposure; of standards one for every star, as each may have a colour of its own.
+    of_stars = exposures.direct("standard") & (stars > 0)
+    row = np.repeat(each, np.where(of_stars, stars, 1))
+    teff, last, starlight = own.teff[row], len(row), of_stars[row]
+    if sources is not None and starlight.any():
+        colour = np.tile(sources.teff, of_stars.sum())
+        teff[starlight] = np.where(np.isfinite(colour), colour, teff[starlight])
+    sloping = np.flatnonzero(of_stars) if instrument.standard.bands else each[:0]
     row, teff = np.append(row, sloping), np.append(teff, np.full(len(sloping), _typical(sources)))
     settings = dataclasses.replace(own[row], teff=teff)
 
     def band_of(band: Int[np.ndarray, " n"]) -> Int[np.ndarray, "e s"]:
-        table = np.repeat(band[: len(each), None], 1 + stars, axis=1)
-        table[of_stars, 1:] = band[len(each) : last].reshape(of_stars.size, stars)
+        table = np.empty((len(each), 1 + stars), int)
+        table[~of_stars] = band[~starlight, None]
+        table[of_stars, 1:] = band[starlight].reshape(of_stars.sum(), stars)
+        table[of_stars, 0] = table[of_stars, -1]  # nothing is used of a standard without its star
         return table
 
     known = [source.kind for source in instrument.sources if source.facts.flux_known]
@@ -65,8 +66,9 @@ def plan_for(
     if instrument.cameras.split or steady.any():
         arrays = _sharing(arrays, own, steady, split=instrument.cameras.split)
     slope = np.arange(len(row)) >= last
-    plan, band = _plan(instrument, settings, hours_of(exposures)[row], filters, arrays, slope)
-    plan = dataclasses.replace(plan, band_of=band_of(band))
+    hours, kinds = hours_of(exposures)[row], exposures.kind[row]
+    plan, band = _plan(instrument, settings, hours, filters, arrays, kinds, slope)
+    plan = dataclasses.replace(plan, band_of=band_of(band[:last]))
     if sources is None or not sloping.size:
         return plan
     curves = {name: filters[name] for name in np.unique(exposures.filter).tolist()}
@@ -197,6 +199,7 @@ def _plan(
     hours: Float[np.ndarray, " n"],
     filters: Mapping[str, FilterCurve],
     exposures: ExposureArrays,
+    kinds: np.ndarray | None = None,
     slope: Bool[np.ndarray, " n"] | None = None,
 ) -> tuple[Plan, Int[np.ndarray, " n"]]:
     """A plan, but for `Plan.band_of`, and the band of every setting; `slope` is true for those of slopes."""
@@ -205,8 +208,9 @@ def _plan(
     names = sorted(asked.conditions)
     values = {"temperature": settings.temperature, "hour_angle": settings.hour_angle, "hours": hours}
     assert set(values) == set(CONDITIONS)
-    # A band is (positions, filter, conditions, colour temperature, slope); sorting puts equal positions together.
-    # NaN (out, flat spectrum) becomes a sortable stand-in.
+    # A band is (positions, filter, conditions, colour temperature, slope, KIND); sorting puts equal positions together.
+    # NaN (out, flat spectrum) becomes a sortable stand-in. KINDs of one colour are apart, so that a set in which one of
+    # them has another has a plan of the same shape, and the same programs.
     # The angle of each element, and after all of them by how much each turns.
     still = np.zeros(len(settings))
     places = [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving]
@@ -215,7 +219,8 @@ def _plan(
     planned = _rows([values[name] for name in names], len(settings))
     teff = np.nan_to_num(settings.teff).tolist()
     sloping = np.zeros(len(settings), bool) if slope is None else slope
-    each = (states, settings.filter.astype(str).tolist(), planned, teff, sloping.tolist())
+    labels = [""] * len(settings) if kinds is None else kinds.tolist()
+    each = (states, settings.filter.astype(str).tolist(), planned, teff, sloping.tolist(), labels)
     keys = list(zip(*each, strict=True))
     bands = sorted(set(keys))
     index = {key: i for i, key in enumerate(bands)}

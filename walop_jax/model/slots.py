@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model import fold, light
-from walop_jax.model.compiled import array
+from walop_jax.model.compiled import array, compiled
 from walop_jax.model.effects.cameras import CrossTalk
 from walop_jax.model.effects.change import BAND, SKY, Change, patched
 from walop_jax.model.effects.numbers import OF_POLARISER, OF_QU, OF_SOURCES
@@ -406,13 +406,12 @@ def _lit(instrument: Instrument, sizes: dict[Slot, Scalar], count: int) -> Instr
     return instrument
 
 
-def generator_ahead(instrument: Instrument, slot: Slot) -> Float[np.ndarray, "4 4"]:
-    """Slope of the Mueller matrix of a slot of the light ahead of the polariser of an instrument (`patched`)."""
-    zero = jnp.zeros(())
+def generators_ahead(instrument: Instrument, some: Sequence[Slot]) -> dict[Slot, Float[np.ndarray, "4 4"]]:
+    """Slopes of Mueller matrices in slots of the light ahead of the polariser of an instrument (`patched`)."""
+    zero = array(0.0)
 
-    def matrix(size: Scalar) -> Array | None:
-        return (
-            patched(instrument, [(Change(*slot[1:]), size)]).telescope()[-1].mueller(Ray.entering(zero, zero))
-        )
+    def matrices(size: Scalar) -> list[Any]:
+        each = [patched(instrument, [(Change(*slot[1:]), size)]) for slot in some]
+        return [one.telescope()[-1].mueller(Ray.entering(zero, zero)) for one in each]
 
-    return np.asarray(jax.jacfwd(matrix)(zero))
+    return dict(zip(some, map(np.asarray, compiled(jax.jacfwd(matrices))(zero)), strict=True))

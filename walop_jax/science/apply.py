@@ -28,6 +28,7 @@ from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, CatalogueSearch
 from walop_jax.science.detectors import detector_slopes, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
+from walop_jax.science.left_over_sky import with_sky
 from walop_jax.science.star_residuals import StarResiduals
 
 STAR_SAMPLE = 16384
@@ -60,7 +61,8 @@ class Stars:
     has changed since the calibration. `colour` is the error of (q, u) if TEFF were ignored; without TEFF, half the
     difference between stars of 3500 K and 10 000 K. `hidden` is the largest shift of q and u by a single mistake
     that the data of the calibration would not have shown (NaN: nobody asked). `flag` holds bits of `Quality`;
-    `rows` counts the rows of a star. `check` is what all stars say together.
+    `rows` counts the rows of a star. `check` is what all stars say together, `sky_bound` the largest shift by light of
+    the sky left over that they do not exclude (None: the level of the sky is not stated).
     """
 
     qu: Float[np.ndarray, "s 2"]
@@ -75,6 +77,7 @@ class Stars:
     rows: Int[np.ndarray, " s"]
     flag: Int[np.ndarray, " s"]
     check: CatalogueCheck = NOTHING_TO_SPARE
+    sky_bound: Float[np.ndarray, " s"] | None = None
 
     @property
     def covariance(self) -> Float[np.ndarray, "s 2 2"]:
@@ -104,7 +107,7 @@ def apply(
         watched += work.residuals(block, chosen)
         if progress is not None:
             progress(done, len(catalogue))
-    return work.together(_joined(parts), work.checked(watched, chosen))
+    return with_sky(work.together(_joined(parts), work.checked(watched, chosen)), catalogue)
 
 
 def results_of(calibration: Calibration, catalogue: Catalogue) -> Stars:
@@ -114,7 +117,7 @@ def results_of(calibration: Calibration, catalogue: Catalogue) -> Stars:
 
 
 def _joined(parts: list[Stars]) -> Stars:
-    columns = [f.name for f in dataclasses.fields(Stars) if f.name != "check"]
+    columns = [f.name for f in dataclasses.fields(Stars) if f.name not in ("check", "sky_bound")]
     return Stars(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))  # pyright: ignore[reportArgumentType]
 
 

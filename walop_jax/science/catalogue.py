@@ -36,8 +36,8 @@ class Catalogue:
     `points` are positions and settings, `teff_err` the errors of the colour temperatures [K] (0: none); `counts` and
     `sigma` [electron] are NaN where a camera is not used; `spoilt` marks rows in which a camera was flagged, `copy`
     those that repeat another row of their star to the last bit, which are not used, and `repeated` those that have the
-    counts of another star or setting. `star` numbers the stars from 0; `rotator` [deg] is NaN for results in the
-    instrument frame, `time` [MJD, d] where it is not known.
+    counts of another star or setting. `star` numbers the stars from 0; `sky` [electron] is what was subtracted
+    (None: not stated), `rotator` [deg] NaN for results in the instrument frame, `time` [MJD, d] where it is not known.
     `remarks` say what is odd in the table, and what of it is not used.
     """
 
@@ -52,6 +52,7 @@ class Catalogue:
     rotator: Float[np.ndarray, " n"]
     time: Float[np.ndarray, " n"]
     remarks: tuple[str, ...] = ()
+    sky: Float[np.ndarray, "n k"] | None = None
 
     def __len__(self) -> int:
         return len(self.star)
@@ -63,7 +64,7 @@ class Catalogue:
         whole = {
             f.name: getattr(self, f.name)
             for f in dataclasses.fields(self)
-            if f.name not in ("points", "remarks")
+            if f.name not in ("points", "remarks") and getattr(self, f.name) is not None
         }
         p = self.points
         points = FieldPoints(p.x[keep], p.y[keep], p.settings[np.flatnonzero(keep)], p.outside[keep])
@@ -109,6 +110,10 @@ def read_catalogue(
     if on_sky.any() and not on_sky.all():
         missing = rows_text(np.flatnonzero(~on_sky))
         source.remarks.append(f"ROTATOR is missing in {missing}: these are in the frame of the instrument")
+    sky = None
+    if {"SKY", "SKY0", "SKY_0"} & set(source.names):
+        (sky,) = vector_columns(source, ("SKY",), rule, instrument.cameras.names)
+        place.refuse(sky < 0, "is below 0", "SKY", "the level of the sky that was subtracted, in electrons")
     copy, repeated = _copies(source, points, counts, sigma, rotator, star)
     bad |= copy[:, None]
     return Catalogue(
@@ -123,6 +128,7 @@ def read_catalogue(
         rotator=rotator,
         time=time,
         remarks=source.about(),
+        sky=sky,
     )
 
 

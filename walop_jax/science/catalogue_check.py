@@ -28,6 +28,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import some, with_error, with_minus_sign
 from walop_jax.likelihood.inverses import whitening
+from walop_jax.science.left_over_sky import LeftOverSky
 from walop_jax.science.places import DisagreeingPlace, places_of
 from walop_jax.science.star_residuals import (
     ABOUT_GAINS,
@@ -160,7 +161,8 @@ class CatalogueCheck(Displayed):
     one row, and `rows_p` its chance beside `noise`. `scale` are the factors on the photon covariance of stars of one
     row and of several: 1 unless errors are off. `tests` are the `asked` questions in their first answer; `smallest` is
     the gain change of the camera seen best that would be found in 99 % of cases (nan: none). `stars` and `rows_used`
-    count what was looked at; `growth` holds the units of X, Y and time; stars of `places` disagree together.
+    count what was looked at; `growth` holds the units of X, Y and time; stars of `places` disagree together; `sky` is
+    the light of the sky left over (None: its level is not stated).
     """
 
     stars: int
@@ -176,6 +178,7 @@ class CatalogueCheck(Displayed):
     smallest: float
     growth: Growth = IN_UNITS
     places: tuple[DisagreeingPlace, ...] = ()
+    sky: LeftOverSky | None = None
 
     @property
     def alarm(self) -> float:
@@ -198,7 +201,12 @@ class CatalogueCheck(Displayed):
     @property
     def holds(self) -> bool:
         """True if calibration and errors stand."""
-        return self.holds_elsewhere and not self.places
+        return self.holds_elsewhere and not self.places and not self.sky_is_left
+
+    @property
+    def sky_is_left(self) -> bool:
+        """True if polarised light of the sky is left in the stars."""
+        return self.sky is not None and self.sky.found
 
     @property
     def holds_elsewhere(self) -> bool:
@@ -208,6 +216,8 @@ class CatalogueCheck(Displayed):
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each thing that does not hold."""
         texts = [entry.words() for entry in (*self.changes, *self.places)]
+        if self.sky is not None and self.sky.found:
+            texts.append(self.sky.words())
         if self.rows_agree:
             assert self.rows is not None
             texts.append(
@@ -246,6 +256,7 @@ class CatalogueCheck(Displayed):
             "changes": [{"best": entry(c.best), "alike": [entry(e) for e in c.alike]} for c in self.changes],
             "places": [place.document() for place in self.places],
             "tests": [entry(test) for test in self.tests],
+            "sky": None if self.sky is None else self.sky.document(),
             "smallest_gain_seen": self.smallest if np.isfinite(self.smallest) else None,
             "warnings": list(self.warnings()),
         }

@@ -48,6 +48,11 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
         "NROWS": (stars.rows.astype(np.int32), "rows that were combined"),
         "FLAG": (stars.flag.astype(np.int32), "quality bits, 0 is good"),
     }
+    if stars.sky_bound is not None:
+        columns["SKY_BOUND"] = (
+            stars.sky_bound,
+            "largest shift of Q, U by sky left over that is not excluded",
+        )
     units = {"EVPA": "deg", "EVPA_ERR": "deg"}
     return {name: (values[star], about, units.get(name, "")) for name, (values, about) in columns.items()}
 

@@ -1,0 +1,165 @@
+"""Polarised light of the sky that is left in the counts of stars: it is in no sum of cameras, but grows as 1/flux.
+
+Equation    (q, u) of a star = m + c log₁₀ L + b S/L + its own; L its light, S the sky under it (electron, all cameras)
+Symbols     b polarised light left over per unit of the sky's level, in the frame of (q, u); m, c what stars have in
+            common: interstellar polarisation grows with distance, hence with faintness, but never as 1/flux
+Method      weighted least squares for q and u; stars differ by a scatter of their own, such that χ² is its degrees of
+            freedom (Paule & Mandel 1982, J. Res. NBS 87, 377); the larger of the errors from the weights and from
+            the residuals (White 1980, Econometrica 48, 817); stars beyond `FAR` are left out
+Limits      a sky of one polarisation in the whole catalogue; first order in S/L. Sky left over without polarisation
+            lowers q and u by the same share of themselves, which nothing here shows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.fit.verdict import Quality
+from walop_jax.io.text import with_error
+from walop_jax.science.catalogue import Catalogue
+
+if TYPE_CHECKING:
+    from walop_jax.science.apply import Stars
+
+CHANCE = 1e-5
+"""Probability that noise finds something in a sound catalogue."""
+FEWEST = 50  # stars
+MOST = 20_000  # that are looked at
+FAR = 5.0  # standard deviations
+_ROUNDS = 4
+_HALVINGS = 25
+_SEEN = 2.33  # one-sided 99 %
+
+
+@dataclasses.dataclass(frozen=True)
+class LeftOverSky:
+    """Polarised light of the sky left over, `share` (q, u) of its level, with `errors`, from so many `stars`."""
+
+    share: Float[np.ndarray, " 2"]
+    errors: Float[np.ndarray, " 2"]
+    stars: int
+
+    @property
+    def p_value(self) -> float:
+        """Chance of a share as large without any."""
+        return float(np.exp(-0.5 * np.sum((self.share / self.errors) ** 2)))
+
+    @property
+    def found(self) -> bool:
+        """True if there is some."""
+        return self.p_value < CHANCE
+
+    @property
+    def bound(self) -> float:
+        """The share that is not exceeded with a probability of 99 %."""
+        return float(np.hypot(*self.share) + _SEEN * self.errors.max())
+
+    def covariance(self, ratio: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2 2"]:
+        """Covariance of its shift of stars with a `ratio` of sky to light, 0 where none was found."""
+        whole = np.outer(self.share, self.share) + np.diag(self.errors**2)
+        return np.where(self.found, ratio**2, 0.0)[:, None, None] * whole
+
+    def words(self) -> str:
+        """The finding in a sentence."""
+        size = with_error(100 * float(np.hypot(*self.share)), 100 * float(self.errors.mean()))
+        angle = np.rad2deg(0.5 * np.arctan2(self.share[1], self.share[0])) % 180.0
+        return (
+            f"polarised light of the sky is left in the stars: {size} % of the level in SKY at {angle:.0f}°, as q and "
+            "u grow with SKY over N. Its shift is in the errors; subtract the sky anew"
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "q": float(self.share[0]),
+            "u": float(self.share[1]),
+            "errors": self.errors.tolist(),
+            "p_value": self.p_value,
+            "found": self.found,
+            "bound": self.bound,
+            "stars": self.stars,
+        }
+
+
+def left_over_sky(
+    qu: Float[np.ndarray, "s 2"],
+    photon: Float[np.ndarray, "s 2 2"],
+    light: Float[np.ndarray, " s"],
+    ratio: Float[np.ndarray, " s"],
+) -> LeftOverSky | None:
+    """The sky left over in stars with these (q, u), covariances, light (electron) and ratios of sky to light.
+
+    None where too few stars have all of them, or all have the same ratio.
+    """
+    good = np.isfinite(qu).all(axis=1) & np.isfinite(photon).all(axis=(1, 2))
+    chosen = np.flatnonzero(good & (light > 0) & np.isfinite(ratio) & (ratio >= 0))
+    chosen = chosen[np.mod(np.arange(len(chosen)) * 0.6180339887498949, 1.0) < MOST / max(len(chosen), 1)]
+    if len(chosen) < FEWEST or np.ptp(ratio[chosen]) <= 0:
+        return None
+    columns = np.stack([np.ones(len(chosen)), np.log10(light[chosen]), ratio[chosen]], axis=1)
+    columns[:, 1] -= columns[:, 1].mean()
+    found = [_slope(columns, qu[chosen, k], photon[chosen, k, k]) for k in range(2)]
+    share, errors = np.array(found).T
+    return (
+        LeftOverSky(share, errors, len(chosen)) if np.isfinite(found).all() and (errors > 0).all() else None
+    )
+
+
+def _slope(
+    columns: Float[np.ndarray, "s 3"], values: Float[np.ndarray, " s"], variance: Float[np.ndarray, " s"]
+) -> tuple[float, float]:
+    """Coefficient of the last column, and its error."""
+    scatter, used = 0.0, np.ones(len(values), bool)
+    for _ in range(_ROUNDS):
+        beta, _, left = _fitted(columns, values, variance + scatter, used)
+        scatter = _scatter(left[used], variance[used])
+        used = np.abs(left) < FAR * np.sqrt(variance + scatter)
+    beta, inverse, left = _fitted(columns, values, variance + scatter, used)
+    pull = np.where(used, left / (variance + scatter), 0.0)[:, None] * columns
+    robust = inverse @ (pull.T @ pull) @ inverse
+    return float(beta[2]), float(np.sqrt(max(inverse[2, 2], robust[2, 2])))
+
+
+def _fitted(
+    columns: Float[np.ndarray, "s 3"],
+    values: Float[np.ndarray, " s"],
+    variance: Float[np.ndarray, " s"],
+    used: Bool[np.ndarray, " s"],
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"], Float[np.ndarray, " s"]]:
+    """Coefficients, their covariance and the residuals."""
+    weight = np.where(used, 1.0 / variance, 0.0)
+    inverse = np.linalg.pinv(columns.T @ (weight[:, None] * columns), hermitian=True)
+    beta = inverse @ (columns.T @ (weight * values))
+    return beta, inverse, values - columns @ beta
+
+
+def _scatter(left: Float[np.ndarray, " s"], variance: Float[np.ndarray, " s"]) -> float:
+    """Variance beyond the stated one for which χ² of residuals is their number, less what was fitted."""
+    low, high, wanted = 0.0, float(np.mean(left**2)), len(left) - 3.0
+    if np.sum(left**2 / variance) <= wanted:
+        return 0.0
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if np.sum(left**2 / (variance + middle)) > wanted else (low, middle)
+    return 0.5 * (low + high)
+
+
+def with_sky(stars: Stars, catalogue: Catalogue) -> Stars:
+    """The stars with what the sky left in them may do, where the catalogue states its level."""
+    if catalogue.sky is None:
+        return stars
+    both = np.isfinite(catalogue.counts) & np.isfinite(catalogue.sky)
+    sums = (np.where(both, one, 0.0).sum(axis=1) for one in (catalogue.counts, catalogue.sky))
+    light, level = (np.bincount(catalogue.star, one) for one in sums)
+    ratio = np.where(light > 0, level / np.where(light > 0, light, 1.0), np.nan)
+    found = left_over_sky(stars.qu, stars.photon, light, ratio)
+    if found is None:
+        return stars
+    changed = stars.changed + np.nan_to_num(found.covariance(ratio))
+    flag = stars.flag | (Quality.CATALOGUE if found.found else 0)
+    check, bound = dataclasses.replace(stars.check, sky=found), found.bound * ratio
+    return dataclasses.replace(stars, changed=changed, flag=flag, check=check, sky_bound=bound)
