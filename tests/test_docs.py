@@ -42,6 +42,7 @@ TOPICS = (
     "sources",
     "validation",
     "vocabulary",
+    "year",
 )
 every_page = pytest.mark.parametrize("topic", TOPICS)
 

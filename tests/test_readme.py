@@ -22,6 +22,10 @@ def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     assert (tmp_path / "calibration.png").stat().st_size > 50_000
 
 
+def test_it_is_short():
+    assert len(TEXT.split()) <= 900
+
+
 def test_commands_exist():
     named = set(re.findall(r"(?:^|`|&& )walop-jax ([a-z][a-z-]+)", TEXT, re.MULTILINE))
     assert len(named) > 5

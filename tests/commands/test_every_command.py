@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from camera_files import four, some_stars
 from command import Call
 from frame_run import frame_run
 from frames_file import write_frames
@@ -71,6 +72,7 @@ LINES = {
     "report": [Line("report RUN"), Line("report RUN -o page.html")],
     "plot": [Line("plot RUN matrix -o matrix.pdf"), Line("plot RUN")],
     "matrix": [Line("matrix RUN --points points.csv -o matrix.fits"), Line("matrix RUN --x 0.1 --y 0.2")],
+    "gather": [Line("gather O1.fits E1.fits O2.fits E2.fits -o gathered.ecsv")],
     "apply": [Line("apply RUN stars.fits -o corrected.fits", takes="seconds")],
     "compare": [Line("compare turn.fits -o COMPARED", "comparison", "minutes")],
     "certify": [Line("certify RUN"), Line("certify RUN -o NIGHT", "commissioning")],
@@ -151,6 +153,7 @@ def home(call: Call, tmp_path_factory) -> Path:
     words = "".join(f'[{name}]\nword = "{word}"\n' for name, word in columns.items())
     (folder / "words.toml").write_text(f"{words}[CLP_IN]\nvalue = true\n")
     write_folder(folder / "exports")
+    four(some_stars(), folder)
     _stars(folder / "RUN").write(folder / "stars.fits")
     return folder
 

@@ -112,7 +112,7 @@ def test_matrix_is_the_table_of_the_command(call, fitted, tmp_path):
         found = walop.matrix(fitted.run, points=given)
         assert found.colnames == expected.colnames
         np.testing.assert_array_equal(found["M32_ERR"], expected["M32_ERR"])
-    found = walop.matrix(fitted.run, [6, -3] * units.arcmin, [0.2, 0.1], teff=[5000, 6000])
+    found = walop.matrix(fitted.run, [6, -3] * units.arcmin, [0.2, 0.1] * units.deg, teff=[5000, 6000])
     np.testing.assert_allclose(found["M32"], expected["M32"], rtol=1e-12)
     one = walop.matrix(fitted.run, [0.1, 0.2], 0.1, filter="SDSS-r")
     assert len(one) == 2

@@ -190,3 +190,49 @@ def test_two_files_with_a_value_each():
         merge_calibration_sets(sets[0], other)
     same = dataclasses.replace(sets[1], sources=sets[0].sources)
     assert merge_calibration_sets(sets[0], same).sources.filter.tolist() == [""] * 3
+
+
+# ------------------------------------------------------------------------------------ fields of zero polarisation
+
+FIELD = ObservingPlan(
+    grid=2, standard_grid=1, polariser_angles=(0.0, 60.0), moon_patches=0, standards=1, unpolarised=1,
+    zero_stars=7, zero_exposures=2, zero_scatter=1e-3, throughput_degree=0,
+)  # fmt: skip
+
+
+def test_the_stars_of_a_field_are_in_every_exposure_of_it():
+    used, source = FIELD.layout()
+    assert FIELD.star_names == ("STD00", "ZERO")
+    assert used.sum(axis=0).tolist() == [4, 4, 1, 7, 7]
+    assert np.unique(source[5:], axis=0).tolist() == [[-1, -1, -1, 1, 1]]
+    assert len(FIELD.points()) == 4 + 1 + 7
+    assert np.abs(FIELD.points().x[5:]).max() <= 0.9 * FIELD.field
+
+
+def test_scatter_of_a_field_counts_once_for_each_star():
+    """σ² = σ₀² + n · 2 s² N², so that q = (N0 − N1)/(N0 + N1) of a star in n exposures is known to s at best."""
+    run = simulate(FIELD, seed=1)
+    assert run.calset.sources.scatter.tolist() == [0.0, 1e-3]
+    likelihood = Likelihood.of(run.calset, base_model(run.calset, throughput_degree=0))
+    weight, counts = (likelihood.points.gathered(name) for name in ("weight", "counts"))
+    block = run.calset.intensities.block(0, len(run.calset.points))
+    expected = np.where(block.used[..., None], block.sigma, np.inf)
+    expected[5:, 3:] = np.sqrt(block.sigma[5:, 3:] ** 2 + 2 * 2.0 * 1e-6 * counts[5:, 3:] ** 2)
+    np.testing.assert_allclose(np.where(weight > 0, weight, 0.0), 1.0 / expected)
+    # q of one star from both exposures: no better than its own scatter.
+    both = 1.0 / weight[5:, 3:, :2]
+    of_q = np.hypot(both[..., 0], both[..., 1]) / counts[5:, 3:, :2].sum(axis=-1)
+    assert np.all(1.0 / np.sum(of_q**-2, axis=1) > 0.99e-6)
+
+
+def test_stars_of_a_field_differ_by_their_scatter():
+    """Simulated counts against those without scatter: q of the same star is off by the same in both exposures."""
+    one, other = (
+        simulate(dataclasses.replace(FIELD, zero_scatter=s, electrons=1e9), seed=1).calset
+        for s in (0.0, 1e-3)
+    )
+    a, b = (calset.intensities.block(5, 12).counts[:, 3:] for calset in (one, other))
+    q = [(n[..., 0] - n[..., 1]) / (n[..., 0] + n[..., 1]) for n in (a, b)]
+    off = q[1] - q[0]
+    assert 3e-4 < off.std() < 2e-3
+    np.testing.assert_allclose(off[:, 0], off[:, 1], atol=2e-4)

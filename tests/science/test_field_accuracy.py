@@ -10,7 +10,7 @@ from small_run import small_fit
 from walop_jax.calibration.accuracy import p_errors, sample_stars
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.fit.verdict import Hidden
-from walop_jax.science.field_accuracy import GROUPS, field_accuracy
+from walop_jax.science.field_accuracy import GROUPS, FieldAccuracy, field_accuracy
 
 IDEAL = np.array([[0.0, 1.0, 0.0, 0.0, 0.0, 1.0]])
 
@@ -53,6 +53,27 @@ def test_map_of_a_fit():
     assert found.filter == "SDSS-r"
     assert 0 < found.median < 0.01
     assert found.share == np.mean(found.error < 1e-3)
+
+
+def test_good_enough_for_a_goal():
+    """The calibration may make half of the goal in 95 % of the field where an exposure measures u; no more may hide."""
+    error = np.full((10, 10), 2e-4)
+    error[0, :3] = 9e-4  # 3 % of the field
+    known = FieldAccuracy(error, (-0.3, 0.3, -0.3, 0.3), "SDSS-r", hidden=3e-4, hidden_by="x", remedy="look")
+    assert known.shortfalls == ()
+    assert dict(known.facts())["good for 0.1 %"] == "yes: 0.020 % in 95 % of the field"
+    strict = dataclasses.replace(known, goal=2e-4)
+    what = ["0.020 % in 95 % of the field, 0.010 % allowed"]
+    what += ["a systematic error of 0.030 % of q or u could hide"]
+    assert [one.what for one in strict.shortfalls] == what
+    # Errors fall with the square root of the light.
+    assert strict.shortfalls[0].advice.startswith("4.0 times the light")
+    assert strict.shortfalls[1].advice == "look"
+    assert dict(strict.facts())["good for 0.02 %"] == f"no: {'; '.join(what)}"
+    assert strict.document()["good_enough"] is False
+    assert strict.share == 0.0
+    untrusted = dataclasses.replace(known, trusted=False)
+    assert untrusted.document()["good_enough"] is False
 
 
 def test_what_limits_it_is_what_alone_is_uncertain():

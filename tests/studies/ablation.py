@@ -40,7 +40,9 @@ from walop_jax.diagnosis.examination import Evidence  # noqa: E402
 Switch = Callable[[], Any]
 RULES: dict[str, tuple[Any, str, Callable[[Any], Any]]] = {
     # rule: where it is, its name there, and what stands in its place when it is off
-    "two names before a description (`name_first`)": (examination, "name_first", lambda _: lambda *a: False),
+    "a name explains a quarter of what is surely missing (`LEAST_SHARE_OF_NAME`)": (
+        thresholds, "LEAST_SHARE_OF_NAME", lambda _: 0.0,
+    ),
     "one-sided amplitudes on their side (`follow_physics`)": (
         examination, "follow_physics", lambda _: lambda *a: True,
     ),
@@ -159,7 +161,6 @@ def _of_descriptions(real: Callable[..., Any], fired: set[str], rule: str) -> Ca
 
 _NAMES = list(RULES)
 WATCHED = {
-    _NAMES[0]: _when(True),
     _NAMES[1]: _when(False),
     _NAMES[2]: _when(False),
     _NAMES[3]: _of_descriptions,
@@ -180,7 +181,7 @@ def _refused(real: Callable[..., str], fired: set[str]) -> Callable[..., str]:
     def told(evidence: Any, trial: Any) -> str:
         reason = real(evidence, trial)
         if reason.startswith("it explains"):
-            fired.add(_NAMES[4])
+            fired.update((_NAMES[0], _NAMES[4]))
         return reason
 
     return told

@@ -9,40 +9,60 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from collections.abc import Mapping
 
-COMMANDS = {
-    "demo": "Fit the small calibration set that comes with the package, and write the page about it.",
-    "inspect": "Say what is in calibration sets and what is wrong with them.",
-    "exposures": "Make the table EXPOSURES of a calibration set from what an observatory writes down.",
-    "simulate": "Make a calibration set of an instrument whose as-built values are drawn from their priors.",
-    "refit": "Fit all field points of calibration sets jointly.",
-    "clip": "Flag single intensities that lie far from a fit of all others.",
-    "diagnose": "Say what is missing from the model, add it, and fit again.",
-    "limits": "Say at which size every effect of the catalogue would be detected and named in calibration sets.",
-    "plan": "Plan the calibration exposures of a night.",
-    "sample": "Sample the posterior.",
-    "report": "Write one HTML page about a run, figures inside.",
-    "plot": "Draw a figure of a run, by name, as a file.",
-    "matrix": "Say what the instrument matrix is at a field point, or at every point of a table.",
-    "gather": "Make one catalogue, a row a star, of those of the cameras.",
-    "apply": "Turn the intensities of stars into Stokes parameters.",
-    "compare": "Compare the method of Paper II, as it is published, with the joint fit.",
-    "certify": "Check a calibration from its checksums to its physics and its accuracy.",
-    "epoch": "Fit new calibration sets and compare with an old calibration.",
-    "watch": "Say when a calibration ceased to hold, from the stars of many nights.",
-    "affected": "Say which catalogues a new calibration changes, and by how much.",
-    "quality": "Add a row of quality numbers for each night to a table, and say which lie outside their limits.",
-    "stack": "Fit many nights at once, each parameter under a law that says how it may change.",
-    "model": "Write the base model as a file.",
-    "instrument": "Print and check an instrument.",
-    "import-zemax": "Make a calibration set (KIND flux) of the transmissions that an optical design program gives.",
-    "trace": "Follow the light of one source through the instrument.",
-    "standards": "List standard stars with band, errors, variability and source.",
-    "cite": "List the sources of the physics in a fitted model, effects included.",
-    "conformance": "Put another program to the test.",
-    "docs": "Print a reference page, or the list of pages.",
+GROUPS: Mapping[str, Mapping[str, str]] = {
+    "Begin": {
+        "demo": "Fit the small calibration set that comes with the package, write its page, and correct stars.",
+        "docs": "Print a reference page, or the list of pages.",
+    },
+    "Calibrate": {
+        "exposures": "Make the table EXPOSURES of a calibration set from what an observatory writes down.",
+        "inspect": "Say what is in calibration sets and what is wrong with them.",
+        "refit": "Fit all field points of calibration sets jointly.",
+        "clip": "Flag single intensities that lie far from a fit of all others.",
+        "diagnose": "Say what is missing from the model, add it, and fit again.",
+        "sample": "Sample the posterior.",
+        "report": "Write one HTML page about a run, figures inside.",
+        "plot": "Draw a figure of a run, by name, as a file.",
+    },
+    "Correct stars": {
+        "matrix": "Say what the instrument matrix is at a field point, or at every point of a table.",
+        "gather": "Make one catalogue, a row a star, of those of the cameras.",
+        "apply": "Turn the intensities of stars into Stokes parameters.",
+    },
+    "Check a calibration": {
+        "certify": "Check a calibration from its checksums to its physics and its accuracy.",
+        "limits": "Say at which size every effect of the catalogue would be detected and named in calibration sets.",
+        "compare": "Compare the method of Paper II, as it is published, with the joint fit.",
+    },
+    "Many nights": {
+        "epoch": "Fit new calibration sets and compare with an old calibration.",
+        "watch": "Say when a calibration ceased to hold, from the stars of many nights.",
+        "affected": "Say which catalogues a new calibration changes, and by how much.",
+        "quality": "Add a row of quality numbers for each night to a table, and say which lie outside their limits.",
+        "stack": "Fit many nights at once, each parameter under a law that says how it may change.",
+    },
+    "Plan and rehearse": {
+        "plan": "Plan the calibration exposures of a night.",
+        "simulate": "Make a calibration set of an instrument whose as-built values are drawn from their priors.",
+    },
+    "Describe an instrument": {
+        "model": "Write the base model as a file.",
+        "instrument": "Print and check an instrument.",
+        "trace": "Follow the light of one source through the instrument.",
+        "standards": "List standard stars with band, errors, variability and source.",
+        "import-zemax": "Make a calibration set (KIND flux) of the transmissions that an optical design program gives.",
+    },
+    "Credits and conformance": {
+        "cite": "List the sources of the physics in a fitted model, effects included.",
+        "conformance": "Put another program to the test.",
+    },
 }
-"""Every command in the order of the help, with its line there: the first sentence of its docstring.
+"""The commands in the groups of the help, each with its line there: the first sentence of its docstring."""
+
+COMMANDS = {name: line for commands in GROUPS.values() for name, line in commands.items()}
+"""Every command in the order of the help, with its line there.
 
 `import-zemax` is the function `import_zemax` of `import_zemax.py`, and so on.
 """

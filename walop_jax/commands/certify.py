@@ -45,13 +45,16 @@ class Certificate(Displayed):
     @property
     def go(self) -> bool:
         """True if the product is valid and everything that is needed is met."""
-        return not self.failed and all(one.met for one in self.requirements if one.needed)
+        from walop_jax.science.commissioning import is_go
+
+        return not self.failed and is_go(self.requirements)
 
     @property
     def missing(self) -> tuple[str, ...]:
         """Advice on requirements that are not met, what is needed first."""
-        ordered = sorted(self.requirements, key=lambda one: not one.needed)
-        return tuple(f"{one.found}: {one.advice}" for one in ordered if not one.met)
+        from walop_jax.science.commissioning import requirement_advice
+
+        return requirement_advice(self.requirements)
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
@@ -71,11 +74,10 @@ class Certificate(Displayed):
 
     def display(self) -> Display:
         """Go or no-go, a line for each check and requirement, and what is missing."""
+        from walop_jax.science.commissioning import requirement_rows
+
         rows = [("ok" if check.passed else "FAILED", check.name, check.found) for check in self.checks]
-        rows += [
-            ("ok", one.what, one.found) if one.met else ("NO" if one.needed else "no", one.what, one.found)
-            for one in self.requirements
-        ]
+        rows += requirement_rows(self.requirements)
         title = f"{self.path}: {'go' if self.go else 'NO GO'}"
         return Display(title, head=("", "asked", "found"), rows=tuple(rows), notes=self.missing)
 

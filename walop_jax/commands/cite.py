@@ -37,7 +37,7 @@ def cite(
     from walop_jax.fit.model_file import model_without_data
     from walop_jax.io.names import POSTERIOR
     from walop_jax.model.instrument import nominal_instrument
-    from walop_jax.model.references import Reference, references
+    from walop_jax.model.references import Reference, References, references
     from walop_jax.model.references import bibtex as entries
 
     sampled = isinstance(run, Run) and POSTERIOR in run
@@ -50,10 +50,9 @@ def cite(
         with errors_naming(path):
             calibration = calibration_of(run if path is None else path, catalogue_of(effects))
             model, filters = calibration.model, calibration.exposures.filter.tolist()
-    sources = (*references(model, filters), Reference("fit", minimise.SOURCE))
-    lines = [f"{entry.what}: {entry.source}" for entry in sources]
+    sources = References((*references(model, filters), Reference("fit", minimise.SOURCE)))
     return Outcome(
         sources,
         [{"what": entry.what, "source": entry.source} for entry in sources],
-        entries(sources, __version__, sampled=sampled) if bibtex else "\n".join(lines),
+        entries(sources, __version__, sampled=sampled) if bibtex else repr(sources),
     )

@@ -105,7 +105,7 @@ def compare(
     return Outcome(
         compared,
         extra={"trusted": trusted, NOT_CARRIED_OVER: list(lost)},
-        below=str(output),
+        below="" if output is None else f"Written to {output}.",
         files=files,
         saved_as=DOCUMENT,
         trusted=trusted,

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from walop_jax.data.user_tables import InputTable
     from walop_jax.fit.verdict import Quality
     from walop_jax.model.effects import EffectKind
+    from walop_jax.posterior.result import PosteriorSample
 
 
 class Diagnosed(Protocol):
@@ -73,7 +74,7 @@ DataOf = Annotated[
     Option("Calibration set of the fit, if it has moved; again for each.", "CALSET", list[Path]),
 ]
 Posterior = Annotated[
-    "PathLike | None",
+    "PosteriorSample | Any | PathLike | None",
     Option("Use draws of walop-jax sample, not the covariance.", "posterior.nc", Path),
 ]
 Angles = Annotated[
@@ -83,6 +84,10 @@ Angles = Annotated[
         "P=ANGLE",
         list[str],
     ),
+]
+Goal = Annotated[
+    "float | None",
+    Option("Error of p of a star that is wanted, in per cent (default: 0.1).", "PERCENT", float, least=0.0),
 ]
 Memory = Annotated["float | None", Option("Memory for the data, in GB.", "GB", float, least=0.1)]
 
@@ -307,6 +312,13 @@ def angles_of(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float
         except ValueError:
             raise UsageError(f"{text!r} is no P=ANGLE, such as CHWP=45", "at") from None
     return found
+
+
+def goal_of(percent: float | None) -> float | None:
+    """A goal as a fraction. Raises `UsageError` for one that no calibration can have."""
+    if percent is not None and not 0.0 < percent <= 100.0:
+        raise UsageError(f"{percent:g} % is no error of p; give a number above 0, in per cent", "goal")
+    return None if percent is None else percent / 100.0
 
 
 def table_of(given: Any, columns: Mapping[str, Any]) -> InputTable:

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from walop_jax.commands import COMMANDS, INTERRUPTED
+from walop_jax.commands import COMMANDS, GROUPS, INTERRUPTED
 from walop_jax.commands.command import (
     COMMON,
     Argument,
@@ -77,9 +77,11 @@ class _Commands(TyperGroup):
         return self.commands.get(cmd_name)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """The list."""
-        with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+        """The list, group by group."""
+        width = max(map(len, COMMANDS))
+        for title, commands in GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl([(f"{name:<{width}}", line) for name, line in commands.items()])
 
 
 app = typer.Typer(

@@ -12,11 +12,13 @@ from walop_jax.commands.inputs import (
     IN_MEMORY,
     Effects,
     Folder,
+    Goal,
     InstrumentLike,
     Memory,
     ModelLike,
     PathLike,
     Sets,
+    goal_of,
     paths_of,
     set_and_model,
 )
@@ -41,6 +43,7 @@ def refit(
     effects: Effects = None,
     memory: Memory = 2.0,
     compress: Annotated[PathLike | None, COMPRESS] = None,
+    goal: Goal = None,
 ) -> Outcome[FitResult]:
     """Fit all field points of calibration sets jointly: RUN/calibration.fits and RUN/summary.json.
 
@@ -51,6 +54,9 @@ def refit(
     converges but is not to be trusted (it does not explain the data, a parameter lies far from its prior, the
     residuals hold patterns or differ between parts of the data) is written with TRUSTED = F and warnings, exit
     code 3.
+
+    The first lines say how well p of a star will be known, whether that is good enough for --goal, and what to do if
+    not; the calibration may make half of the goal.
 
     Sets of more than 65536 points (whole frames) are read in slabs on every pass. The calibration then holds a map of
     what the smooth model leaves. --compress makes of them a set of some hundred field points, a megabyte: refit,
@@ -68,6 +74,7 @@ def refit(
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.residual_map import residual_map
     from walop_jax.calibration.summary import summary
+    from walop_jax.calibration.thresholds import GOAL
     from walop_jax.data.write import write_calibration_set
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.misfit import describe
@@ -86,7 +93,7 @@ def refit(
         with job.repeated() as say:
             fitted = fit(calset, chosen, progress=say, memory=None if memory is None else memory * GIGABYTE)
             say(Stage("looking for patterns in the residuals", "examining"))
-            result = answered(examined(fitted, job.seed))
+            result = answered(examined(fitted, job.seed), goal=goal_of(goal) or GOAL)
         if compress is not None:
             write_calibration_set(compress, _compressed(result), overwrite=job.overwrite)
         wanted = output is not None

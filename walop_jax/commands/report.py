@@ -12,10 +12,12 @@ from walop_jax.commands.inputs import (
     DataOf,
     Diagnosed,
     Effects,
+    Goal,
     PathLike,
     catalogue_of,
     fit_of,
     folder_of,
+    goal_of,
     save,
 )
 from walop_jax.io.display import Display, Displayed
@@ -54,11 +56,13 @@ def report(
     *,
     data: DataOf = None,
     effects: Effects = None,
+    goal: Goal = None,
 ) -> Outcome[Page]:
     """Write one HTML page about a run, figures inside: it needs no network and no other file, and can be mailed or
     printed.
 
-    The verdict, the accuracy of p over the field, what the data were, what was found, residuals before and after, maps
+    First whether the calibration is good enough for --goal (default: that of the fit), and what to do if not. The
+    verdict, the accuracy of p over the field, what the data were, what was found, residuals before and after, maps
     of the matrix and of its errors, pulls from the priors, all parameters, warnings, inputs and versions, as far as RUN
     holds them; the page says what is missing. What sample and limits have put into RUN is there as well; compare,
     epoch, limits, plan, stack, watch and certify have pages of their own. A page that exists is made anew; another file
@@ -83,7 +87,7 @@ def report(
                 save(run, Path(temporary) / "fit")
             else:
                 write(run, Path(temporary) / "fit")  # pyright: ignore[reportArgumentType]
-            return command_of(report).body(job, Path(temporary) / "fit", output, effects=effects)
+            return command_of(report).body(job, Path(temporary) / "fit", output, effects=effects, goal=goal)
     folder = folder_of(run)  # pyright: ignore[reportArgumentType]
     target = folder / PAGE if output is None else Path(output)
     job.begin("reading")
@@ -92,7 +96,7 @@ def report(
     overwrite = job.overwrite or _is_page(target)
     check_output(target, overwrite=overwrite)
     job.tell("drawing", "drawing")
-    text, missing = render_other(folder, kind) if found is None else render(found)
+    text, missing = render_other(folder, kind) if found is None else render(found, goal_of(goal))
     text = encodable(text)
     with atomic_path(target, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -131,7 +131,8 @@ def simulate(
         made = astropy_table(seen.columns, {"INSTRUME": plan.name})
         known = truth_document(plan, job.seed, sources, true) | {"stars": seen.document()}
         about["stars"] = stars
-        text = f"{output}: {plan.name}, {stars} stars of the instrument of seed {job.seed}"
+        which = f"seed {job.seed}" if like is None or isinstance(like, tuple) else str(like)
+        text = f"{output}: {plan.name}, {stars} stars of the instrument of {which}"
         suggested, times = (f"walop-jax apply RUN {output} -o OUT.fits",), made["MJD"]
     else:
         made = simulated(plan, job.seed, noiseless=noiseless, night=night, **drawn)

@@ -243,7 +243,7 @@ def _join_sources(sets: tuple[CalibrationSet, ...]) -> tuple[Sources, list[np.nd
         at = earliest.setdefault(name, i) if name else i
         if owner[at] != here:
             star[star == i] = at
-    values = np.stack([whole[name] for name in ("q", "u", "q_err", "u_err")], axis=1)
+    values = np.stack([whole[name] for name in ("q", "u", "q_err", "u_err", "scatter")], axis=1)
     band = _bands_of(sets, star, owner, values, whole["filter"])
     kept: list[int] = []
     for row in range(len(star)):

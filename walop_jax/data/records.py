@@ -268,7 +268,8 @@ class Sources:
     """Standard stars: catalogue `q`, `u` and their errors in the equatorial frame, `teff` in K (or NaN).
 
     `filter` is the band of a value, "" where the catalogue does not state it (None: nowhere). A star with values in
-    several bands has a row for each, with one number `source`; its first row stands for it wherever a star is meant.
+    several bands has a row for each, with one number `source`; its first row stands for it wherever a star is meant. A
+    row may be a field of stars, which differ from its `q`, `u` by `scatter` (rms of each).
     """
 
     source: Int[np.ndarray, " s"]
@@ -279,8 +280,11 @@ class Sources:
     u_err: Float[np.ndarray, " s"]
     teff: Float[np.ndarray, " s"]
     filter: Shaped[np.ndarray, " s"] = None  # pyright: ignore[reportAssignmentType]
+    scatter: Float[np.ndarray, " s"] = None  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self) -> None:
+        if self.scatter is None:
+            object.__setattr__(self, "scatter", np.zeros(len(self.source)))
         if self.filter is None:
             object.__setattr__(self, "filter", np.full(len(self.source), "", dtype="U1"))
 
@@ -294,10 +298,12 @@ class Sources:
         return first[number]
 
     def columns(self) -> dict[str, np.ndarray]:
-        """The columns of SOURCES; FILTER only where a band is stated."""
+        """The columns of SOURCES; FILTER and SCATTER only where there is any."""
         columns = {field.name.upper(): getattr(self, field.name) for field in dataclasses.fields(self)}
         if not (self.filter != "").any():
             del columns["FILTER"]
+        if not self.scatter.any():
+            del columns["SCATTER"]
         return columns
 
 
@@ -398,6 +404,39 @@ class CalibrationSet(Displayed):
             "standards": ", ".join(str(name) for name in self.sources.name) or "none",
         }
         return Display(f"Calibration set of {self.instrument}", tuple(facts.items()), notes=self.remarks)
+
+    def to_arrays(self) -> dict[str, Any]:
+        """The set as arrays: `from_arrays(**calset.to_arrays())` is the same set; NaN where nothing was measured.
+
+        `counts` and `errors` (point, exposure, camera) are electrons, `x`, `y` and `angles` degrees. Of whole frames
+        give a part at a time: `intensities.block(start, stop)`.
+
+        >>> arrays = calset.to_arrays()
+        >>> arrays["counts"].shape == (len(calset.points), len(calset.exposures), calset.cameras)
+        True
+        """
+        block, e = self.intensities.block(0, len(self.points)), self.exposures
+        used = block.used[:, :, None]
+        others = {name.lower(): values for name, values in e.columns().items()}
+        for name in ("exposure", "kind", "clp_in", "clp_angle"):
+            others.pop(name, None)
+        return {
+            "counts": np.where(used, block.counts, np.nan),
+            "errors": np.where(used, block.sigma, np.nan),
+            "x": block.x,
+            "y": block.y,
+            "angles": np.where(e.clp_in, e.clp_angle, np.nan),
+            "kinds": e.kind,
+            "source": np.where(block.source >= 0, np.append(self.sources.source, -1)[block.source], -1),
+            **others,
+            "instrument": self.instrument,
+            "site": self.site,
+            "filters": dict(self.filters),
+            "sources": {f.name.upper(): getattr(self.sources, f.name) for f in dataclasses.fields(Sources)}
+            if len(self.sources)
+            else None,
+            "origin": self.origin,
+        }
 
     def to_table(self) -> Any:
         """The exposures as an astropy table, with the columns of EXPOSURES."""

@@ -132,6 +132,9 @@ INTENSITIES: Mapping[str, Column] = {
 _SHARE = within(1.0, "fractions are wanted: are these per cent?", "exceeds 1")
 _FRACTION = Column("float", rules=(finite("remove the source"), _SHARE))
 _ERROR = Column("float", rules=(_POSITIVE,))
+_SCATTER = Rule(
+    lambda rms: ~((rms >= 0) & (rms <= 1)), "is no scatter", "the rms of q and of u, a fraction; 0: none"
+)
 SOURCES: Mapping[str, Column] = {
     "SOURCE": Column("int", rules=(_NUMBERED,)),
     "NAME": Column("str"),
@@ -141,6 +144,7 @@ SOURCES: Mapping[str, Column] = {
     "U_ERR": _ERROR,
     "TEFF": _TEFF,
     "FILTER": Column("str", missing="", remarked=False),
+    "SCATTER": Column("float", missing=0.0, remarked=False, rules=(_SCATTER,)),
 }
 _PADDED = "use one length, padded with NaN"
 FILTERS: Mapping[str, Column] = {

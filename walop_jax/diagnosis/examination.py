@@ -2,9 +2,6 @@
 
 Evidence      Of a candidate alone: ln B of the score test (`score.log_bayes`). Alternative shapes of an effect share
               its prior, sentences share that of one name.
-Two steps     A sentence may hold a part of two effects at once, and alone be more probable than either. Compared are
-              ln B(first) + ln B(second behind first) − ln(names), the second step of a name being a name, that of a
-              sentence anything. Where two names are the more probable, the sentence does not come before them.
 Separation    The change D of the residuals that a candidate makes at its amplitudes, projected off the other
               parameters, is fitted by each rival; the length of what the rival cannot follow is the separation in
               standard deviations (Atkinson & Fedorov 1975, Biometrika 62, 57). Below `thresholds.SEPARATION` the data
@@ -16,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -99,34 +96,6 @@ def shortest(item: Ranked, most: int = thresholds.MOST_TOGETHER) -> Described:
     best = subsets[int(np.argmax(worth))]
     amplitudes = np.linalg.lstsq(information[np.ix_(best, best)], scores[best], rcond=None)[0]
     return Described.combine([item.probe.group[i] for i in best], amplitudes)
-
-
-def name_first(
-    names: Sequence[Ranked],
-    sentence: Ranked,
-    joined: Callable[[Ranked], Evidence],
-) -> bool:
-    """True if significant `names` come before a more probable sentence; `joined` is `Evidence.joined`.
-
-    They do where the best of them leaves nothing significant and the sentence does, or where two of them are more
-    probable than the sentence with whatever is best behind it.
-    """
-
-    def worth(first: Ranked, second: Sequence[Ranked], count: int) -> float:
-        gain = max((item.log_bayes for item in second), default=0.0) - float(np.log(max(count, 1)))
-        return first.log_bayes + max(gain, 0.0)
-
-    if not names:
-        return False
-    left = joined(sentence)
-    least = worth(sentence, [*left.ranked[:1], *left.told[:1]], len(left.ranked))
-    for name in leaders(names):
-        behind = joined(name)
-        if name is names[0] and left.alarm and not behind.alarm:
-            return True
-        if worth(name, behind.ranked[:1], len(behind.ranked)) > least:
-            return True
-    return False
 
 
 # --------------------------------------------------------------------------------------------------- evidence
@@ -249,17 +218,6 @@ class Evidence:
             self._p(table[probe.name]) < thresholds.ALARM for probe in probes if table[probe.name].testable
         )
 
-    def followed(self, item: Ranked) -> float:
-        """Evidence of further sentences behind one: a pattern of many numbers may hold several at once."""
-        gain, state = 0.0, self
-        for _ in range(1, thresholds.MOST_TOGETHER):
-            state = state.joined(item)
-            if not state.significant_sentences:
-                break
-            item = state.significant_sentences[0]
-            gain += item.log_bayes
-        return gain
-
     def joined(self, item: Ranked, known: ScoreSpace | None = None) -> Evidence:
         """The evidence once a candidate has joined the base, by a linear step; `known` is the space of that."""
         space, reduce = self.space.with_base([item.probe.name])
@@ -280,11 +238,9 @@ class Evidence:
         )
 
     def sentences_before_names(self) -> list[Ranked]:
-        """Sentences that are more probable than every name; none where names suffice and they do not."""
-        names, found = self.significant, self.significant_sentences
-        if names:
-            found = [item for item in found if item.log_bayes > names[0].log_bayes]
-        return [] if found and name_first(names, found[0], self.joined) else found
+        """Sentences that are more probable than every name."""
+        best = max((item.log_bayes for item in self.significant), default=-np.inf)
+        return [item for item in self.significant_sentences if item.log_bayes > best]
 
     # ------------------------------------------------------------------------------- what cannot be told apart
 

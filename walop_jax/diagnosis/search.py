@@ -137,10 +137,7 @@ def _stands(evidence: Evidence, trial: Trial, worth: float) -> bool:
     probes = [probe for probe in evidence.probes if probe.effect is trial.effect]
     if not probes and trial.effect is not Described:  # what has no linear step
         return True
-    if evidence.stands(probes, worth):
-        return True
-    more = evidence.followed(trial.item) if trial.effect is Described and trial.item is not None else 0.0
-    return more > 0.0 and evidence.stands(probes, worth + more / evidence.floor**2)
+    return evidence.stands(probes, worth)
 
 
 def hopeless(evidence: Evidence, trial: Trial) -> str:
@@ -292,8 +289,6 @@ def _too_far(evidence: Evidence, item: Ranked) -> str:
     """Reason for which a significant candidate was not tried: what comes before it."""
     names, sentences = evidence.significant, evidence.significant_sentences
     best = max([*names[:1], *sentences[:1]], key=lambda one: one.log_bayes)
-    if item.effect is Described and names and best is not names[0] and not evidence.sentences_before_names():
-        return f"names explain the same without it, {names[0].name} first (ln B = {names[0].log_bayes:.3g})"
     gap = best.log_bayes - item.log_bayes
     if best is item or gap <= 0.0:
         return "others were tried first"

@@ -19,7 +19,7 @@ COMMON_MODE = 0.05
 MOST_STEPS = 6
 """Additions of one diagnosis. Not measured."""
 MOST_LEADERS = 5
-"""Names that are tried at one step. Ablation."""
+"""Names that are tried at one step. Not measured."""
 MOST_SENTENCES = 2
 """Descriptions of one step; more of them in the final model can be one thing that none of them holds. Blind."""
 MOST_TOGETHER = 4
@@ -27,7 +27,7 @@ MOST_TOGETHER = 4
 MOST_SHAPES = 4
 """Shapes of one effect from which it is fitted. Not measured."""
 WITHIN = 8.0
-"""Evidence below the best within which a rival is tried. Ablation."""
+"""Evidence below the best within which a rival is tried. Not measured."""
 LINEAR_GOOD = 1.0
 """Evidence by which a fit may differ from its linear trial before rivals are fitted as well. Not measured."""
 SAME_COUNTS = 0.01
@@ -38,24 +38,29 @@ GOOD_SHARE = 0.5
 """Share of what is missing that a name must explain for these not to be tried. Not measured."""
 
 LINEAR_BELOW = 150.0
-"""Evidence of the best above which rivals are tried down to `LINEAR_SHARE` of it less."""
+"""Evidence of the best above which rivals are tried down to `LINEAR_SHARE` of it less. Not measured."""
 LINEAR_SHARE = 0.6
+"""By which a fit may be better than its linear step there. Not measured."""
 FLOOR = 1.25
-"""Standard deviations of what is left behind all candidates above which evidence counts in that unit."""
+"""Standard deviations of what is left behind all candidates above which evidence counts in that unit. Not measured:
+errors of all scenes are as stated."""
 
 # --------------------------------------------------------------------------------------------- what may be added?
 
 LEAST_SHARE = 0.1
-"""Share of what is missing that an addition must explain."""
+"""Share of what is missing that an addition must explain. Ablation: no gain where the fit is not poor."""
 LEAST_SHARE_OF_NAME = 0.25
-"""Of what is surely missing (2 σ of χ²) a name, where the fit is not poor: else it stands in for what has none."""
+"""Of what is surely missing (2 σ of χ²) a name, where the fit is not poor: else it stands in for what has none.
+Ablation."""
 PART = 10.0
-"""Factor by which names must bring down χ²/dof − 1 of a poor fit; else they are told as parts, and not added."""
+"""Factor by which names must bring down χ²/dof − 1 of a poor fit; else they are told as parts, and not added. Not
+measured."""
 HOPEFUL = 1.0
-"""Standard errors by which a sentence must predict unseen settings better, by its linear step, to be fitted."""
+"""Standard errors by which a sentence must predict unseen settings better, by its linear step, to be fitted. Not
+measured."""
 
 EVEN_ODDS = 3.0
-"""Difference in evidence that is no preference; a description needs that much more than a name. Ablation."""
+"""Difference in evidence that is no preference; a description needs that much more than a name. Not measured."""
 IMPROBABLE = 6.9
 """Difference in evidence at which the other has a probability of 10⁻³: rivals are listed down to it. Blind."""
 SEPARATION = 3.0

@@ -16,6 +16,7 @@ from walop_jax.model.specification import THROUGHPUT, Model, Vector
 Columns = dict[str, tuple[np.ndarray, str, str]]
 
 PRIOR_ONLY = 0.99  # of the prior width: an error above it owes nothing to the data
+PRIOR_WORDS = "prior only"
 MOST_LISTED = 6  # parameters by name, in a note
 HEAD = ("parameter", ">value", ">error", "unit", ">start", "prior", "")
 
@@ -39,6 +40,11 @@ class Fitted(Result):
     model: Model
     values: Vector
     covariance: Float[np.ndarray, "n n"]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all parameters, in the order of `values`."""
+        return self.model.names
 
     @property
     def sigma(self) -> Vector:
@@ -95,8 +101,8 @@ def parameter_rows(model: Model, values: Vector, sigma: Vector) -> tuple[tuple[s
         start = "" if same else with_minus_sign(f"{p.start + 0.0:.6g}")
         texts = value_and_error(float(value), float(s))
         rows.append((p.name, *texts, p.unit, start, prior, _state(p, idle)))
-    # Standards last: they are no part of the instrument.
-    return tuple(sorted(rows, key=lambda row: row[0].startswith("standard.")))
+    # First what was measured. Standards last: they are no part of the instrument.
+    return tuple(sorted(rows, key=lambda row: (row[0].startswith("standard."), row[-1] == PRIOR_WORDS)))
 
 
 def parameter_notes(model: Model, sigma: Vector) -> tuple[str, ...]:
@@ -111,6 +117,4 @@ def parameter_notes(model: Model, sigma: Vector) -> tuple[str, ...]:
 
 
 def _state(p: Parameter, idle: tuple[str, ...]) -> str:
-    if p.tie is not None:
-        return f"tied to {p.tie}"
-    return "fixed" if not p.free else "prior only" if p.name in idle else ""
+    return p.state or (PRIOR_WORDS if p.name in idle else "")

@@ -277,7 +277,7 @@ class PointReader:
     def point_data(self, block: Block) -> PointData:
         """A block of measurements as the engine wants it."""
         band = np.take_along_axis(self.plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
-        sigma = with_floor(block.sigma, block.counts, self.floor)
+        sigma = with_floor(self._with_scatter(block), block.counts, self.floor)
         weight = np.where(block.used[:, :, None], 1.0 / np.where(sigma > 0, sigma, 1.0), 0.0)
         opposite = self.sky_polarisation(-block.x, -block.y) if self.mirrored else None
         return PointData(
@@ -290,6 +290,19 @@ class PointReader:
             band=array(band),
             opposite_sky=None if opposite is None else array(opposite),
         )
+
+    def _with_scatter(self, block: Block) -> Float[np.ndarray, "p e k"]:
+        """Errors of the counts with the scatter of the stars of a field around their mean q, u.
+
+        A camera of a pair with (N0 − N1)/(N0 + N1) off by s has √2 s N. What is off is the same in all n exposures of a
+        star, so that their mean does not make it smaller: √n more in each.
+        """
+        scatter = np.append(self.calset.sources.scatter, 0.0)[block.source]
+        if not scatter.any():
+            return block.sigma
+        same = (block.source[:, :, None] == block.source[:, None, :]) & block.used[:, None, :]
+        share = scatter * np.sqrt(2.0 * np.maximum(same.sum(axis=2), 1))
+        return np.hypot(block.sigma, share[:, :, None] * np.abs(block.counts))
 
     @cached_property
     def _moon(self) -> tuple[np.ndarray, Vector, Vector]:

@@ -67,6 +67,11 @@ class Parameter:
         """Standard deviation of the prior, None where there is none."""
         return None if self.prior is None else self.prior[1]
 
+    @property
+    def state(self) -> str:
+        """Fixed, or tied to another; empty for a free one."""
+        return f"tied to {self.tie}" if self.tie is not None else "" if self.free else "fixed"
+
     def at(self, value: float, prior: tuple[float, float] | None = None) -> Parameter:
         """A declared parameter at a value; `prior` replaces what is declared."""
         if prior is None and self.prior is not None:

@@ -28,6 +28,15 @@ class Reference:
     source: str
 
 
+class References(tuple[Reference, ...]):
+    """Several of them, which print as a line each."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return "\n".join(f"{entry.what}: {entry.source}" for entry in self)
+
+
 def _optics(instrument: Instrument) -> Iterator[Reference]:
     behind = [element for arm in instrument.arms for element in (*arm.train(), arm.analyser)]
     elements = [*instrument.train(), *behind]

@@ -14,6 +14,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.data.records import Exposures
+from walop_jax.io.display import Display, Displayed
+from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.text import with_error, with_minus_sign
 from walop_jax.model.compiled import array
 from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects import EFFECTS, Described, EffectKind, effect_by_name, in_order
@@ -29,7 +32,7 @@ THROUGHPUT = "throughput"
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Model:
+class Model(Displayed):
     """An instrument with what may vary in it. Immutable: every change returns a new model.
 
     `catalogue` are the effects that it may be given by name, `laws` how parameters may change from night to night: the
@@ -43,12 +46,36 @@ class Model:
     name: str
     template: Instrument
     parameters: tuple[Parameter, ...]
-    catalogue: tuple[EffectKind, ...] = EFFECTS
+    catalogue: tuple[EffectKind, ...] = dataclasses.field(default_factory=lambda: EFFECTS)
     laws: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
-    def __repr__(self) -> str:
+    def display(self) -> Display:
+        """The number of parameters, and those of them that are not terms of the throughput."""
         effects = ", ".join(self.effect_names) or "none beyond the base model"
-        return f"Model of {self.name}: {len(self.parameters)} parameters, {len(self.free)} free; effects: {effects}"
+        counts = f"{len(self.parameters)} parameters, {len(self.free)} free"
+        rows = tuple(
+            (p.name, with_minus_sign(f"{p.start + 0.0:.6g}"), p.unit, _prior_of(p), p.state, p.about)
+            for p in sorted(self.parameters, key=lambda p: p.name.startswith("standard."))
+            if p.part != THROUGHPUT
+        )
+        hidden = len(self.positions(THROUGHPUT))
+        note = (f"{hidden} throughput terms not shown; to_table() has them",) if hidden else ()
+        head = ("parameter", ">start", "unit", "prior", "", "what it is")
+        return Display(f"Model of {self.name}: {counts}; effects: {effects}", (), head, rows, note)
+
+    def to_table(self) -> Any:
+        """All parameters as an astropy table: start value, unit, prior, whether it is free, and what it is."""
+        priors = np.array([p.prior or (np.nan, np.nan) for p in self.parameters]).reshape(-1, 2)
+        columns: Mapping[str, tuple[np.ndarray, str, str]] = {
+            "NAME": (np.array(self.names), "", "parameter"),
+            "START": (self.start, "", "start value"),
+            "UNIT": (np.array([p.unit for p in self.parameters]), "", "unit of the numbers of this row"),
+            "PRIOR_MEAN": (priors[:, 0], "", "mean of the prior"),
+            "PRIOR_SIGMA": (priors[:, 1], "", "standard deviation of the prior"),
+            "STATE": (np.array([p.state or "free" for p in self.parameters]), "", "free, fixed or tied"),
+            "ABOUT": (np.array([p.about for p in self.parameters]), "", "what it is"),
+        }
+        return astropy_table(columns)
 
     def __post_init__(self) -> None:
         names = self.names
@@ -171,6 +198,10 @@ class Model:
         if values is None or not isinstance(values, jax.Array):
             values = np.asarray(self.start if values is None else values, float)
         return with_values(self.template)(values)
+
+
+def _prior_of(p: Parameter) -> str:
+    return "" if p.prior is None else with_error(p.prior[0] + 0.0, p.prior[1])
 
 
 def _wave_plates(instrument: Instrument) -> Iterator[tuple[str, WavePlate]]:

@@ -184,7 +184,7 @@ class Available:
         """All choices, and in words what had to be left out, with what would do."""
         plan, notes = self.plan, []
         up: dict[str, tuple[int, ...]] = {}
-        for kind, total in (("moon", plan.moon_patches), ("standard", plan.standards)):
+        for kind, total in (("moon", plan.moon_patches), ("standard", len(plan.star_names))):
             up[kind], remarks = self._up(kind, total)
             notes += remarks
         candidates = []
@@ -211,7 +211,9 @@ class Available:
     def _members(self, blank: Stop, numbers: tuple[int, ...]) -> Iterator[Stop]:
         single = self.places and blank.kind == "standard"
         for number in numbers:
-            for place in range(self.plan.standard_grid**2) if single else (None,):
+            for place in (
+                range(self.plan.standard_grid**2) if single and number < self.plan.standards else (None,)
+            ):
                 yield dataclasses.replace(blank, number=number, place=place)
 
     def _up(self, kind: str, total: int) -> tuple[tuple[int, ...], list[str]]:

@@ -212,7 +212,7 @@ def fewer_points(plan: ObservingPlan) -> ObservingPlan:
 
 def _factor(plan: ObservingPlan, few: ObservingPlan) -> float:
     def count(one: ObservingPlan) -> int:
-        return len(one.points()) - (one.standard_grid**2 if one.standards else 0)
+        return len(one.points()) - (one.standard_grid**2 if one.standards else 0) - one.zero_stars
 
     return count(plan) / count(few)
 

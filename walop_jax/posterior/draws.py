@@ -82,15 +82,21 @@ def read_groups(path: str | os.PathLike[str]) -> DataTree:
         raise fail(f"cannot be read: {error}", file=path, advice=_AGAIN) from error
 
 
-def read_draws(
-    path: str | os.PathLike[str], names: tuple[str, ...], fit: str | None = None
-) -> Float[np.ndarray, "d n"]:
+def _groups_of(given: Any) -> Any:
+    """The groups of a `posterior.nc`, of what `walop.sample` returns, or as they are (`Run.posterior`)."""
+    if isinstance(given, str | os.PathLike):
+        return read_groups(given)
+    return given.groups() if callable(getattr(given, "groups", None)) else given
+
+
+def read_draws(path: Any, names: tuple[str, ...], fit: str | None = None) -> Float[np.ndarray, "d n"]:
     """Draws of the parameters `names`, all chains one after the other; fixed ones keep their value.
 
+    `path` is that of a `posterior.nc`, or a posterior in memory.
     `fit` is the `digest_of_fit` that was sampled around; None: whichever. Raises `DataError` for a file that cannot be
     read, is of another model or another fit, or may not be trusted.
     """
-    groups = read_groups(path)
+    groups, path = _groups_of(path), path if isinstance(path, str | os.PathLike) else "the posterior"
     try:
         posterior = groups["posterior"]
         fixed = json.loads(posterior.attrs["fixed"])
@@ -112,8 +118,8 @@ def read_draws(
     return np.stack([held.get(name, np.full(count, fixed.get(name, np.nan))) for name in names], axis=1)
 
 
-def with_draws(calibration: Calibration, path: str | os.PathLike[str], count: int = DRAWS) -> Calibration:
-    """The calibration with `count` draws of a `posterior.nc`, over which its matrices are averaged.
+def with_draws(calibration: Calibration, path: Any, count: int = DRAWS) -> Calibration:
+    """The calibration with `count` draws of a posterior, in a file or in memory, over which its matrices are averaged.
 
     `DataError` for a file of another model or another fit, or not trusted.
     """
@@ -122,7 +128,7 @@ def with_draws(calibration: Calibration, path: str | os.PathLike[str], count: in
     return dataclasses.replace(calibration, draws=draws[chosen])
 
 
-def with_moments(calibration: Calibration, path: str | os.PathLike[str]) -> Calibration:
+def with_moments(calibration: Calibration, path: Any) -> Calibration:
     """The calibration with mean and covariance of all draws of a `posterior.nc` in place of the fit's.
 
     For linear propagation, star by star. `DataError` as in `with_draws`.
@@ -131,6 +137,6 @@ def with_moments(calibration: Calibration, path: str | os.PathLike[str]) -> Cali
     return dataclasses.replace(calibration, values=draws.mean(axis=0), covariance=np.cov(draws, rowvar=False))
 
 
-def _draws_of(calibration: Calibration, path: str | os.PathLike[str]) -> Float[np.ndarray, "d n"]:
+def _draws_of(calibration: Calibration, path: Any) -> Float[np.ndarray, "d n"]:
     names = calibration.model.names
     return read_draws(path, names, digest_of_fit(calibration.inputs, names, calibration.values))

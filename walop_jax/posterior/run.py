@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.calibration.calibration import Calibration, Product
+from walop_jax.calibration.calibration import Calibration, Matrix, Product
 from walop_jax.calibration.product import read_product
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_file import model_for
-from walop_jax.fit.parameter_table import ParameterValue
+from walop_jax.fit.parameter_table import Fitted
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.verdict import STATED
-from walop_jax.io.display import Display, Result
+from walop_jax.io.display import Display
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.names import MODEL, POSTERIOR, PRODUCT
 from walop_jax.io.run_folder import RunFolder
@@ -27,6 +27,7 @@ from walop_jax.io.text import two_digits
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, EffectKind
+from walop_jax.model.specification import Model, Vector
 from walop_jax.posterior.draws import A_MEAN, read_groups
 
 VERDICTS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
@@ -45,17 +46,19 @@ SAME_FIT = 0.05  # standard errors
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Run(RunFolder, Result):
+class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverride]
     """The folder of a run; everything in it is read when it is asked for. None stands for what is not there.
 
     `catalogue` are the effects that its model may have, `data` the sets of its fit (default: where they were, in the
     folder of the run, or beside it).
 
+    Values, covariance, names and `to_table()` are those of its calibration, as of a fit; `posterior` are the draws.
+
     >>> walop.read("RUN")["pupil.magnification"]
     15.6675 ± 0.0051
     """
 
-    catalogue: Sequence[EffectKind] = EFFECTS
+    catalogue: Sequence[EffectKind] = dataclasses.field(default_factory=lambda: EFFECTS)
     data: Sequence[str | os.PathLike[str]] = ()
 
     @functools.cached_property
@@ -77,6 +80,26 @@ class Run(RunFolder, Result):
         self.wanted(PRODUCT)
         assert self.calibration is not None
         return self.calibration
+
+    @property
+    def model(self) -> Model:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The model that was fitted."""
+        return self.rebuilt.model
+
+    @property
+    def values(self) -> Vector:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Values of all parameters."""
+        return self.rebuilt.values
+
+    @property
+    def covariance(self) -> Matrix:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Covariance of all parameters."""
+        return self.rebuilt.covariance
+
+    @property
+    def trusted(self) -> bool:
+        """The verdict on the calibration."""
+        return self.rebuilt.verdict.trusted
 
     @functools.cached_property
     def posterior(self) -> Any:
@@ -153,10 +176,6 @@ class Run(RunFolder, Result):
                 result, covariance=calibration.covariance, errors_from=verdict.errors_from
             )
         return dataclasses.replace(result, verdict=verdict)
-
-    def __getitem__(self, name: str) -> ParameterValue:
-        """A parameter of the calibration by name, with its error; `DataError` where there is no calibration."""
-        return self.rebuilt[name]
 
     def display(self) -> Display:
         """The files, and the calibration if there is one."""

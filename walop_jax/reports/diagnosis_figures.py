@@ -21,6 +21,7 @@ from walop_jax.diagnosis.figure_data import DiagnosisFigureData, PointMap, Resid
 from walop_jax.diagnosis.limits_found import NO_LEVEL, DetectionLimits
 from walop_jax.fit.verdict import SUSPECT_SIGMA
 from walop_jax.reports.style import (
+    ABOVE,
     AFTER,
     BEFORE,
     DIVERGING,
@@ -101,12 +102,14 @@ def _maps(
     shown = np.any([np.isfinite(values).any(axis=1) for values in maps.values()], axis=0)
     shown = shown if shown.any() else np.ones(len(points), bool)
     size, grid = (0.6 + 2.0 * len(cameras), 0.55 + 1.75 * len(maps)), (len(maps), len(cameras))
-    figure, axes = on.panels(*size, *grid, sharex=True, sharey=True, squeeze=False, least=0.8, labels=0.2)
+    figure, axes = on.panels(*size, *grid, sharex=True, sharey=True, squeeze=False, least=0.8, labels=0.4)
     tiles: Any = None
     for number, values in enumerate(maps.values()):
         for k, axis in enumerate(axes[number]):
             field_axes(axis, f"camera {cameras[k]}" if number == 0 else "")
             axis.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 4, 5, 10], prune="both"))
+            if on.width is not None:
+                axis.tick_params(axis="x", labelrotation=90)
             axis.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="both"))
             tiles = point_map(axis, points.x, points.y, values[:, k], norm, colours, shown)
             if signs:
@@ -271,6 +274,7 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
 
     Crosses: q and u cannot both be measured with one exposure there.
     """
+    from scipy.interpolate import griddata
     from scipy.spatial import KDTree  # takes a tenth of a second, and this figure alone needs it
 
     figure, axis = on.single(5.0, 3.8)
@@ -282,28 +286,46 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     field_axes(axis, "largest error that goes undetected")
     percent = 100 * found.protection
     norm = LogNorm(np.nanmin(percent), max(np.nanmax(percent), 1.2 * np.nanmin(percent)))
-    # Standards lie between the other points: every pixel has the value of the point nearest to it.
+    # Standards lie between the other points: in between the level is interpolated, where one of these is known.
     field = (found.x.min(), found.x.max(), found.y.min(), found.y.max())
-    places = np.meshgrid(np.linspace(*field[:2], _PIXELS), np.linspace(*field[2:], _PIXELS))
-    nearest = KDTree(np.stack([found.x, found.y], axis=1)).query(np.stack(places, axis=-1))[1]
-    shown = pixel_map(axis, percent[nearest], field, norm, SEQUENTIAL)
+    places = np.stack(
+        np.meshgrid(np.linspace(*field[:2], _PIXELS), np.linspace(*field[2:], _PIXELS)), axis=-1
+    )
+    points = np.stack([found.x, found.y], axis=1)
+    level = (
+        griddata(points[good], np.log(percent[good]), places)
+        if good.sum() > 3
+        else np.full((_PIXELS,) * 2, np.nan)
+    )
+    nearest = KDTree(points).query(places)[1]
+    level = np.where(np.isnan(level), np.log(percent[nearest]), level)
+    shown = pixel_map(axis, np.where(good[nearest], np.exp(level), np.nan), field, norm, SEQUENTIAL)
     colour_bar(figure, shown, axis, "error of q, u (%)")
-    axis.plot(found.x[~good], found.y[~good], "x", color="0.5", ms=4)
+    axis.plot(found.x[~good], found.y[~good], "x", color="0.5", ms=4, label="one exposure holds no u")
+    if not good.all():
+        figure.legend(frameon=False, fontsize=SMALL, loc=ABOVE)
     return figure
 
 
 @styled
 def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
-    """Separation (σ) of each effect (column) from each other one (row) that is present at its detection limit."""
-    count = len(found.effects)
-    size = max(3.0, 0.17 * count)
-    figure, axis = on.single(size + 2.2, size + 1.2)
-    shown = axis.imshow(found.separation, norm=BoundaryNorm(_STEPS, 256, extend="max"), cmap="RdYlBu")
-    axis.set_xticks(range(count), found.effects, rotation=90, fontsize=SMALL)
-    axis.set_yticks(range(count), found.effects, fontsize=SMALL)
-    axis.set_ylabel("effect present (at its detection limit)", fontsize=FONT)
+    """Separation (σ) of each effect (column) from each other one (row) that is present at its detection limit.
+
+    Effects that nothing comes near are left out, and counted.
+    """
+    alike = found.separation + np.where(np.eye(len(found.effects), dtype=bool), np.inf, 0.0) < _STEPS[-1]
+    kept = np.flatnonzero((alike | alike.T).any(axis=0))
+    kept = kept if kept.size else np.arange(len(found.effects))
+    count, names = len(kept), [found.effects[i] for i in kept]
+    size = max(1.5, 0.17 * count)
+    figure, axis = on.single(size + 3.2, size + 2.0)
+    separation = found.separation[np.ix_(kept, kept)]
+    shown = axis.imshow(separation, norm=BoundaryNorm(_STEPS, 256, extend="max"), cmap="RdYlBu")
+    axis.set_xticks(range(count), names, rotation=90, fontsize=SMALL)
+    axis.set_yticks(range(count), names, fontsize=SMALL)
+    axis.set_ylabel("effect present\n(at its detection limit)", fontsize=FONT)
     axis.set_xlabel("could be mistaken for", fontsize=FONT)
-    colour_bar(
-        figure, shown, axis, f"separation (σ); below {thresholds.SEPARATION:g}: can be mistaken", shrink=0.7
-    )
+    if others := len(found.effects) - count:
+        axis.set_title(f"{others} other effects: more than {_STEPS[-1]:g} σ from all", fontsize=FONT)
+    colour_bar(figure, shown, axis, f"separation (σ); below {thresholds.SEPARATION:g}: can be mistaken")
     return figure

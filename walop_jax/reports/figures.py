@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from scipy.ndimage import zoom
 
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet
 from walop_jax.fit.model_file import instrument_of
 from walop_jax.io.text import two_digits, with_minus_sign
@@ -293,7 +292,8 @@ _RANGE = (1e-4, 3.0)  # per cent
 
 @styled
 def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
-    """The error of p over the field (%, logarithmic; a line at 0.1 %), and which share of the field has which error."""
+    """The error of p over the field (%, logarithmic; a line at the goal), and the share of the field that has it."""
+    goal = 100.0 * accuracy.goal
     percent = np.clip(100.0 * np.nan_to_num(accuracy.error, nan=np.inf), *_RANGE)
     figure, (left, right) = on.panels(8.2, 3.4, 1, 2, width_ratios=(1.15, 1.0))
     low, high = float(percent.min()), float(percent.max())
@@ -302,19 +302,19 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     colour_bar(
         figure, pixel_map(left, percent, accuracy.extent, norm, SEQUENTIAL, smooth=True), left, extend="both"
     )
-    if low < 100.0 * GOAL < high:
+    if low < goal < high:
         fine = 10.0 ** zoom(np.log10(percent), 4, order=1)
-        left.contour(fine, [100.0 * GOAL], extent=accuracy.extent, colors="w", linewidths=1.2)
+        left.contour(fine, [goal], extent=accuracy.extent, colors="w", linewidths=1.2)
     edges = np.geomspace(0.8 * low, 1.25 * high, 37)
     share = np.full(percent.size, 100.0 / percent.size)
     right.hist(percent.ravel(), edges.tolist(), weights=share, color=AFTER)
-    right.axvline(100.0 * GOAL, color="0.3", lw=1.0, ls="--")
+    right.axvline(goal, color="0.3", lw=1.0, ls="--")
     right.text(
-        100.0 * GOAL, 1.01, "goal 0.1 %", fontsize=SMALL, transform=right.get_xaxis_transform(), ha="center",
+        goal, 1.01, f"goal {goal:.3g} %", fontsize=SMALL, transform=right.get_xaxis_transform(), ha="center",
         va="bottom",
     )  # fmt: skip
     right.set_xscale("log")
-    right.set_xlim(edges[0], max(edges[-1], 150.0 * GOAL))
+    right.set_xlim(edges[0], max(edges[-1], 1.5 * goal))
     plain_ticks(right.xaxis)
     right.set_xlabel("error of p (%)", fontsize=FONT)
     right.set_ylabel("share of the field (%)", fontsize=FONT)

@@ -17,11 +17,12 @@ from walop_jax.reports import diagnosis_figures, figures, paper_figures, posteri
 from walop_jax.reports.run import FigureSource
 from walop_jax.reports.style import PLATES, AnyFigure
 from walop_jax.reports.wording import listed
-from walop_jax.science.field_accuracy import field_accuracy
+
+NARROW = 5.0  # inches of a corner plot: three coefficients at most
 
 
 def _accuracy(source: FigureSource) -> AnyFigure:
-    found = field_accuracy(source.rebuilt)
+    found = source.accuracy
     if found is None:
         advice = "plot matrix-errors"
         raise fail("has a single arm: one exposure holds no p", file=source.folder, advice=advice)
@@ -66,7 +67,9 @@ def _corner(source: FigureSource) -> AnyFigure:
     held, units, shown = _draws(source)
     if not source.parameters:
         draws = np.stack([held[name].ravel() for name in shown], axis=1)
-        shown = posterior_figures.correlated(draws, shown, source.prior_width)
+        narrow = source.canvas.width is not None and source.canvas.width < NARROW
+        most = 3 if narrow else posterior_figures.MOST_IN_CORNER
+        shown = posterior_figures.correlated(draws, shown, source.prior_width, most)
     if source.canvas.ax is not None:
         raise ValueError("ax: a corner plot needs a figure of its own")
     draws = np.stack([held[name].ravel() for name in shown], axis=1)

@@ -17,6 +17,7 @@ import jinja2
 from matplotlib.figure import Figure
 
 from walop_jax.calibration.product import read_product
+from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.display import Display, signed
@@ -47,6 +48,8 @@ from walop_jax.reports.wording import (
     names_in_words,
     symbols_in_words,
 )
+from walop_jax.science.commissioning import is_go, requirement_advice, requirement_rows, requirements
+from walop_jax.science.field_accuracy import FieldAccuracy
 
 TEMPLATES = Path(__file__).parent / "templates"
 MOST_PULLS = 8
@@ -133,16 +136,23 @@ def picture(
 # ------------------------------------------------------------------------------------------- a fit, a diagnosis
 
 
-def render(run: RunContents) -> tuple[str, tuple[str, ...]]:
-    """The HTML text of the page about a fit or a diagnosis, and in words what the run lacks for it."""
+def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str, ...]]:
+    """The HTML text of the page about a fit or a diagnosis, and in words what the run lacks for it.
+
+    `goal` is the error of p that is wanted (None: as the fit was asked).
+    """
     summary, diagnosis, folder = run.summary, run.diagnosis, run.source.folder
+    of_fit = (summary.get("accuracy_of_p") or {}).get("goal", GOAL)
+    run = dataclasses.replace(run, source=dataclasses.replace(run.source, goal=goal or of_fit))
     fit = display_of(summary, folder / SUMMARY)
     head = fit if diagnosis is None else display_of(diagnosis, folder / "diagnosis.json")
     trusted = bool(summary.get("trusted", summary["converged"]))
     good = trusted and (diagnosis is None or diagnosis["verdict"] != "unexplained")
-    asked = (
-        None if run.commissioning is None else display_of(run.commissioning, folder / "commissioning.json")
-    )
+    asked, go = _asked(run)
+    answered = any(name.startswith("good for") for name, _ in head.facts)
+    if trusted and asked is not None and (goal is not None or not answered):
+        known = _accuracy(run)
+        head = head if known is None else _with_goal(head, known)
     missing, drawn = [*run.missing], _Drawn(run)
     origin = "" if run.product is None or not run.product.origin else f"; data from {run.product.origin}"
     sampled = run.product is not None and run.product.verdict.covariance_from == "posterior"
@@ -172,7 +182,7 @@ def render(run: RunContents) -> tuple[str, tuple[str, ...]]:
     text = filled(
         head,
         sections,
-        good=good and (run.commissioning is None or run.commissioning["go"]),
+        good=good and go,
         untrusted=not good,
         title="Calibration" if diagnosis is None else "Diagnosis",
         instrument=summary.get("instrument", "WALOP"),
@@ -185,6 +195,43 @@ def render(run: RunContents) -> tuple[str, tuple[str, ...]]:
         missing=missing,
     )
     return text, tuple(missing)
+
+
+def _asked(run: RunContents) -> tuple[Display | None, bool]:
+    """Go or no-go with its reasons: as `certify` has left it, or worked out; and whether it is a go."""
+    if run.commissioning is not None and run.source.goal == GOAL:
+        shown = display_of(run.commissioning, run.source.folder / COMMISSIONING)
+        return shown, bool(run.commissioning["go"])
+    accuracy = _accuracy(run)
+    if run.product is None or accuracy is None:
+        return None, True
+    found = requirements(run.product.verdict, "", accuracy, None)
+    whole = all(each.met for each in found)
+    title = "No go" if not is_go(found) else "Go: fit for use" if whole else "Go, with reservations"
+    advice = requirement_advice(found)
+    return Display(title, head=("", "asked", "found"), rows=requirement_rows(found), notes=advice), is_go(
+        found
+    )
+
+
+def _accuracy(run: RunContents) -> FieldAccuracy | None:
+    """The error of p over the field; None where there is none: its figure, which is missing then, says why."""
+    try:
+        return None if run.product is None else run.source.accuracy
+    except (ValueError, OSError):
+        return None
+
+
+def _with_goal(head: Display, known: FieldAccuracy) -> Display:
+    """The head of a page with the answer for another goal in place of that of the fit."""
+    answer = known.facts()
+    said = {name for name, _ in answer}
+    rest = [
+        fact
+        for fact in head.facts
+        if fact[0] not in said and not fact[0].startswith(("good for", "what to do"))
+    ]
+    return dataclasses.replace(head, facts=(*answer, *rest))
 
 
 class _Drawn:
@@ -455,9 +502,19 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
         first="",
         doubts=[one for one in document.get("warnings", ()) if one not in head.notes],
         name=folder.resolve().name,
+        next=_AFTER.get(kind, ()),
         missing=missing,
     )
     return text, tuple(missing)
+
+
+_AFTER: Mapping[str, Sequence[tuple[str, str]]] = {
+    "limits": [("plan exposures that show more", "walop-jax plan RUN --minutes 10")],
+    "plan": [("rehearse it", "walop-jax simulate PLAN/plan.toml -o SET.fits")],
+    "epoch": [("fit all nights together", "walop-jax stack RUN NEW.fits -o SURVEY")],
+    "survey": [("correct stars", "walop-jax apply SURVEY STARS.fits -o OUT.fits")],
+}
+"""Next steps after what other commands have made: words and a command line."""
 
 
 def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: list[str]) -> list[Picture]:

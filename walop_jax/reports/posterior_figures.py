@@ -76,22 +76,25 @@ def informed(
 
 
 def correlated(
-    draws: Float[np.ndarray, "d k"], names: Sequence[str], prior: Mapping[str, float]
+    draws: Float[np.ndarray, "d k"],
+    names: Sequence[str],
+    prior: Mapping[str, float],
+    most: int = MOST_IN_CORNER,
 ) -> tuple[str, ...]:
-    """The coefficients worth a corner plot, at most `MOST_IN_CORNER`, in their order.
+    """The coefficients worth a corner plot, at most `most`, in their order.
 
     Of those that the data constrain (`informed`; all where there is none) the two most correlated, then one after the
     other whatever is most correlated with any of these.
     """
     spread = dict(zip(names, draws.std(axis=0).tolist(), strict=True))
     pool = informed(names, spread, prior) or tuple(names)
-    if len(pool) <= MOST_IN_CORNER:
+    if len(pool) <= most:
         return tuple(name for name in names if name in pool)
     columns = draws[:, [names.index(name) for name in pool]]
     size = np.abs(np.corrcoef(columns / columns.std(axis=0), rowvar=False))
     np.fill_diagonal(size, 0.0)
     chosen = [int(np.argmax(size.max(axis=1)))]
-    while len(chosen) < MOST_IN_CORNER:
+    while len(chosen) < most:
         nearest = size[chosen].max(axis=0)
         nearest[chosen] = -1.0
         chosen.append(int(np.argmax(nearest)))
@@ -130,7 +133,8 @@ def corner_figure(
         data_kwargs={"ms": 0.7, "color": "0.5", "alpha": 0.3}, hist_kwargs={"linewidth": 0.8},
         max_n_ticks=3 if few else 0, fig=figure,
     )  # fmt: skip
-    figure.subplots_adjust(left=0.1, right=0.99, bottom=0.09, top=0.94, wspace=0.05, hspace=0.05)
+    edges = {"left": 0.71 / width, "bottom": 0.64 / width, "top": 1.0 - 0.43 / width}
+    figure.subplots_adjust(**edges, right=1.0 - 0.07 / width, wspace=0.05, hspace=0.05)
     low, middle, high = np.quantile(draws, (0.1587, 0.5, 0.8413), axis=0)
     panels = np.array(figure.axes, dtype=object).reshape(k, k)
     for i in range(k):
@@ -165,7 +169,7 @@ def trace_figure(
 ) -> AnyFigure:
     """Median and 68 % band of walkers against the step, a colour per ensemble; the bar is one autocorrelation time."""
     e, n, _, k = chains.shape
-    figure, panels = on.panels(7.1, 0.9 * k + 0.6, k, 1, sharex=True, squeeze=False)
+    figure, panels = on.panels(7.1, 0.9 * k + 0.6, k, 1, labels=0.05, sharex=True, squeeze=False)
     step = thin * np.arange(n)
     for i, axes in enumerate(panels[:, 0]):
         for j in range(e):

@@ -12,6 +12,7 @@ import numpy as np
 
 from walop_jax.calibration.calibration import Calibration, Product
 from walop_jax.calibration.matrix import MatrixMaps
+from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, figure_data, read_figure_data
@@ -37,6 +38,7 @@ from walop_jax.model.effects.free_form import FreeForm
 from walop_jax.posterior.result import PosteriorSample
 from walop_jax.posterior.run import Run
 from walop_jax.reports.style import PAGE, Canvas
+from walop_jax.science.field_accuracy import FieldAccuracy, field_accuracy
 
 SUMMARY_KEYS = ("chi2", "dof", "n_data", "parameters", "converged", "message", "versions", "inputs")
 DIAGNOSIS_KEYS = ("verdict", "steps", "candidates", "unexplained")
@@ -55,7 +57,8 @@ class FigureSource:
     `held` are the contents of a result in memory under the names of the files of a run that would hold them, its data
     as `DATA`; it has no `run`. `sample` is a posterior in memory, which has the walkers as well. `parameters` are
     coefficients by name; `place` (deg) is a field point; `step` numbers the effects of a diagnosis; `reference` are
-    values to be marked, by name; `canvas` is where to draw.
+    values to be marked, by name; `canvas` is where to draw, `goal` the error of p that is
+    wanted.
     """
 
     run: Run | None = None
@@ -66,6 +69,7 @@ class FigureSource:
     step: int = 1
     reference: Mapping[str, float] | None = None
     canvas: Canvas = PAGE
+    goal: float = GOAL
 
     @classmethod
     def of(cls, given: Drawable, **options: Any) -> FigureSource:
@@ -154,6 +158,11 @@ class FigureSource:
         return self._wanted(
             FIGURE_DATA, lambda run: read_figure_data(run.wanted(FIGURE_DATA, advice)), advice
         )
+
+    @functools.cached_property
+    def accuracy(self) -> FieldAccuracy | None:
+        """The error of p over the field; None where one exposure holds no p."""
+        return field_accuracy(self.rebuilt, goal=self.goal)
 
     @property
     def limits(self) -> DetectionLimits:

@@ -142,7 +142,7 @@ class Canvas:
         if self.width is not None:
             before = (width / (rows if turned else columns), height / (columns if turned else rows))
             scale = self.width / group / before[0]
-            lowest = 0.0 if labels < LABELS else 1.1 if rows * groups == 1 else 0.8
+            lowest = 0.0 if labels < LABELS else 1.3 if rows * groups == 1 else 0.8
             size = self.width, rows * groups * (labels + max(scale * (before[1] - labels), lowest))
         squeeze = options.pop("squeeze", True)
         figure = self.figure(*size)

@@ -148,7 +148,7 @@ _RESIDUALS = "Residuals (data − model) over the field in the cameras"
 _NOISE = "noise alone has a standard deviation of about 1 σ. Tiles beyond 3 σ carry their sign."
 CAPTIONS: Mapping[str, str] = {
     "accuracy": "Standard error of p for one exposure through {filter}, photon noise left out; the white line and the "
-    "dashed line are at 0.1 %. Values above 3 % are shown as 3 %.",
+    "dashed line are at the goal. Values above 3 % are shown as 3 %.",
     "protection": "Protection level: the largest error of q and u that a single mistake can make at each field point "
     "without being detected (99 %).",
     "separation": "Standard deviations between an effect at its detection limit (row) and another fitted to imitate it "

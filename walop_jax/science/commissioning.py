@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 from walop_jax.calibration.could_hide import off_by, unmeasured
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.inspection import inspect
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.verdict import Verdict
 from walop_jax.io.text import two_digits
 from walop_jax.science.field_accuracy import SHARE, FieldAccuracy
-
-MOST = GOAL / 2  # error of p that the calibration may make
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +43,7 @@ def requirements(
         ),
     ]  # fmt: skip
     if accuracy is not None:
+        most, goal = accuracy.goal / 2, two_digits(100 * accuracy.goal)
         limit = accuracy.limited_by.split(" (")[0]
         for where, reached, needed in (
             ("50 % of the field", accuracy.median, True),
@@ -52,25 +51,25 @@ def requirements(
         ):
             cause = f", most of it from {limit}" if limit else ""
             advice = (
-                f"{two_digits((reached / MOST) ** 2)} times the light, over several nights (walop-jax stack); "
+                f"{two_digits((reached / most) ** 2)} times the light, over several nights (walop-jax stack); "
                 "walop-jax plan says which exposures"
             )
             if not needed and accuracy.without_u > 1.0 - SHARE:
                 strip = f"{100 * accuracy.without_u:.0f} % of the field"
                 cause = f", worst beside the {strip} where one exposure carries almost no information on u"
                 advice = "observe the stars there with the calibration plate at 22.5° as well"
-            text = f"p known to {two_digits(100 * MOST)} % in {where}"
+            text = f"p known to {two_digits(100 * most)} % in {where}"
             value = f"{two_digits(100 * reached)} %{cause}"
-            found.append(Requirement(text, reached <= MOST, value, advice, needed))
+            found.append(Requirement(text, reached <= most, value, advice, needed))
         for name, effect in unmeasured(accuracy.not_measured).items():
-            text = f"what moves stars by {two_digits(100 * MOST)} % is measured"
+            text = f"what moves stars by {two_digits(100 * most)} % is measured"
             lacking = f"{name} not measured, {off_by(*effect.error)} at the usual size"
-            found.append(Requirement(text, effect.error[0] <= MOST, lacking, effect.remedy))
+            found.append(Requirement(text, effect.error[0] <= most, lacking, effect.remedy))
         if accuracy.hidden > 0:
             found.append(
                 Requirement(
-                    f"no single mistake can hide that is worth {two_digits(100 * GOAL)} %",
-                    accuracy.hidden <= GOAL,
+                    f"no undetectable error exceeds {goal} %",
+                    accuracy.hidden <= accuracy.goal,
                     f"q or u off by {two_digits(100 * accuracy.hidden)} % from {accuracy.hidden_by}",
                     accuracy.remedy or "walop-jax limits says which exposures would show it",
                     needed=False,
@@ -87,3 +86,21 @@ def requirements(
             )
         )
     return tuple(found)
+
+
+def is_go(asked: Sequence[Requirement]) -> bool:
+    """True if everything that is needed is met."""
+    return all(each.met for each in asked if each.needed)
+
+
+def requirement_rows(asked: Sequence[Requirement]) -> tuple[tuple[str, str, str], ...]:
+    """A row for each requirement: ok, NO where it is needed, no where it is advice; what is asked, what was found."""
+    return tuple(
+        ("ok" if each.met else "NO" if each.needed else "no", each.what, each.found) for each in asked
+    )
+
+
+def requirement_advice(asked: Sequence[Requirement]) -> tuple[str, ...]:
+    """Advice on requirements that are not met, what is needed first."""
+    ordered = sorted(asked, key=lambda each: not each.needed)
+    return tuple(f"{each.found}: {each.advice}" for each in ordered if not each.met)

@@ -51,7 +51,7 @@ class FieldAccuracy:
     median over the field (NaN: nobody asked), at its just undetected size, `hidden_worst` where it is largest; `remedy`
     is the measurement that would show it. `not_measured` are the mistakes on which the data hold no information.
     `without_u` is the share of the field where a single exposure carries almost no information on u, `with_u` says
-    where it does (None: everywhere).
+    where it does (None: everywhere). `goal` is what p of a star is wanted to: the calibration may make half of it.
     """
 
     error: Float[np.ndarray, "y x"]
@@ -66,6 +66,7 @@ class FieldAccuracy:
     remedy: str = ""
     not_measured: tuple[CouldHide, ...] = ()
     with_u: Bool[np.ndarray, "y x"] | None = None
+    goal: float = GOAL
 
     @property
     def reached(self) -> float:
@@ -79,8 +80,44 @@ class FieldAccuracy:
 
     @property
     def share(self) -> float:
-        """Share of the field in which the error is below 0.1 %."""
-        return float(np.mean(self.error < GOAL))
+        """Share of the field in which the error is below the goal."""
+        return float(np.mean(self.error < self.goal))
+
+    @property
+    def shortfalls(self) -> tuple[Shortfall, ...]:
+        """Everything that the calibration lacks for the goal; empty: it is good enough."""
+        if not self.trusted:
+            return (
+                Shortfall("the calibration is not trusted", "walop-jax diagnose looks for what is missing"),
+            )
+        most, lacks = self.goal / 2, []
+        for name, one in unmeasured(self.not_measured).items():
+            if one.error[0] > most:
+                lacks.append(
+                    Shortfall(f"{name} not measured, {off_by(*one.error)} at the usual size", one.remedy)
+                )
+        if self.reached > most:
+            if self.without_u > 1.0 - SHARE and self.median <= most:
+                advice = (
+                    "observe the stars beside the strip without u with the calibration plate at 22.5° as well"
+                )
+            else:
+                light = two_digits((self.reached / most) ** 2)  # errors fall with its square root
+                advice = f"{light} times the light; walop-jax plan RUN --goal {100 * most:.2g} says how long that takes"
+            lacks.append(
+                Shortfall(
+                    f"{two_digits(100 * self.reached)} % in {self.judged}, {two_digits(100 * most)} % allowed",
+                    advice,
+                )
+            )
+        if self.hidden > self.goal:
+            lacks.append(
+                Shortfall(
+                    f"a systematic error of {two_digits(100 * self.hidden)} % of q or u could hide",
+                    self.remedy or "walop-jax limits says which exposures would show it",
+                )
+            )
+        return tuple(lacks)
 
     @property
     def median(self) -> float:
@@ -97,9 +134,11 @@ class FieldAccuracy:
     def document(self) -> dict[str, object]:
         """As plain data, `accuracy_of_p` of summary.json; shares, not per cent."""
         return {
-            "median": self.median, "share_below_goal": self.share, "goal": GOAL, "filter": self.filter,
+            "median": self.median, "share_below_goal": self.share, "goal": self.goal, "filter": self.filter,
             "limited_by": self.limited_by, "hidden": self.hidden, "hidden_by": self.hidden_by,
             "hidden_worst": self.hidden_worst, "not_measured": [one.name for one in self.not_measured],
+            "reached": self.reached, "good_enough": not self.shortfalls,
+            "shortfalls": [dataclasses.asdict(one) for one in self.shortfalls],
         }  # fmt: skip
 
     def facts(self, *, complete: bool = True) -> tuple[tuple[str, str], ...]:
@@ -107,8 +146,15 @@ class FieldAccuracy:
         if not self.trusted:
             return (("p of a star", "not known: the calibration is not trusted"),)
         known = f"{two_digits(100 * self.median)} %{self.apart_from} (median error for p ≤ 5 %)"
-        known += f"; below 0.1 % over {100 * self.share:.0f} % of the field"
+        goal, lacks = f"{100 * self.goal:.3g} %", self.shortfalls
+        known += f"; below {goal} over {100 * self.share:.0f} % of the field"
         lines = [("p of a star", known if complete else f"{known}, if nothing were missing")]
+        if complete:
+            yes = f"yes: {two_digits(100 * self.reached)} % in {self.judged}"
+            lines.append(
+                (f"good for {goal}", f"no: {'; '.join(one.what for one in lacks)}" if lacks else yes)
+            )
+            lines += [("what to do", one.advice) for one in lacks[:1] if one.advice != self.remedy]
         if self.limited_by:
             lines.append(("limited by", self.limited_by))
         if self.not_measured:
@@ -119,6 +165,14 @@ class FieldAccuracy:
         if self.hidden > 0 and self.remedy:
             lines.append(("to see that", self.remedy))
         return tuple(lines)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shortfall:
+    """Something that a calibration lacks for a goal, and what to do."""
+
+    what: str
+    advice: str
 
 
 def reached(error: Float[np.ndarray, "*p"]) -> float:
@@ -136,9 +190,9 @@ def judged(without_u: float) -> str:
     )
 
 
-def answered(result: FitResult) -> FitResult:
+def answered(result: FitResult, goal: float = GOAL) -> FitResult:
     """The fit, able to say how well stars are known with it; worked out when it is first asked."""
-    return dataclasses.replace(result, answer=_Answer(result))
+    return dataclasses.replace(result, answer=_Answer(result, goal))
 
 
 @dataclasses.dataclass
@@ -146,6 +200,7 @@ class _Answer:
     """The accuracy of p of a fit, worked out once; a class, so that fits can be pickled."""
 
     result: FitResult
+    goal: float = GOAL
 
     def __call__(self) -> FieldAccuracy | None:
         return self.known
@@ -153,10 +208,10 @@ class _Answer:
     @functools.cached_property
     def known(self) -> FieldAccuracy | None:
         """See `field_accuracy`."""
-        return field_accuracy(Calibration.from_fit(self.result))
+        return field_accuracy(Calibration.from_fit(self.result), goal=self.goal)
 
 
-def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy | None:
+def field_accuracy(calibration: Calibration, size: int = SIZE, goal: float = GOAL) -> FieldAccuracy | None:
     """The map for an instrument with two arms, in the usual settings; None for others: they need several exposures."""
     if len(calibration.model.template.cameras.pairs) != 2:
         return None
@@ -181,6 +236,7 @@ def field_accuracy(calibration: Calibration, size: int = SIZE) -> FieldAccuracy 
         trusted=calibration.verdict.trusted,
         without_u=float(np.mean(~with_u)),
         with_u=with_u,
+        goal=goal,
     )
 
 

@@ -28,7 +28,6 @@ _COLOUR = (0.95, 0.25)  # mean and scatter of BP − RP
 _COLOUR_ERROR = 0.01
 _SCATTER = 61.0  # K, about the relation of a star's kind
 _DEGREE = 0.05  # p is uniform up to it
-_NIGHT = 61041.9  # MJD
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,6 +99,6 @@ def simulated_stars(
         "BP_RP": (colour + _COLOUR_ERROR * draw.standard_normal(count), "mag", "colour of Gaia"),
         "BP_RP_ERR": (np.full(count, _COLOUR_ERROR), "mag", "standard error of BP_RP"),
         "FILTER": (np.full(count, curve.name), "", "filter"),
-        "MJD": (np.full(count, _NIGHT + night), "d", "mid-exposure, UTC"),
+        "MJD": (np.full(count, plan.start + night), "d", "mid-exposure, UTC"),
     }
     return SimulatedStars(columns, qu, teff)

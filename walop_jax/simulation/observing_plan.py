@@ -46,6 +46,10 @@ _SOME_NIGHT = 61041.9  # MJD
 NARROW_BANDS: Mapping[str, float] = {"NB-580": 0.580, "NB-660": 0.660}  # centre, µm
 _SPACING = 0.004  # d between exposures
 _GOLDEN = 0.5 * (3.0 - np.sqrt(5.0))  # of a turn: spreads any number of angles evenly
+_ZERO_EDGE = 0.9  # of the field
+_SPREAD = np.array(
+    [1.0 / 1.324717957244746, 1.0 / 1.324717957244746**2]
+)  # Roberts 2018: evenly in two dimensions
 _STANDARD_EDGE = 0.8  # of the field: 5 × 5 centres of boxes that fill it
 EXPOSED: Mapping[str, float] = {
     name: kind.seconds for name, kind in KINDS.items() if kind.seconds is not None
@@ -121,8 +125,10 @@ class ObservingPlan:
     observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after.
     `star_lmax` are the wavelengths (µm) of largest polarisation of the polarised standards, in turn: these are then
     observed in every filter, and the catalogue has their values in the first one; none: they are observed in that one,
-    unless stops say, and have 0.55 µm. `electrons` is the level of a camera in unpolarised light of full transparency,
-    ahead of reflections.
+    unless stops say, and have 0.55 µm. After them come `zero_exposures` of a field of `zero_stars` stars that are all
+    measured at once: their mean q and u are 0 with an error of `zero_error`, they scatter by `zero_scatter` around it;
+    among stops it is the standard that follows the last one. `electrons` is the level of a camera in unpolarised light
+    of full transparency, ahead of reflections.
 
     `instrument` is one that comes with the package, by name, or any other; None: the first of the family. `moving`
     holds the positions (deg, None: out) of further moving elements by the prefix of their columns: the polariser goes
@@ -147,6 +153,10 @@ class ObservingPlan:
     unpolarised: int = 2
     catalogue_error: float = 2e-4
     star_lmax: tuple[float, ...] = ()
+    zero_stars: int = 0
+    zero_exposures: int = 1
+    zero_error: float = 1e-4
+    zero_scatter: float = 5e-4
     filters: Sequence[str | FilterCurve] | Mapping[str, Any] = (DEFAULT_FILTER,)
     plate: tuple[float | None, ...] = (None,)
     electrons: float = 1e6
@@ -215,7 +225,7 @@ class ObservingPlan:
                         f"a stop has a position of {prefix}: list all of them in the plan as well, "
                         f"moving = {{ {prefix} = [0, 22.5, 45] }}"
                     )
-            total = {"moon": self.moon_patches, "standard": self.standards}.get(stop.kind, 1)
+            total = {"moon": self.moon_patches, "standard": len(self.star_names)}.get(stop.kind, 1)
             if not 0 <= stop.number < total:
                 raise ValueError(
                     f"a stop: there is no {stop.kind} {stop.number}; they go from 0 to {total - 1}"
@@ -268,6 +278,7 @@ class ObservingPlan:
         # Named only where there are any: plans of other instruments read as they always did.
         fields["stops"] = [stop.document() for stop in self.stops]
         later = {"moving": {}, "lamps": 0, "stops": [], "patches": None, "stars": None, "star_lmax": ()}
+        later |= {name: getattr(type(self), name) for name in fields if name.startswith("zero_")}
         return {key: value for key, value in fields.items() if key not in later or value != later[key]}
 
     @property
@@ -285,11 +296,11 @@ class ObservingPlan:
 
     @property
     def star_names(self) -> tuple[str, ...]:
-        """Names of the standards."""
-        return tuple(f"STD{i:02d}" for i in range(self.standards))
+        """Names of the standards, a field of zero polarisation last."""
+        return (*(f"STD{i:02d}" for i in range(self.standards)), *(("ZERO",) if self.zero_stars else ()))
 
     def points(self) -> Points:
-        """Grid points first, then the places of the standards (if there are any)."""
+        """Grid points first, then the places of the standards (if there are any), then the stars of a field."""
         if self._raster[0] == "line":
             x = np.linspace(0.0, self.field, self.grid)
             y = np.zeros_like(x)
@@ -302,6 +313,10 @@ class ObservingPlan:
             edge = np.linspace(-last, last, n) if n > 1 else np.zeros(1)
             star_y, star_x = (a.ravel() for a in np.meshgrid(edge, edge, indexing="ij"))
             x, y = np.append(x, star_x), np.append(y, star_y)
+        if self.zero_stars:
+            spread = np.mod(np.arange(1, self.zero_stars + 1)[:, None] * _SPREAD, 1.0)
+            zero_x, zero_y = (_ZERO_EDGE * self.field * (2.0 * spread - 1.0)).T
+            x, y = np.append(x, zero_x), np.append(y, zero_y)
         return Points(point=np.arange(len(x)), x=x, y=y)
 
     @property
@@ -344,6 +359,10 @@ class ObservingPlan:
                 numbers if numbers is not None else () if kind in kinds else range(total)
             )
         ]
+        if self.zero_stars and self.stars is None and "standard" not in kinds:
+            name, plate = self.filter_names[0], plates[0]
+            field = Stop(None, name, plate, further[0], kind="standard", number=self.standards)
+            sky += [field] * self.zero_exposures
         return (*indoors, *sky)
 
     def exposures(self) -> Exposures:
@@ -399,9 +418,11 @@ class ObservingPlan:
     def layout(self) -> tuple[Bool[np.ndarray, "p e"], np.ndarray]:
         """True for the (point, exposure) pairs that are measured, and the row of the star in each (−1: none)."""
         stops, points = self._taken, self.points()
-        place = np.arange(len(points)) - (len(points) - (self.standard_grid**2 if self.standards else 0))
+        raster = self.standard_grid**2 if self.standards else 0
+        place = np.arange(len(points)) - (len(points) - raster - self.zero_stars)
         star = np.array([stop.number if stop.kind == "standard" else -1 for stop in stops])
-        used = (place[:, None] >= 0) == (star >= 0)
+        # Points of the grid, of the raster of standards, of a field of stars; and the exposures that see them.
+        used = np.digitize(place, (0, raster))[:, None] == np.digitize(star, (0, self.standards))
         for e, stop in enumerate(stops):
             if stop.place is not None and stop.kind == "standard":
                 used[:, e] &= place == stop.place

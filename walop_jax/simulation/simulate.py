@@ -7,7 +7,7 @@ physics; the physics itself is held against outside data and the oracle of the t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -42,6 +42,7 @@ STRUCTURE = 0.02  # rms over the field, relative
 TRANSPARENCY = (0.7, 1.0)
 _MEDIAN_ROUNDS = 6  # the median that a pedestal refers to has the pedestal in it: each round gains its level
 _POLARISED = (0.01, 0.06)
+_PROBE = 0.01  # of q and u
 _STAR_TEFF = (5000.0, 9500.0)
 
 
@@ -114,20 +115,27 @@ def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, 
     angle = rng.uniform(0.0, 2.0 * np.pi, n)
     catalogue = np.stack([degree * np.cos(angle), degree * np.sin(angle)])
     true = catalogue + plan.catalogue_error * rng.standard_normal((2, n))
+    error, teff = np.full(n, plan.catalogue_error), rng.uniform(*_STAR_TEFF, n)
+    if plan.zero_stars:
+        field = plan.zero_error * rng.standard_normal((2, 1))
+        catalogue, true = np.append(catalogue, [[0.0], [0.0]], 1), np.append(true, field, 1)
+        error, teff = np.append(error, plan.zero_error), np.append(teff, rng.uniform(*_STAR_TEFF))
+    names = plan.star_names
     sources = Sources(
-        source=np.arange(n),
-        name=np.array(plan.star_names, dtype="U5"),
+        source=np.arange(len(names)),
+        name=np.array(names, dtype="U5"),
         q=catalogue[0],
         u=catalogue[1],
-        q_err=np.full(n, plan.catalogue_error),
-        u_err=np.full(n, plan.catalogue_error),
-        teff=rng.uniform(*_STAR_TEFF, n),
-        filter=np.full(n, plan.filter_names[0] if plan.star_lmax else ""),
+        q_err=error,
+        u_err=error,
+        teff=teff,
+        filter=np.full(len(names), plan.filter_names[0] if plan.star_lmax else ""),
+        scatter=np.where(np.arange(len(names)) < n, 0.0, plan.zero_scatter),
     )
     standards = standards_of(sources, plan.exposures(), plan.curves())
     lmax = np.asarray(standards.lmax).copy()
     if plan.star_lmax:
-        polarised = np.arange(n) - plan.unpolarised
+        polarised = np.append(np.arange(n) - plan.unpolarised, [-1] * (len(names) - n))
         lmax = np.where(
             polarised < 0, lmax, np.resize(plan.star_lmax, polarised.max(initial=0) + 1)[polarised]
         )
@@ -136,12 +144,29 @@ def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, 
 
 def _stars_of(plan: ObservingPlan, catalogue: Sources, true: Standards) -> tuple[Sources, Standards]:
     """The first stars of a catalogue, with a value each, and what they really are: as in `true`, by name."""
-    rows = np.unique(catalogue.stars)[: plan.standards]
+    rows = np.unique(catalogue.stars)[: len(plan.star_names)]
     sources = Sources(**{f.name: getattr(catalogue, f.name)[rows] for f in dataclasses.fields(catalogue)})
     standards = standards_of(sources, plan.exposures(), plan.curves())
     known = dict(zip((leaf.name for leaf in leaves(true)), np.asarray(values_of(true)), strict=True))
     values = zip((leaf.name for leaf in leaves(standards)), np.asarray(values_of(standards)), strict=True)
     return sources, with_values(standards)(np.array([known.get(*pair) for pair in values]))
+
+
+def _scattered(
+    plan: ObservingPlan,
+    truth: Instrument,
+    expected: Cube,
+    counts: Callable[[Instrument], Cube],
+    rng: np.random.Generator,
+) -> Cube:
+    """Counts that the stars of a field have beyond those of their mean q, u: light is linear in them."""
+    _, source = plan.layout()
+    seen, whole = source[:, :, None] == plan.standards, np.zeros_like(expected)
+    for axis in "qu":
+        moved = truth.changed("standard", **{axis: lambda value: value.at[plan.standards].add(_PROBE)})
+        own = plan.zero_scatter * rng.standard_normal(len(expected))
+        whole += np.where(seen, own[:, None, None] * (counts(moved) - expected) / _PROBE, 0.0)
+    return whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,7 +195,9 @@ class PhotonNoise:
         Raises ValueError for expected counts that are negative or not finite.
         """
         if not (np.isfinite(expected).all() and np.all(expected >= 0.0)):
-            raise ValueError("expected counts must be finite and non-negative")
+            raise ValueError(
+                "expected counts must be finite and non-negative: an effect, or a prior, leaves no possible light"
+            )
         # Read noise first: how many random numbers a Poisson draw takes depends on what is expected.
         read = self.read_noise * rng.standard_normal(expected.shape)
         counts = rng.poisson(expected) + read
@@ -209,7 +236,12 @@ def simulate(
         streams = np.random.SeedSequence((seed, night)).spawn(2)
     sky, noise = map(np.random.default_rng, streams)
     blank = _without_light(plan, sources, seed, len(truth.cameras))
-    expected = _expected(blank, truth, fluxes(plan, None if steady else sky))
+    flux = fluxes(plan, None if steady else sky)
+    expected = _expected(blank, truth, flux)
+    if plan.zero_stars and plan.zero_scatter > 0 and not noiseless:
+        own = np.random.SeedSequence(seed if catalogue_seed is None else catalogue_seed).spawn(5)[4]
+        stars = np.random.default_rng(own)
+        expected += _scattered(plan, truth, expected, lambda other: _expected(blank, other, flux), stars)
     detector = PhotonNoise(plan.read_noise)
     if noiseless:
         counts, sigma = expected, detector.sigma(expected)
@@ -292,11 +324,14 @@ def fluxes(plan: ObservingPlan, rng: np.random.Generator | None) -> Float[np.nda
     usual = [EXPOSED.get(str(kind), t) for kind, t in zip(exposures.kind, exposures.exptime, strict=True)]
     electrons = plan.electrons * exposures.exptime / np.array(usual)
     if rng is None:
-        brightness = np.append(np.full(plan.standards, np.mean(TRANSPARENCY)), 1.0)
+        brightness = np.append(np.full(len(plan.star_names), np.mean(TRANSPARENCY)), 1.0)
         return 4.0 * electrons * np.mean(TRANSPARENCY) * np.broadcast_to(brightness[source], used.shape)
     transparency = rng.uniform(*TRANSPARENCY, used.shape[1])
     illumination = rng.uniform(0.9, 1.1, used.shape[0])
-    brightness = np.append(rng.uniform(*TRANSPARENCY, plan.standards), 1.0)  # the last entry: no star
+    field = [np.mean(TRANSPARENCY)] * (len(plan.star_names) - plan.standards)
+    brightness = np.concatenate(
+        [rng.uniform(*TRANSPARENCY, plan.standards), field, [1.0]]
+    )  # the last: no star
     return 4.0 * electrons * illumination[:, None] * transparency * brightness[source]
 
 
