@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, command_of
+from walop_jax.commands.each import EACH, SCHEDULER, WORKERS, for_each
 from walop_jax.commands.gather import gather
 from walop_jax.commands.inputs import (
     Effects,
@@ -23,6 +24,8 @@ from walop_jax.commands.inputs import (
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from walop_jax import Calibration
     from walop_jax.data.user_tables import InputTable
 
@@ -41,7 +44,7 @@ APART = 0.005  # deg: rows of one star that lie farther apart may be those of tw
 FORCE = Option("Also stars whose filter or temperature it does not cover (FLAG 2048).")
 
 
-@command(stages=("reading", "tabulating", "writing"), writes="file")
+@command(stages=("reading", "tabulating", "writing"), writes=())
 def apply(
     job: Job,
     calibration: Product,
@@ -54,6 +57,9 @@ def apply(
     effects: Effects = None,
     force: Annotated[bool, FORCE] = False,
     common: Annotated[bool, COMMON] = False,
+    each: Annotated[bool, EACH] = False,
+    workers: Annotated[int | None, WORKERS] = None,
+    scheduler: Annotated[str | Executor | None, SCHEDULER] = None,
 ) -> Outcome[Any]:
     """Turn the intensities of stars into Stokes parameters: Q, U, P, EVPA and their errors.
 
@@ -76,12 +82,17 @@ def apply(
 
     The catalogues of the cameras may be given as they are: they are made one as `walop-jax gather` does.
 
+    With --each every CATALOGUE is reduced by itself into the folder OUT, in this process or by Dask (--workers,
+    --scheduler): a table appears whole or not at all, and one that is there is not made again.
+
     In Python: an astropy table; `catalogue` is a path, an astropy table, columns by name, or the paths of all cameras.
+    With `each` the paths of the tables; `scheduler` is an address or any `concurrent.futures.Executor`.
 
     >>> star = {"X": [0.1], "Y": [0.0], "N": [[51e4, 49e4, 50e4, 48e4]], "N_ERR": [[714.0, 700.0, 707.0, 693.0]]}
     >>> walop.apply(result, star)["P", "P_ERR", "EVPA"]  # doctest: +SKIP
     """
     from walop_jax.fit.verdict import Quality
+    from walop_jax.io.atomic import check_output
     from walop_jax.io.plain_tables import table_format
     from walop_jax.posterior.draws import with_moments
     from walop_jax.science.apply import apply as apply_to_rows
@@ -90,11 +101,23 @@ def apply(
     from walop_jax.science.polarisation import ESTIMATORS
     from walop_jax.science.stokes_columns import header, stokes_columns
 
+    if (workers is not None or scheduler is not None) and not each:
+        raise UsageError("a single table is made by one process; see --each", "workers")
+    if workers is not None and scheduler is not None:
+        raise UsageError("workers and scheduler exclude each other", "scheduler")
     if debias not in ESTIMATORS:
         raise UsageError(f"{debias!r} is neither {' nor '.join(ESTIMATORS)}", "debias")
     if saturation is not None and not saturation > 0:
         raise UsageError(f"{saturation} must be above 0 electrons", "saturation")
+    if each:
+        files = list(catalogue) if isinstance(catalogue, list | tuple) else [catalogue]
+        options = {
+            "calibration": calibration, "debias": debias, "saturation": saturation, "posterior": posterior,
+            "effects": effects, "force": force, "common": common,
+        }  # fmt: skip
+        return for_each(job, apply, files, output, options, workers, scheduler)
     if output is not None:
+        check_output(output, overwrite=job.overwrite)
         table_format(output)
     job.begin("reading")
     table, said = _table_of(catalogue)

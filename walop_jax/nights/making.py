@@ -15,10 +15,10 @@ import importlib
 import importlib.util
 import pickle
 from collections import Counter
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -41,6 +41,9 @@ from walop_jax.nights.equations import (
 )
 from walop_jax.nights.night_file import read_nights, write_nights
 from walop_jax.posterior.run import Run
+
+Given = TypeVar("Given")
+Done = TypeVar("Done")
 
 SKETCH = 512  # measurements by which sets are compared
 COPIED = 0.02  # their share that no two sets have in common by chance
@@ -174,8 +177,7 @@ class Makers:
         if self._executor is None:
             return map(self._maker.make, tasks)
         recipe = pickle.dumps((self.like, self._maker.folder, self._maker.count))
-        given = [(files_of_users(), recipe, pickle.dumps(task)) for task in tasks]
-        return self._executor.map(make, *zip(*given, strict=True)) if given else ()
+        return mapped(make, [(recipe, task) for task in tasks], self._executor)
 
     def _refuse_copies(self, here: str, smallest: frozenset[int]) -> None:
         seen = Counter(self._seen[number] for number in smallest if number in self._seen)
@@ -185,17 +187,42 @@ class Makers:
         self._seen |= dict.fromkeys(smallest, here)
 
 
-def make(code: tuple[str, ...], recipe: bytes, task: bytes) -> Made:
-    """The nights of a pickled `Task`, made in any process by `Maker(*recipe)`; the files of `code` are run first."""
-    return _maker(code, recipe).make(pickle.loads(task))
+def make(given: tuple[bytes, Task]) -> Made:
+    """The nights of a task, made in any process by `Maker(*recipe)`."""
+    recipe, task = given
+    return _maker(recipe).make(task)
 
 
 @functools.lru_cache(maxsize=1)
-def _maker(code: tuple[str, ...], recipe: bytes) -> Maker:
+def _maker(recipe: bytes) -> Maker:
     """The maker of a worker process, with the sets that it has read and the candidates that it has listed."""
+    return Maker(*pickle.loads(recipe))
+
+
+def mapped(
+    function: Callable[[Given], Done], tasks: Sequence[Given], executor: Executor | None
+) -> Iterable[Done]:
+    """`function` of every task in their order, here or by an executor, in whose processes files of users are run."""
+    if executor is None:
+        return map(function, tasks)
+    if not tasks:
+        return ()
+    code = files_of_users()
+    return executor.map(
+        _there, *zip(*((code, pickle.dumps((function, task))) for task in tasks), strict=True)
+    )
+
+
+def _there(code: tuple[str, ...], work: bytes) -> Any:
+    _run_files(code)
+    function, task = pickle.loads(work)
+    return function(task)
+
+
+@functools.lru_cache(maxsize=1)
+def _run_files(code: tuple[str, ...]) -> None:
     for path in code:
         run_file(path, "start the workers where this file can be read")
-    return Maker(*pickle.loads(recipe))
 
 
 @contextlib.contextmanager

@@ -1,0 +1,65 @@
+"""An alarm on the time of compilation: the largest programs of a fit, in equations as they are traced.
+
+What XLA takes for a program grows with its equations, and these are the same on every machine, however busy; jax 0.10
+and 0.12 differ by 3 % at most. A program that has to grow moves its bound, and says why.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import pytest
+from jax.extend import core
+from small_run import SMALL
+
+from walop_jax.fit.model_file import base_model
+from walop_jax.likelihood import columns, engine
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.simulation.simulate import simulate
+
+
+def equations(jaxpr: core.Jaxpr) -> int:
+    """Number of equations, those of inner programs among them."""
+    inner = (part for one in jaxpr.eqns for value in one.params.values() for part in jaxprs(value))
+    return len(jaxpr.eqns) + sum(map(equations, inner))
+
+
+def jaxprs(value: Any) -> Iterator[core.Jaxpr]:
+    if isinstance(value, core.ClosedJaxpr):
+        yield value.jaxpr
+    elif isinstance(value, core.Jaxpr):
+        yield value
+    elif isinstance(value, tuple | list):
+        for part in value:
+            yield from jaxprs(part)
+
+
+def test_equations_are_counted_within():
+    """A sine, a loop, and two equations of its body."""
+
+    def function(x):
+        return jax.lax.fori_loop(0, 3, lambda _, y: y * y, jax.numpy.sin(x))
+
+    found = jax.make_jaxpr(function)(1.0)
+    assert equations(found.jaxpr) > len(found.jaxpr.eqns)
+
+
+@pytest.fixture(scope="module")
+def likelihood():
+    calset = simulate(SMALL, seed=1).calset
+    return Likelihood.of(calset, base_model(calset))
+
+
+@pytest.mark.parametrize(("program", "most"), [(engine.residuals, 1300), (engine.linearised_residuals, 3850)])
+def test_programs_of_a_fit_stay_small(likelihood, program, most):
+    instrument = likelihood.model.instrument(likelihood.model.start)
+    batch = next(iter(likelihood.points))
+    found = jax.make_jaxpr(program.__wrapped__)(instrument, likelihood.plan, batch)
+    assert 0.5 * most < equations(found.jaxpr) < most
+
+
+def test_the_program_of_the_responses_stays_small(likelihood):
+    every = columns.Columns(likelihood, likelihood.model.start)
+    (data,) = every.reader.batches(0, 32, 32)
+    found = jax.make_jaxpr(columns._at_points.__wrapped__)(every.instrument, every.plan, data)
+    assert 4500 < equations(found.jaxpr) < 9500
