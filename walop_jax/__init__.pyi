@@ -13,6 +13,7 @@ from walop_jax.commands.demo import demo as demo
 from walop_jax.commands.diagnose import diagnose as diagnose
 from walop_jax.commands.docs import docs as docs
 from walop_jax.commands.epoch import epoch as epoch
+from walop_jax.commands.exposures import exposures as exposures
 from walop_jax.commands.gather import gather as gather
 from walop_jax.commands.import_zemax import import_zemax as import_zemax
 from walop_jax.commands.inputs import read as read

@@ -46,6 +46,7 @@ class Line(NamedTuple):
 LINES = {
     "demo": [Line("demo -o DEMO", "summary", "seconds")],
     "inspect": [Line("inspect set.fits")],
+    "exposures": [Line("exposures log.csv --words words.toml -o exposures.ecsv")],
     "simulate": [
         Line("simulate plan.toml -o made.fits --truth truth.json", takes="seconds"),
         Line("simulate -o made.fits", takes="seconds"),
@@ -62,7 +63,7 @@ LINES = {
     ],
     "plan": [
         Line("plan bench.toml --minutes 10 --draws 1 --criterion window.delta -o PLAN", "plan"),
-        Line("plan plan.toml --minutes 20 --draws 1 -o PLAN", "plan", "seconds"),
+        Line("plan plan.toml --minutes 20 --draws 1 --schedule night.json -o PLAN", "plan", "seconds"),
         Line("plan WALOP-SOUTH --minutes 20 --draws 1 -o PLAN", "plan", "minutes"),
         Line("plan RUN --minutes 10 --draws 1 -o PLAN", "plan", "minutes"),
     ],
@@ -145,6 +146,10 @@ def home(call: Call, tmp_path_factory) -> Path:
     (folder / "own.toml").write_text(OWN)
     (folder / "bench.toml").write_text(BENCH)
     (folder / "points.csv").write_text("X,Y\n0,0\n0.2,-0.1\n")
+    (folder / "log.csv").write_text("TYPE,ANGLE,SECONDS\nclp,0,20\nclp,45,20\n")
+    columns = {"KIND": "TYPE", "CLP_ANGLE": "ANGLE", "EXPTIME": "SECONDS"}
+    words = "".join(f'[{name}]\nword = "{word}"\n' for name, word in columns.items())
+    (folder / "words.toml").write_text(f"{words}[CLP_IN]\nvalue = true\n")
     write_folder(folder / "exports")
     _stars(folder / "RUN").write(folder / "stars.fits")
     return folder

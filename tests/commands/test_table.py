@@ -166,8 +166,8 @@ CASES = {
     "conformance": Case(lambda g: ("--make", g.pack), lambda g, **k: walop.conformance(make=g.pack, **k)),
     "docs": Case(lambda g: ("files",), lambda g, **k: walop.docs("files", **k)),
 }
-ELSEWHERE = {"demo", "clip", "sample", "plan", "stack"}
-# fit/test_outliers; test_sample; tests/plans; tests/nights
+ELSEWHERE = {"exposures", "demo", "clip", "sample", "plan", "stack"}
+# data/test_header_words; fit/test_outliers; test_sample; tests/plans; tests/nights
 CHEAP = [name for name, case in CASES.items() if not case.long]
 WRITING = [name for name in CHEAP if CASES[name].output]
 TABLE = [pytest.param(name, marks=[pytest.mark.long] if CASES[name].long else []) for name in CASES]

@@ -172,6 +172,37 @@ def test_a_name_that_explains_no_more_than_a_stated_number_is_told_beside_it():
     assert "the equinox of RA and DEC 20" in told
 
 
+def an_hour_late(calset: CalibrationSet) -> CalibrationSet:
+    """Local time of a zone one hour east, in the exposures of the sky."""
+    e = calset.exposures
+    mjd = np.where(e.kind == "moon", e.mjd + 1.0 / 24.0, e.mjd)
+    return dataclasses.replace(calset, exposures=dataclasses.replace(e, mjd=mjd))
+
+
+@pytest.mark.parametrize(
+    ("change", "what", "size"),
+    [
+        (an_hour_late, r"MJD of sky exposures changed by (\S+)", -1.0 / 24.0),
+        (of_date, r"the equinox of RA and DEC (\S+)", 2080.0),
+    ],
+)
+def test_one_number_explains_data_in_which_no_name_was_found(change, what, size):
+    calset = change(simulate(SMALL, seed=SEED).calset)
+    wrong = refit(calset)
+    text = instead_of_names(wrong, wrong)
+    found = re.search(what, text)
+    assert found, text
+    assert float(found[1].replace("−", "-")) == pytest.approx(size, rel=0.1)
+
+
+def test_where_no_number_explains_the_data_none_is_told():
+    wrong = refit(
+        simulate(SMALL, seed=5, effects=[effect_from_text("camera_leakage=0.02", SMALL.context())]).calset
+    )
+    assert not wrong.explains_data
+    assert instead_of_names(wrong, wrong) == ""
+
+
 def test_a_number_that_would_be_impossible_is_no_rival():
     """An encoder's wobble of 0.3°: Newton's steps in the latitude of the site end beyond the pole."""
     wobble = effect_from_text("clp_wobble=amplitude:0.3,phase:1.0", SMALL.context())

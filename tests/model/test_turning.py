@@ -8,16 +8,20 @@ import jax
 import numpy as np
 import pytest
 from handmade_set import Handmade
+from small_run import SMALL
 
 import walop_jax as walop
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import Position
 from walop_jax.data.settings import BUILTIN_FILTERS, Settings, builtin_filter
+from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model import light
 from walop_jax.model.fold import Turning
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.planning import plan_for_settings
+from walop_jax.simulation.observing_plan import Stop
+from walop_jax.simulation.simulate import simulate
 
 R = next(iter(BUILTIN_FILTERS))
 
@@ -102,3 +106,22 @@ def test_an_element_that_is_out_does_not_turn():
     assert Position(
         np.array([True, False]), np.array([1.0, np.nan]), np.array([-5.0, 5.0])
     ).turn.tolist() == [5.0, 0.0]
+
+
+def test_a_set_with_a_turning_plate_is_fitted(tmp_path):
+    """Simulated, fitted, written and read; taken for a plate that stands still it is explained by nothing."""
+    settings = ((None, 0.0), (0.0, 0.0), (30.0, 70.0))
+    stops = [Stop(a, plate=p, turn=t) for a in (0.0, 45.0, 90.0, 135.0) for p, t in settings]
+    plan = dataclasses.replace(
+        SMALL, plate=(None, 0.0, 30.0), stops=tuple(stops), moon_patches=0, standards=0
+    )
+    calset = simulate(plan, 3).calset
+    fit = refit(calset)
+    assert abs(fit.excess) < 4.0
+    fit.judged().save(tmp_path / "RUN")
+    turn = walop.read(tmp_path / "RUN").calibration.exposures.positions["CHWP"].turn
+    np.testing.assert_array_equal(turn, calset.exposures.positions["CHWP"].turn)
+    assert turn.max() == 70.0
+    still = dataclasses.replace(calset.exposures.positions["CHWP"], turn=np.zeros(len(turn)))
+    taken = dataclasses.replace(calset, exposures=calset.exposures.placed(CHWP=still))
+    assert refit(taken).excess > 100.0

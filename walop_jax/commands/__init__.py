@@ -13,6 +13,7 @@ import sys
 COMMANDS = {
     "demo": "Fit the small calibration set that comes with the package, and write the page about it.",
     "inspect": "Say what is in calibration sets and what is wrong with them.",
+    "exposures": "Make the table EXPOSURES of a calibration set from what an observatory writes down.",
     "simulate": "Make a calibration set of an instrument whose as-built values are drawn from their priors.",
     "refit": "Fit all field points of calibration sets jointly.",
     "clip": "Flag single intensities that lie far from a fit of all others.",

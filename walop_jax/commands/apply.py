@@ -86,6 +86,7 @@ def apply(
     from walop_jax.posterior.draws import with_moments
     from walop_jax.science.apply import apply as apply_to_rows
     from walop_jax.science.catalogue import read_catalogue
+    from walop_jax.science.overlaps import overlap
     from walop_jax.science.polarisation import ESTIMATORS
     from walop_jax.science.stokes_columns import header, stokes_columns
 
@@ -106,6 +107,7 @@ def apply(
         stars = apply_to_rows(
             used, rows, lambda done, total: job.tell(f"{done} of {total} rows"), force=force
         )
+        seen_twice = overlap(used, rows, force=force)
     job.begin("writing")
     columns = stokes_columns(stars, rows.star, debias)
     on_the_sky = sum(map(math.isfinite, rows.rotator)) / max(len(rows.rotator), 1)
@@ -123,13 +125,20 @@ def apply(
         header(held.content_hash(), debias, on_the_sky, stars.check),
         output,
         counted=_counted(alone),
-        warnings=[*said, *doubts, *_about_noise(rows.counts, rows.sigma), *_about_places(rows, stars.flag)],
+        warnings=[
+            *said,
+            *doubts,
+            *_about_noise(rows.counts, rows.sigma),
+            *_about_places(rows, stars.flag),
+            *([] if seen_twice is None else seen_twice.warnings()),
+        ],
         remade=_common if common else None,
         extra={
             "stars": len(stars.qu),
             "seconds": job.seconds,
             "estimator": debias,
             "catalogue": stars.check.document(),
+            "overlap": None if seen_twice is None else dataclasses.asdict(seen_twice),
         },
     )
     crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 PLAN, INSTRUMENT = "plan.toml", "instrument.toml"
 MOST_ANGLES = 24  # of a moving element, where a plan takes them from a run
 
+SCHEDULE = Option("Write the exposures as a schedule of the survey (format v4).", "FILE.json", Path)
+WORDS = Option("Numbers of filters and facts of a schedule; see walop-jax docs files.", "WORDS.toml", Path)
 FOLDER = Option(f"Folder for {PLAN} and plan.json; without it the plan is printed only.", "RUN", Path, "-o")
 What = Annotated[
     "ObservingPlan | FitResult | Calibration | Diagnosis | Run | PathLike",
@@ -75,6 +78,8 @@ def plan(
     apart: Apart = None,
     draws: Draws = 20,
     effects: Effects = None,
+    schedule: Annotated[PathLike | None, SCHEDULE] = None,
+    words: Annotated[PathLike | None, WORDS] = None,
     output: Annotated[PathLike | None, FOLDER] = None,
 ) -> Outcome[ExposurePlan]:
     """Plan the calibration exposures of a night: those that make the error of p smallest where it is largest.
@@ -83,7 +88,7 @@ def plan(
     plate, Moon patches, standards, exposure times, costs. The polariser may stand at any angle; so may the plate, of an
     INSTRUMENT, of a RUN, or where the file says so. Printed are the exposures in order, the errors that they promise,
     and what no plan of the same time could undercut, which is proven. RUN/plan.toml is the plan for `simulate` and
-    `limits`, RUN/plan.json holds all numbers.
+    `limits`, RUN/plan.json holds all numbers; --schedule writes it for the telescope.
 
     In Python: the plan. Raises ValueError for a time that pays for nothing or determines nothing.
 
@@ -146,7 +151,37 @@ def plan(
         PLAN: text_file(plan_text(found.observing_plan, INSTRUMENT if described else None)),
         INSTRUMENT: text_file(described) if described else None,
     }
-    return Outcome(found, extra={"seed": job.seed}, files=lambda: files, saved_as=PLANNED)
+    remarks = () if schedule is None else _scheduled(job, found.observing_plan, schedule, words)
+    return Outcome(found, extra={"seed": job.seed}, files=lambda: files, saved_as=PLANNED, warnings=remarks)
+
+
+def _scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike | None) -> Sequence[str]:
+    """Write the exposures of a plan as a schedule; filters are numbered in their order unless words say otherwise."""
+    from walop_jax.data.header_words import Words, read_words
+    from walop_jax.data.schedule import schedule_of
+    from walop_jax.io.atomic import atomic_path
+    from walop_jax.io.text import json_text
+
+    said = Words({}) if words is None else read_words(words)
+    numbers = said.filters or {name: k for k, name in enumerate(planned.filter_names, start=1)}
+    exposures = planned.exposures()
+    _, star = planned.layout()
+    stars = star.max(axis=0)
+    names = [
+        planned.star_names[s]
+        if s >= 0
+        else f"Moon at {ra:.2f} {dec:+.2f}"
+        if kind == "moon"
+        else "calibration"
+        for s, kind, ra, dec in zip(stars, exposures.kind, exposures.ra, exposures.dec, strict=True)
+    ]
+    made, remarks = schedule_of(exposures, planned.site, numbers, facts=said.schedule, names=names)
+    with atomic_path(path, overwrite=job.overwrite) as temporary:
+        temporary.write_text(json_text(made), encoding="utf-8")
+    if not said.filters:
+        listed = ", ".join(f"{name} {number}" for name, number in numbers.items())
+        remarks.append(f"{path}: filters are numbered in their order ({listed}); --words gives other numbers")
+    return remarks
 
 
 def _stood_at(exposures: Exposures, prefix: str) -> tuple[float | None, ...]:

@@ -196,4 +196,7 @@ class Settings:
         if len(self) != 1:
             raise ValueError(f"one setting is asked for, {len(self)} are given")
         inside = tuple(sorted(self.inside().items()))
+        inside += tuple(
+            sorted((prefix, float(turn.item())) for prefix, turn in self.turns.items() if turn.any())
+        )
         return (str(self.filter[0]), inside, float(self.temperature[0]), float(self.hour_angle[0]))

@@ -42,9 +42,9 @@ from walop_jax.calibration.matrix import effect_slopes, first_setting, matrix_sl
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import Examination, examine, most_points
+from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
-from walop_jax.diagnosis.hypotheses import Probe, applicable, fringes_of
-from walop_jax.diagnosis.hypotheses import probes as all_probes
+from walop_jax.diagnosis.hypotheses import Probe, fringes_of
 from walop_jax.diagnosis.limits_found import ConditionLimit, DetectionLimit, DetectionLimits, over_field
 from walop_jax.diagnosis.score import ScoreSpace, local_p, noncentrality, separations
 from walop_jax.diagnosis.stated_conditions import STEP, Singles, condition_scores
@@ -54,7 +54,6 @@ from walop_jax.fit.stand_in import on_field_points
 from walop_jax.io.progress import Stage
 from walop_jax.model.effects import EffectKind
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.specification import effect_context
 
 MANY_SHAPES = 8
 """Shapes of an effect above which one of them, of the median size, stands for all in what it does to the matrix."""
@@ -78,14 +77,11 @@ def detection_limits(
     tell = progress or (lambda text: None)
     template, calset = result.model.template, result.calset
     catalogue = result.model.catalogue if catalogue is None else catalogue
-    context = effect_context(template, calset.exposures)
-    fitting = applicable(catalogue, context, template)
-    wanted = list(all_probes(fitting, context))
-    result = sampled(
-        on_field_points(result), most_points(calset, template, sum(len(probe.widths) for probe in wanted))
-    )
+    asked = hypotheses(catalogue, template, calset.exposures, len(calset.points))
+    result = sampled(on_field_points(result), most_points(calset, template, asked.amplitudes))
     tell(Stage("differentiating every effect", "differentiating"))
-    examination = examine(result, wanted, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    examination = examine(result, asked.names, rng, sentences=asked.sentences, parts=asked.parts)
     p = examination.table.local(thresholds.ALARM)
     tell(Stage("comparing the effects", "comparing"))
     rivals = examination.bare.subset([probe.name for probe in examination.probes])
@@ -97,7 +93,7 @@ def detection_limits(
         hidden = hidden_mistakes(design, Singles.of(design))
     examined = result if result.verdict is not None else result.judged()
     calibration = Calibration.from_fit(dataclasses.replace(examined, hidden=hidden))
-    found = _collected(examination, columns, errors, fitting, calibration)
+    found = _collected(examination, columns, errors, asked.effects, calibration)
     return dataclasses.replace(found, conditions=condition_limits(design), could_hide=could_hide(calibration))
 
 

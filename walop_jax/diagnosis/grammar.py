@@ -22,13 +22,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from walop_jax.data.records import Exposures
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.dependences import STEPS, Asked, between, starts_of_steps
-from walop_jax.diagnosis.hypotheses import Probe, said_by
+from walop_jax.diagnosis.hypotheses import Probe, applicable, probes, said_by
 from walop_jax.likelihood import limits
 from walop_jax.model.conventions import Units
 from walop_jax.model.effects import Context, Described, EffectKind
@@ -40,6 +41,7 @@ from walop_jax.model.effects.optics import DISPLACEMENTS
 from walop_jax.model.elements import Element, PupilMapping, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.slots import acts
+from walop_jax.model.specification import effect_context
 
 # -------------------------------------------------------------------------------------------------------- all sentences
 
@@ -61,11 +63,43 @@ def _probe(group: tuple[Sentence, ...]) -> Probe:
     return Probe("; ".join(sentence.text for sentence in group), Described, members)
 
 
+# ----------------------------------------------------------------------------------------- all that may be missing
+
+
+class Hypotheses(NamedTuple):
+    """All that a model may lack: effects that fit the instrument, their probes, and sentences.
+
+    `sentences` are those that no effect holds, `parts` those that effects hold in part, with the holders, `every` are
+    all of them, those that are an effect by another name as well.
+    """
+
+    effects: tuple[EffectKind, ...]
+    names: tuple[Probe, ...]
+    sentences: list[Probe]
+    parts: list[tuple[Probe, frozenset[EffectKind]]]
+    every: tuple[Probe, ...]
+
+    @property
+    def amplitudes(self) -> int:
+        """Number of all amplitudes."""
+        return sum(len(probe.widths) for probe in (*self.names, *self.every))
+
+
+def hypotheses(
+    catalogue: Sequence[EffectKind], instrument: Instrument, exposures: Exposures, points: int
+) -> Hypotheses:
+    """The one list of what a diagnosis looks for, the verdict of a fit is held against, and limits are given beside."""
+    context, every = effect_context(instrument, exposures), sentences(instrument, exposures, points)
+    effects = applicable(catalogue, context, instrument)
+    alone, parts = beside_names(every, effects, context, instrument)
+    return Hypotheses(effects, tuple(probes(effects, context)), alone, parts, every)
+
+
 # ------------------------------------------------------------------------------------- names that are sentences
 
 
 def beside_names(
-    probes: Sequence[Probe], catalogue: Sequence[EffectKind], context: Context, instrument: Instrument
+    every: Sequence[Probe], catalogue: Sequence[EffectKind], context: Context, instrument: Instrument
 ) -> tuple[list[Probe], list[tuple[Probe, frozenset[EffectKind]]]]:
     """The groups that are no effect of a catalogue by another name: those that none holds, and parts, with the holders.
 
@@ -80,7 +114,7 @@ def beside_names(
             ):
                 known.append((texts, effect))
     alone, parts = [], []
-    for probe in probes:
+    for probe in every:
         said = frozenset(said_by(probe))
         holders = frozenset(effect for texts, effect in known if texts > said)
         if any(texts == said for texts, _ in known):

@@ -177,9 +177,10 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     left = square - best.statistic * table.noise_scale**2
     if not result.explains_data and left * result.noise_scale**2 > NEARLY * design.projector.free:
         return
-    likely = [score for score in found if score.statistic > best.statistic - _ALIKE]
+    likely = [one for one in found if one.statistic - one.rank > best.statistic - best.rank - _ALIKE]
     # Of an element and one of its numbers alone, the shorter statement if it explains as much.
     likely = [one for one in likely if not any(_holds(one, other) for other in likely)]
+    likely.sort(key=lambda one: (one.rank, one.log_p))  # a mistake of one number before sixteen
     said = {one.candidate.name: one.said for one in rivals}
     told = "; or for ".join(said[score.name](score) for score in likely[:_SHOWN])
     more = f"; or for {len(likely) - _SHOWN} others" if len(likely) > _SHOWN else ""
@@ -210,6 +211,9 @@ def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
 def instead_of_names(before: FitResult, after: FitResult) -> str:
     """The number that the set states which, if wrong, explains the data better than names do; empty: none.
 
+    Numbers that are as probable are told together. Where nothing was added (`after` is `before`) only what explains the
+    data is told.
+
     Compared are the evidence of the names, ln B of `after` against `before`, and that of the number, fitted exactly,
     with its width as prior: ½ (χ² − χ²_c) − ½ ln(1 + w² C̃ᵀC̃). One number may so come before sixteen.
     """
@@ -217,7 +221,8 @@ def instead_of_names(before: FitResult, after: FitResult) -> str:
     asked = [one for one in asked if corrected_p(one.score.log_p, len(asked)) < thresholds.ALARM]
     if after.noise_scale != before.noise_scale:  # one scale of the errors, or χ² of both are not comparable
         after = fit(after.likelihood, start=after.values, noise_scale=before.noise_scale)
-    best, told = log_evidence_ratio(before, after), ""
+    added = after is not before
+    least, likely = log_evidence_ratio(before, after) if added else 0.0, list[tuple[float, str]]()
     for one in sorted(asked, key=lambda one: one.score.log_p)[:_FITTED]:
         found, size, result, now = one.stated, 0.0, before, one
         for _ in range(_ROUNDS):  # Gauss and Newton: hours are no small step
@@ -233,13 +238,18 @@ def instead_of_names(before: FitResult, after: FitResult) -> str:
         score, square = now.score, now.square
         worth = 0.5 * (before.posterior.objective - result.posterior.objective)
         worth -= 0.5 * float(np.log1p(square * found.width**2))
-        if result.converged and abs(size) < found.width and worth > best:
+        explained = result.explains_data or result.nearly_explains_data
+        if result.converged and abs(size) < found.width and worth > least and (added or explained):
             value = size if found.value is None else found.value + size
             sigma = float(np.sqrt(score.covariance[0, 0]))
             by = " changed by" if found.value is None else ""
-            best, told = worth, f"{found.what}{by} {with_error(value, sigma)} {found.unit}".rstrip()
-            told += f" ({found.remedy}; χ²/dof = {result.chi2 / max(result.dof, 1):.3g})"
-    return told
+            text = f"{found.what}{by} {with_error(value, sigma)} {found.unit}".rstrip()
+            text += f" ({found.remedy}; χ²/dof = {result.chi2 / max(result.dof, 1):.3g})"
+            likely.append((worth, text))
+    best = max((worth for worth, _ in likely), default=0.0)
+    return "; or ".join(
+        text for worth, text in sorted(likely, reverse=True) if worth > best - thresholds.EVEN_ODDS
+    )
 
 
 def _holds(one: Score, other: Score) -> bool:

@@ -22,15 +22,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar, thresholds
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import only_a_class, with_average
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
 from walop_jax.diagnosis.examination import Examination, most_points
 from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained, describe, told
-from walop_jax.diagnosis.hypotheses import Probe, applicable
-from walop_jax.diagnosis.hypotheses import probes as all_probes
+from walop_jax.diagnosis.grammar import Hypotheses, hypotheses
 from walop_jax.diagnosis.leftover import back_to, concluded
 from walop_jax.diagnosis.readings import mixups_of, refusal
 from walop_jax.diagnosis.refits import Refits
@@ -75,9 +74,8 @@ def diagnose(
     catalogue = model.catalogue if catalogue is None else catalogue
     calset = in_field_points(calset, model, tell, pixel_structure)
     context = effect_context(model.template, calset.exposures)
-    every = grammar.sentences(model.template, calset.exposures, len(calset.points))
-    amplitudes = sum(len(probe.widths) for probe in (*all_probes(tuple(catalogue), context), *every))
-    some = thinned(calset, most_points(calset, model.template, amplitudes), neighbours=1)
+    asked = hypotheses(catalogue, model.template, calset.exposures, len(calset.points))
+    some = thinned(calset, most_points(calset, model.template, asked.amplitudes), neighbours=1)
     if len(some.points) < len(calset.points):
         tell(f"looking at {len(some.points)} of {len(calset.points)} field points")
     tell(Stage("fitting the model", "fitting"))
@@ -85,14 +83,12 @@ def diagnose(
     readings = () if as_written else mixups_of(before)
     if readings and readings[0].explained < thresholds.READING_SURE:
         raise refusal(before, readings)
-    fitting = applicable(catalogue, context, model.template)
-    alone, parts = grammar.beside_names(every, fitting, context, model.template)
     judge = Refits(
         context=context,
-        catalogue=fitting,
-        wanted=list(all_probes(fitting, context)),
-        sentences=alone,
-        parts=parts,
+        catalogue=asked.effects,
+        wanted=asked.names,
+        sentences=asked.sentences,
+        parts=asked.parts,
         rng=np.random.default_rng(seed),
         tell=tell,
         minutes=np.inf if minutes is None else minutes,
@@ -106,10 +102,12 @@ def diagnose(
     # Another reading that comes near competes with names and with other descriptions of the instrument.
     if remainder and readings and readings[0].explained * after.dof < after.chi2:
         raise refusal(before, readings)
-    if state.steps and (stated := instead_of_names(before, after)):
-        names = ", ".join(step.effect.name for step in state.steps)
+    if (state.steps or remainder) and (stated := instead_of_names(before, after)):
+        parts = () if remainder is None else remainder.parts
+        names = ", ".join([step.effect.name for step in state.steps] or parts) or "none that holds"
         text = f"one number that the set states explains more than names do ({names}), if it is {stated}"
-        remainder, state = Unexplained(first.evidence.table.p_global, text, ()), back_to(first, state)
+        remainder = Unexplained(first.evidence.table.p_global, text, (), parts=parts)
+        state = back_to(first, state)
         after = before
     evidence, added = state.evidence, [step.effect.name for step in state.steps]
     steps = tuple(_finished(step, evidence, context, added) for step in state.steps)
@@ -122,7 +120,7 @@ def diagnose(
         steps=steps,
         candidates=first.evidence.summary(),
         limits=tuple(evidence.limits()),
-        untestable=first.evidence.untestable(fitting),
+        untestable=first.evidence.untestable(asked.effects),
         unexplained=remainder,
         p_value=first.evidence.table.p_global,
         remaining_p=evidence.table.p_global,
@@ -137,8 +135,8 @@ def diagnose(
         ended=state.ended or (judge.over(state.fits) if remainder else ""),
         members=classes_of(evidence, context, set(added), groups, alike),
         rounds=state.rounds,
-        not_scored=_not_scored(catalogue, fitting, every, judge),
-        descriptions=len(alone) + len(parts),
+        not_scored=_not_scored(catalogue, asked),
+        descriptions=len(asked.sentences) + len(asked.parts),
     )
     del first, state, evidence  # the columns of all candidates, gigabytes of a large set
     return _examined(found, seed)
@@ -162,16 +160,16 @@ def _examined(found: Diagnosis, seed: int) -> Diagnosis:
     return dataclasses.replace(found, before=before, after=after)
 
 
-def _not_scored(
-    catalogue: Sequence[EffectKind], fitting: Sequence[EffectKind], every: Sequence[Probe], judge: Refits
-) -> dict[str, str]:
+def _not_scored(catalogue: Sequence[EffectKind], asked: Hypotheses) -> dict[str, str]:
     """Everything that was not scored, by name, each with the reason."""
-    probed = {probe.effect for probe in judge.wanted}
-    scored = {probe.name for probe in (*judge.sentences, *(probe for probe, _ in judge.parts))}
+    probed = {probe.effect for probe in asked.names}
+    scored = {probe.name for probe in (*asked.sentences, *(probe for probe, _ in asked.parts))}
     reasons = {
-        one.name: "the instrument has nothing that it acts on" for one in catalogue if one not in fitting
+        one.name: "the instrument has nothing that it acts on"
+        for one in catalogue
+        if one not in asked.effects
     }
-    for effect in fitting:
+    for effect in asked.effects:
         if effect.is_structural():
             reasons[effect.name] = (
                 f"it has no amplitude and no score: it is tried where χ²/dof is above {thresholds.POOR_FIT:g} and no "
@@ -180,7 +178,7 @@ def _not_scored(
         elif effect not in probed:
             reasons[effect.name] = "the exposures have nothing that it acts on"
     name = "it is an effect of the catalogue by another name"
-    return reasons | {probe.name: name for probe in every if probe.name not in scored}
+    return reasons | {probe.name: name for probe in asked.every if probe.name not in scored}
 
 
 def _promise(choice: Choice) -> tuple[float, float]:

@@ -72,6 +72,7 @@ class Stop:
     """One exposure, taken `times` times: through the polariser at an angle (deg), or of another `kind`.
 
     `plate` is the angle of the calibration plate, `moving` those of further moving elements (deg, None: out);
+    `turn` the angle (deg) by which the calibration plate turns during the exposure, about `plate`;
     `seconds` the exposure time (None: the usual one; electrons grow with it). `number`, from 0, is that of the Moon
     patch or standard, `place` the place of a standard among those of the raster (None: all of them, one after the
     other).
@@ -86,6 +87,7 @@ class Stop:
     number: int = 0
     place: int | None = None
     seconds: float | None = None
+    turn: float = 0.0
 
     def __post_init__(self) -> None:
         check_names("kind of a stop", [self.kind], EXPOSED)
@@ -98,9 +100,14 @@ class Stop:
         if self.seconds is not None and not self.seconds > 0:
             raise ValueError(f"an exposure of {self.seconds} s: give a time above 0, or leave it out")
 
+        if self.turn and self.plate is None:
+            raise ValueError(
+                f"turn = {self.turn:g} deg: the calibration plate is out; give its angle, plate = 0"
+            )
+
     def document(self) -> dict[str, Any]:
         """The stop as plain data, with what is as usual left out from `kind` on."""
-        later = {"kind": "clp", "number": 0, "place": None, "seconds": None}
+        later = {"kind": "clp", "number": 0, "place": None, "seconds": None, "turn": 0.0}
         return {k: v for k, v in dataclasses.asdict(self).items() if k not in later or v != later[k]}
 
 
@@ -393,7 +400,9 @@ class ObservingPlan:
             teff=np.full(n, self.teff),
             positions={
                 POLARISER: Position.at(stop.polariser_angle for stop in stops),
-                CALIBRATION_PLATE: Position.at(stop.plate for stop in stops),
+                CALIBRATION_PLATE: dataclasses.replace(
+                    Position.at(stop.plate for stop in stops), turn=np.array([stop.turn for stop in stops])
+                ),
                 **{prefix: Position.at(stop.moving.get(prefix) for stop in stops) for prefix in self.moving},
             },
         )

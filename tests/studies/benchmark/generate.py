@@ -26,9 +26,10 @@ import numpy as np
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "diagnosis")]
+sys.path[:0] = [str(HERE), str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "diagnosis")]
 
 from blind import Blind, outside  # noqa: E402
+from new_shapes import new_shapes  # noqa: E402
 
 from walop_jax.data.records import Block, CalibrationSet, Points  # noqa: E402
 from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
@@ -47,6 +48,7 @@ PLAN = ObservingPlan(
     grid=15, standard_grid=3, polariser_angles=polariser_turn(15), moon_patches=6, standards=6
 )
 ANGLES_KEPT_BACK = (2, 7, 12)  # exposures
+FAINT = 1e-3  # of its length, left of a shape behind the base
 STEP = 1e-3  # of a standard error: residuals are stored in this unit
 
 
@@ -145,7 +147,9 @@ class Hidden:
     beyond: np.ndarray
 
 
-def hidden(layout: Layout, seed: int, draws: int, nulls: int, ratios: Sequence[float]) -> Iterator[Hidden]:
+def hidden(
+    layout: Layout, seed: int, draws: int, nulls: int, ratios: Sequence[float], *, new: bool = False
+) -> Iterator[Hidden]:
     """All scenes in a fixed order; each is judged without one entry of the catalogue, that which it hides or any."""
     blind, named, rng = layout.blind, layout.columns, np.random.default_rng([seed, 32])
     blind.rng = np.random.default_rng([seed, 33])
@@ -157,9 +161,10 @@ def hidden(layout: Layout, seed: int, draws: int, nulls: int, ratios: Sequence[f
     nothing = np.zeros(len(layout.design.residual)), np.zeros(int((~layout.inside).sum()))
     for _ in range(nulls):
         yield Hidden("null", "", 0.0, (), str(rng.choice(blind.visible)), *nothing)
-    for name, column in outside(layout.whole, single):
+    for name, said, column in _shapes(layout, single, seed, new=new):
         rows, beyond = (part[:, 0] for part in layout.projected(column[:, None]))
-        said = tuple(sorted(blind.in_sentences[name]))
+        if np.linalg.norm(rows) < FAINT * np.linalg.norm(column):  # the base takes it up
+            continue
         for ratio in ratios:
             for _ in range(draws):
                 size = rng.choice([-1.0, 1.0]) * ratio / np.linalg.norm(rows)
@@ -174,6 +179,17 @@ def hidden(layout: Layout, seed: int, draws: int, nulls: int, ratios: Sequence[f
             size = ratio / np.linalg.norm(rows)
             said = tuple(sorted(blind.in_sentences[drawn.probe]))
             yield Hidden("left out", name, ratio, said, name, size * rows[:, 0], size * beyond[:, 0])
+
+
+def _shapes(
+    layout: Layout, single: dict[str, np.ndarray], seed: int, *, new: bool
+) -> Iterator[tuple[str, tuple[str, ...], np.ndarray]]:
+    """Shapes outside the catalogue: name, descriptions that it is, change of the data rows."""
+    if new:
+        yield from new_shapes(layout.whole, single, seed)
+        return
+    for name, column in outside(layout.whole, single):
+        yield name, tuple(sorted(layout.blind.in_sentences[name])), column
 
 
 def grammar(layout: Layout) -> dict[str, np.ndarray]:
@@ -231,12 +247,14 @@ def stored(residual: np.ndarray) -> np.ndarray:
     return steps.astype(np.int16)
 
 
-def generate(folder: Path, seed: int, draws: int, nulls: int, ratios: Sequence[float]) -> dict[str, str]:
+def generate(
+    folder: Path, seed: int, draws: int, nulls: int, ratios: Sequence[float], *, new: bool = False
+) -> dict[str, str]:
     """Write all files; returns their hashes."""
     folder.mkdir(parents=True, exist_ok=True)
     layout = Layout(seed)
     noise = np.random.default_rng([seed, 34])
-    scenes = list(hidden(layout, seed, draws, nulls, ratios))
+    scenes = list(hidden(layout, seed, draws, nulls, ratios, new=new))
     order = np.random.default_rng([seed, 35]).permutation(len(scenes))
     scenes = [scenes[i] for i in order]
     residuals = np.stack([stored(one.rows + layout.noise(noise)) for one in scenes])
@@ -267,10 +285,13 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=5)
     parser.add_argument("--nulls", type=int, default=200)
     parser.add_argument("--ratios", type=float, nargs="+", default=(10.0, 30.0), help="signal to noise")
+    parser.add_argument("--new", action="store_true", help="shapes that made no rule, for ablation.py")
     parser.add_argument("--check", action="store_true", help="fail unless the hashes are the published ones")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    hashes = generate(options.folder, options.seed, options.draws, options.nulls, options.ratios)
+    hashes = generate(
+        options.folder, options.seed, options.draws, options.nulls, options.ratios, new=options.new
+    )
     print(json.dumps(hashes, indent=1))
     if options.check and hashes != json.loads((HERE / "published.json").read_text())["sha256"]:
         raise SystemExit("these are not the published files: other options, versions or processor")

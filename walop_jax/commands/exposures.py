@@ -1,0 +1,76 @@
+"""`walop-jax exposures`: a table of EXPOSURES of an observatory's headers, its log, or an executed schedule."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
+from walop_jax.commands.inputs import PathLike, TableFile
+
+FILES = Argument(
+    "FITS files, a JSON export of a log, a table of words, or a schedule.", "FILE...", list[Path]
+)
+WORDS = Option(
+    "Which word is which column, and what filters are numbered.", "WORDS.toml", Path, required=True
+)
+
+
+@command(writes="file", jax=False)
+def exposures(
+    job: Job,
+    files: Annotated[PathLike | Sequence[PathLike], FILES],
+    *,
+    words: Annotated[PathLike | None, WORDS] = None,
+    output: TableFile = None,
+) -> Outcome[Any]:
+    """Make the table EXPOSURES of a calibration set from what an observatory writes down.
+
+    WORDS.toml says which header word (or key of a log, or column of a table) is which column, in which unit, and what
+    is made of it (walop-jax docs files). Words that are missing, units that do not fit and values that cannot be meant
+    are errors, with file and word. An executed schedule (format v4) needs the numbers of its filters alone.
+
+    In Python: an astropy table; its columns are those of `from_arrays`.
+
+    >>> walop.exposures(["night/0001.fits", "night/0002.fits"], words="words.toml")  # doctest: +SKIP
+    """
+    import json
+
+    from walop_jax.data.header_words import exposures_table, read_words
+    from walop_jax.data.schedule import is_schedule, read_schedule
+    from walop_jax.data.schema import EXPOSURES
+    from walop_jax.io.plain_tables import astropy_table, write_table
+    from walop_jax.io.text import read_text
+
+    if words is None:
+        raise UsageError("give the file that says which word is which column", "words")
+    given = [files] if isinstance(files, str | os.PathLike) else list(files)
+    known = read_words(words)
+    first = Path(given[0])
+    content = None
+    if first.suffix.lower() == ".json" and len(given) == 1:
+        try:
+            content = json.loads(read_text(first))
+        except json.JSONDecodeError:
+            content = None  # an error of the reader below
+    if is_schedule(content):
+        made, names, remarks = read_schedule(first, known.filters)
+        import numpy as np
+
+        columns = {**made.columns(), "TARGET": np.array(names)}
+    else:
+        columns, remarks = exposures_table(given, known)
+    units = {name: "deg" for name in columns if name.endswith(("_ANGLE", "_TURN"))}
+    units |= {name: rule.unit for name, rule in EXPOSURES.items()}
+    table = astropy_table({name: (values, units.get(name, ""), "") for name, values in columns.items()})
+    if output is not None:
+        write_table(output, table, overwrite=job.overwrite)
+    document = {
+        "output": output,
+        "exposures": len(table),
+        "columns": list(table.colnames),
+        "remarks": remarks,
+    }
+    return Outcome(table, document, f"{output}: {len(table)} exposures", warnings=remarks)

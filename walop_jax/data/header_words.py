@@ -1,0 +1,347 @@
+"""Exposures from the words of an observatory: headers of FITS files, exports of a telescope's log, tables of words.
+
+A TOML file says which word is which column of EXPOSURES, in which unit, and what is to be made of it (docs: files): no
+code of an observatory's own. Expressions are arithmetic; nothing else is evaluated.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import json
+import math
+import operator
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from walop_jax.data.records import KINDS
+from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, table_of, table_rules
+from walop_jax.data.table_files import read_table_file
+from walop_jax.data.units import Place, convert_unit
+from walop_jax.io.errors import errors_naming, fail, nearest
+from walop_jax.io.text import parse_toml, read_text
+from walop_jax.io.toml import Reader
+
+WORD: Mapping[str, Any] = {
+    "word": Any, "unit": str, "expression": str, "values": Mapping[str, Any], "value": Any, "optional": bool,
+}  # fmt: skip
+TOP: Mapping[str, Any] = {"extension": int, "rows": str, "filters": Mapping[str, int], "schedule": Any}
+"""Entries of a file of words beside its columns: extension of FITS files, where the rows of a JSON file are, numbers of
+filters and facts of schedules (`data.schedule`)."""
+_SEXAGESIMAL = re.compile(r"[+-]?\d+[: ]\d+[: ]\d+(\.\d*)?")
+_MOVES = re.compile(r"[A-Z][A-Z0-9_]*_(IN|ANGLE|TURN)")
+_OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
+    ast.Pow: operator.pow, ast.Mod: operator.mod, ast.USub: operator.neg, ast.UAdd: operator.pos,
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Word:
+    """Origin of a column: the first of `words` that is there, or a fixed `value`.
+
+    `values` replace what the word says (names of filters, kinds, positions), `unit` is that of the word, `expression`
+    makes the value of the column of x, the value in the unit of the column, and of other columns by name.
+    """
+
+    words: tuple[str, ...]
+    unit: str = ""
+    expression: str = ""
+    values: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    value: Any = None
+    optional: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Words:
+    """The words of an observatory by column of EXPOSURES, and what else its files need (`TOP`)."""
+
+    columns: Mapping[str, Word]
+    extension: int = 0
+    rows: str = ""
+    filters: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    schedule: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def read_words(path: str | os.PathLike[str]) -> Words:
+    """The words in a file. Raises `DataError` for a column that EXPOSURES do not have, and for what no word has."""
+    with errors_naming(path):
+        return words_of(parse_toml(read_text(path)))
+
+
+def words_of(content: Mapping[str, Any]) -> Words:
+    """The words in the tables of a TOML file."""
+    read, columns = Reader(""), {}
+    for name, table in content.items():
+        if name in TOP:
+            continue
+        if name not in EXPOSURES and not _MOVES.fullmatch(name):
+            raise read.fault("", f"EXPOSURES have no column {name!r}; {nearest(name, [*EXPOSURES, *TOP])}")
+        said = read.values(WORD, table, name)
+        words = said.pop("word", ())
+        words = (words,) if isinstance(words, str) else tuple(words)
+        if bool(words) == ("value" in said) or not all(isinstance(word, str) for word in words):
+            raise read.fault(
+                name, 'needs word = "…", a list of words of which the first is taken, or value = …'
+            )
+        if said.get("expression"):
+            names = _names(said["expression"], read, name)
+            if odd := names - {"x", *content}:
+                raise read.fault(
+                    name, f"expression: there is no {sorted(odd)[0]!r}; {nearest(sorted(odd)[0], content)}"
+                )
+        columns[name] = Word(words, **said)
+    top = read.values(TOP, {key: value for key, value in content.items() if key in TOP}, "")
+    return Words(columns, **top)
+
+
+def exposures_table(
+    paths: Sequence[str | os.PathLike[str]], words: Words
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns of EXPOSURES, one row for each exposure in the files, their names in FILE; and remarks.
+
+    Raises `DataError`, with file, word and column, for words that are missing, have another unit, or a value that
+    cannot be meant.
+    """
+    records = [(str(path), record) for path in map(Path, paths) for record in _records(path, words)]
+    if not records:
+        raise fail("no exposures in these files", advice="name FITS files, a JSON file or a table")
+    rows = [_row(record, words, file) for file, record in records]
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    if "KIND" not in names:
+        raise Place(records[0][0], "").fail(
+            "nothing says what was observed", "KIND", "add [KIND] to the words"
+        )
+    place = Place(", ".join(dict.fromkeys(file for file, _ in records)), "EXPOSURES")
+    given = {name: _column([row.get(name) for row in rows], name) for name in names}
+    given.setdefault("EXPOSURE", np.arange(len(rows)))
+    rules = table_rules("EXPOSURES", list(given), place)
+    made = table_of(given, rules, place)
+    made["KIND"] = np.char.lower(made["KIND"])
+    for kind in np.unique(made["KIND"]).tolist():
+        if kind not in KINDS:
+            place.refuse(
+                made["KIND"] == kind,
+                f"{kind!r} is not a kind,",
+                "KIND",
+                f"say it in values; {nearest(kind, KINDS)}",
+            )
+    check(made, {name: rule for name, rule in rules.items() if name in made}, place)
+    absent = [name for name in EXPOSURES if name not in given and not _MOVES.fullmatch(name)]
+    remarks = [f"no word for {', '.join(absent)}: taken as not known"] if absent else []
+    return made | {"FILE": np.array([file for file, _ in records])}, remarks
+
+
+# ------------------------------------------------------------------------------------------------ files and records
+
+
+def _records(path: Path, words: Words) -> Iterator[Mapping[str, Any]]:
+    """The words of every exposure in a file: one of a FITS file, one for each record or row of others."""
+    suffix = path.suffix.lower()
+    if suffix in (".json", ".jsonl"):
+        yield from _of_json(path, words.rows)
+    elif suffix in (".fits", ".fit", ".fts", ".gz", ".fz"):
+        from astropy.io import fits
+
+        try:
+            header: Any = fits.getheader(path, words.extension)
+        except (OSError, IndexError, KeyError) as error:
+            raise fail(
+                f"has no header to read: {error}", file=path, advice="check the name and `extension`"
+            ) from error
+        yield {key: header[key] for key in dict.fromkeys(header) if key}
+    else:
+        _, table, _ = read_table_file(path, ())
+        for row in table:
+            yield {name: _unmasked(row[name]) for name in table.colnames}
+
+
+def _of_json(path: Path, rows: str) -> Iterator[Mapping[str, Any]]:
+    text = read_text(path)
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError as error:
+        try:
+            content = [json.loads(line) for line in text.splitlines() if line.strip()]
+        except json.JSONDecodeError:
+            raise fail(f"is no JSON: {error}", file=path, advice="export the log again") from None
+    for key in filter(None, rows.split(".")):
+        if not isinstance(content, Mapping) or key not in content:
+            known = list(content) if isinstance(content, Mapping) else []
+            raise fail(
+                f"rows = {rows!r}: there is no {key!r}",
+                file=path,
+                advice=nearest(key, known) if known else "",
+            )
+        content = content[key]
+    if not isinstance(content, list) or not all(isinstance(one, Mapping) for one in content):
+        raise fail("holds no list of records", file=path, advice='say where it is: rows = "data.exposures"')
+    yield from content
+
+
+def _unmasked(value: Any) -> Any:
+    return None if np.ma.is_masked(value) else value.item() if hasattr(value, "item") else value
+
+
+def _found(record: Mapping[str, Any], word: str) -> Any:
+    """The value of a word, a path of words in nested records ("hwp.angle"); None where it is not there or empty."""
+    value: Any = record
+    if word in record:
+        value = record[word]
+    else:
+        for key in word.split("."):
+            value = value.get(key) if isinstance(value, Mapping) else None
+    if isinstance(value, Mapping) and len(value) == 1 and (key := next(iter(value))).startswith("$"):
+        value = value[key]  # of a document database: {"$date": …}
+    return None if isinstance(value, str) and value.strip().lower() in MISSING else value
+
+
+# --------------------------------------------------------------------------------------------------- values of words
+
+
+def _row(record: Mapping[str, Any], words: Words, file: str) -> dict[str, Any]:
+    """The columns of one exposure."""
+    place, row, made = Place(file, ""), {}, dict[str, Any]()
+    rules = table_rules("EXPOSURES", list(words.columns), place)
+    for name, word in words.columns.items():
+        value = (
+            word.value
+            if not word.words
+            else next((v for w in word.words if (v := _found(record, w)) is not None), None)
+        )
+        if value is None:
+            if word.optional:
+                continue
+            listed = " or ".join(word.words)
+            like = nearest(word.words[0], record) if record else ""
+            raise place.fail(
+                f"the word {listed} is missing", name, f"{like}; optional = true where it may be absent"
+            )
+        made[name] = _value(value, name, rules[name], word, place)
+    for name, value in made.items():
+        expression = words.columns[name].expression
+        row[name] = value if not expression else _evaluated(expression, {**made, "x": value}, name, place)
+    return row
+
+
+def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any:
+    """A value in the unit and of the kind of its column."""
+    if word.values:
+        keys = {key.upper(): one for key, one in word.values.items()}
+        text = _text(value).upper()
+        if text not in keys:
+            raise place.fail(f"{word.words[0]} = {value!r} is none of its values", name, nearest(text, keys))
+        value = keys[text]
+    what = f"{' or '.join(word.words) or 'value'} = {value!r}"
+    if rule.kind == "str":
+        return _text(value)
+    if rule.kind == "bool":
+        known = {
+            "T": True,
+            "TRUE": True,
+            "1": True,
+            "IN": True,
+            "F": False,
+            "FALSE": False,
+            "0": False,
+            "OUT": False,
+        }
+        if _text(value).upper() not in known:
+            raise place.fail(
+                f"{what} is neither true nor false", name, 'say what it means: values = { "…" = true }'
+            )
+        return known[_text(value).upper()]
+    number = _number(value, name, rule, word, place, what)
+    if rule.kind == "int":
+        if number != round(number):
+            raise place.fail(f"{what} is not a whole number", name, "give an expression, or another word")
+        return int(number)
+    return number
+
+
+def _number(value: Any, name: str, rule: Column, word: Word, place: Place, what: str) -> float:
+    if isinstance(value, str) and rule.unit == "d" and not _is_number(value):
+        from astropy.time import Time
+
+        try:
+            days: Any = Time(value.strip().rstrip("Z"), scale="utc").mjd
+            return float(days)
+        except ValueError:
+            raise place.fail(
+                f"{what} is no date", name, "as 2026-11-26T01:02:03, or a number of days"
+            ) from None
+    if isinstance(value, str) and rule.unit in ("deg", "h") and _SEXAGESIMAL.fullmatch(value.strip()):
+        head, *parts = re.split("[: ]", value.strip())
+        sign = -1.0 if head.startswith("-") else 1.0
+        number = sign * (abs(float(head)) + float(parts[0]) / 60.0 + float(parts[1]) / 3600.0)
+        if not word.unit:
+            raise place.fail(
+                f"{what} may be hours or degrees", name, 'say unit = "hourangle" or unit = "deg"'
+            )
+    elif isinstance(value, bool) or not _is_number(value):
+        raise place.fail(f"{what} is not a number", name, "give another word, or values = { … }")
+    else:
+        number = float(value)
+    if not word.unit:
+        return number
+    return float(convert_unit(np.array([number]), word.unit, rule.unit, name, place)[0])
+
+
+def _text(value: Any) -> str:
+    return str(int(value)) if isinstance(value, float) and value == int(value) else str(value).strip()
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        return math.isfinite(float(value))
+    except (TypeError, ValueError):
+        return False
+
+
+def _column(values: Sequence[Any], name: str) -> np.ndarray:
+    """The values of all exposures; what some lack is what an absent column would hold."""
+    rule = EXPOSURES.get(name)
+    missing = (
+        False if name.endswith("_IN") else 0.0 if name.endswith("_TURN") else rule.missing if rule else np.nan
+    )
+    return np.array([missing if value is None else value for value in values])
+
+
+def _names(expression: str, read: Reader, name: str) -> set[str]:
+    try:
+        tree = ast.parse(expression, mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        raise read.fault(name, f"expression = {expression!r} cannot be read: as in x + 90") from None
+    allowed = (ast.BinOp, ast.UnaryOp, ast.Constant, ast.Name, ast.Load, *_OPERATORS)
+    for node in ast.walk(tree):
+        number = not isinstance(node, ast.Constant) or type(node.value) in (int, float)
+        if not isinstance(node, allowed) or not number:
+            raise read.fault(
+                name, f"expression = {expression!r} may hold numbers, columns, + - * / % ** and ( ) only"
+            )
+    return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+
+
+def _evaluated(expression: str, values: Mapping[str, Any], name: str, place: Place) -> float:
+    def of(node: Any) -> float:
+        if isinstance(node, ast.Constant):
+            return float(node.value)  # pyright: ignore[reportArgumentType]: `_names` lets numbers pass alone
+        if isinstance(node, ast.Name):
+            if not isinstance(values.get(node.id), int | float):
+                raise place.fail(f"{expression!r} needs {node.id}, which is not known", name, "give its word")
+            return float(values[node.id])
+        parts = (node.operand,) if isinstance(node, ast.UnaryOp) else (node.left, node.right)
+        return _OPERATORS[type(node.op)](*map(of, parts))
+
+    try:
+        found = of(ast.parse(expression, mode="eval").body)
+    except (ZeroDivisionError, OverflowError) as error:
+        raise place.fail(f"{expression!r}: {error}", name, "correct the expression") from None
+    if isinstance(found, complex) or not np.isfinite(found):
+        raise place.fail(f"{expression!r} is not finite", name, "correct the expression")
+    return found

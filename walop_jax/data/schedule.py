@@ -1,0 +1,297 @@
+"""Schedules of the survey's telescope control (format v4, JSON): written for exposures, and read back as exposures.
+
+A schedule has targets, a target has acquisitions: a window, a number of the filter, the half-wave plate, the polariser,
+and so many exposures of whole seconds. Times of a window are local, those after midnight of the next day.
+
+Source      skiehl/pasiphae-survey-planner, info/schedule_json_format (fields, ranges, types of targets)
+"""
+
+from __future__ import annotations
+
+import datetime
+import itertools
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, Exposures, Position, Site, Sources
+from walop_jax.io.errors import fail
+from walop_jax.io.text import read_text
+
+TYPES: Mapping[str, str] = {"clp": "CAL-CAL", "lamp": "CAL-CAL", "moon": "CAL-MOO"}
+"""Types of targets by KIND; of standards CAL-POL or CAL-UPO."""
+KINDS_OF: Mapping[str, str] = {
+    "CAL-CAL": "clp",
+    "CAL-MOO": "moon",
+    "CAL-POL": "standard",
+    "CAL-UPO": "standard",
+}
+FASTEST = 3.0  # turns per minute
+MOST_FILTERS = 4
+SLACK = 30.0  # minutes that a window is longer than its exposures, on both sides
+ALIKE = 180.0  # deg after which a wave plate is the same again
+UNPOLARISED = 0.005
+ELEMENTS = {CALIBRATION_PLATE: "hwp", POLARISER: "polarizer"}
+
+
+def is_schedule(content: Any) -> bool:
+    """True for the content of a schedule."""
+    return isinstance(content, Mapping) and "targets" in content and "objects" in content
+
+
+def schedule_of(
+    exposures: Exposures,
+    site: Site,
+    filters: Mapping[str, int],
+    *,
+    facts: Mapping[str, str] | None = None,
+    names: Sequence[str] | None = None,
+    sources: Sources | None = None,
+) -> tuple[dict[str, Any], list[str]]:
+    """The schedule of exposures in their order, and remarks; `names` are those of their targets.
+
+    `facts` are name, pi, observer, mode. Raises `DataError` for what a schedule cannot state: more than four filters,
+    other moving elements, a turn that is not one of half turns or faster than three turns a minute.
+    """
+    facts, remarks = dict(facts or {}), list[str]()
+    _check(exposures, filters)
+    unpolarised = set() if sources is None else {
+        str(n) for n, q, u in zip(sources.name, sources.q, sources.u, strict=True) if math.hypot(q, u) < UNPOLARISED
+    }  # fmt: skip
+    rows = [_acquired(exposures[e : e + 1], filters) for e in range(len(exposures))]
+    rounded = [float(t) for t in exposures.exptime if t != round(t) or t < 1]
+    if rounded:
+        remarks.append(f"{len(rounded)} exposure times are no whole seconds ({rounded[0]:g} s): rounded")
+    label = [names[e] if names is not None else _target(exposures[e : e + 1]) for e in range(len(exposures))]
+    kinds = [
+        "CAL-UPO" if label[e] in unpolarised else _type(exposures[e : e + 1]) for e in range(len(exposures))
+    ]
+    night = _window(exposures.mjd, exposures.exptime, site)
+    targets, objects = [], dict[str, dict[str, str]]()
+    for (target, kind), group in itertools.groupby(range(len(rows)), lambda e: (label[e], kinds[e])):
+        acquisitions = []
+        for _, same in itertools.groupby(group, lambda e: json.dumps(rows[e], sort_keys=True)):
+            which = list(same)
+            of_sky = kind != "CAL-CAL"
+            window = _window(exposures.mjd[which], exposures.exptime[which], site) if of_sky else night
+            setting = dict(rows[which[0]])
+            exposure = {"multiples": len(which), "T": setting.pop("seconds")}
+            acquisitions.append({"window": window, "guider": False, **setting, "exposure": exposure})
+            ra, dec = float(exposures.ra[which[0]]), float(exposures.dec[which[0]])
+            if math.isfinite(ra) and math.isfinite(dec):
+                objects.setdefault(
+                    target, {"name": target, "ra": _sexagesimal(ra / 15.0, 24), "dec": _signed(dec)}
+                )
+        targets.append({"target": target, "type": kind, "acquisition": acquisitions})
+    mjd = exposures.mjd[np.isfinite(exposures.mjd)]
+    evening = _local(float(mjd.min()) if mjd.size else 51544.0, site) - datetime.timedelta(hours=12)
+    made = {
+        "name": facts.get("name", "calibration"),
+        "date": evening.date().isoformat(),
+        "pi": facts.get("pi", "walop-jax"),
+        "mode": facts.get("mode", "manual"),
+        "observer": facts.get("observer", "walop-jax"),
+        "objects": list(objects.values()),
+        "targets": targets,
+    }
+    return made, remarks
+
+
+def read_schedule(
+    path: str | os.PathLike[str], filters: Mapping[str, int]
+) -> tuple[Exposures, tuple[str, ...], list[str]]:
+    """The exposures of a schedule, the names of their targets, and remarks.
+
+    An acquisition that was executed may hold `executed`, the UTC at which each exposure began. Without it times are not
+    known. Raises `DataError`, with target and acquisition, for what is missing or cannot be stated of an exposure.
+    """
+    try:
+        content = json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise fail(f"is no JSON: {error}", file=path, advice="write it again") from None
+    if not is_schedule(content):
+        raise fail("is no schedule: it has no objects and targets", file=path, advice="give one of format v4")
+    where = {str(one.get("name")): one for one in content["objects"]}
+    name_of = {number: name for name, number in filters.items()}
+    rows, remarks = list(_read(content, where, name_of, path)), list[str]()
+    if not rows:
+        raise fail("has no exposures", file=path, advice="nothing to be read")
+    if unknown := sum(not math.isfinite(row["mjd"]) for row in rows):
+        remarks.append(f"{path}: {unknown} exposures without `executed`: their time is not known")
+    columns = {
+        name: np.array([row[name] for row in rows]) for name in rows[0] if name not in ("positions", "target")
+    }
+    nothing = np.full(len(rows), np.nan)
+    places = {}
+    for prefix in ELEMENTS:
+        inside, angle, turn = (
+            np.array(part) for part in zip(*(row["positions"][prefix] for row in rows), strict=True)
+        )
+        places[prefix] = Position(inside.astype(bool), angle.astype(float), turn.astype(float))
+    exposures = Exposures(
+        exposure=np.arange(len(rows)), **columns, temp=nothing, ha=nothing, rotator=nothing, teff=nothing,
+        positions=places,
+    )  # fmt: skip
+    return exposures, tuple(row["target"] for row in rows), remarks
+
+
+# --------------------------------------------------------------------------------------------------------- writing
+
+
+def _check(exposures: Exposures, filters: Mapping[str, int]) -> None:
+    for name in np.unique(exposures.filter).tolist():
+        number = filters.get(name)
+        if number is None or not 1 <= number <= MOST_FILTERS:
+            what = f"filter {name} has no number from 1 to {MOST_FILTERS}"
+            raise fail(what, column="FILTER", advice=f'give it: filters = {{ "{name}" = 1 }} in the words')
+    if numbers := [n for n in filters.values() if list(filters.values()).count(n) > 1]:
+        raise fail(
+            f"two filters have the number {numbers[0]}",
+            column="FILTER",
+            advice="correct filters of the words",
+        )
+    if inside := [prefix for prefix, at in exposures.further.items() if at.inside.any()]:
+        raise fail(
+            f"a schedule cannot set {inside[0]}", column=f"{inside[0]}_ANGLE", advice="take these by hand"
+        )
+    if not np.isfinite(exposures.exptime).all():
+        raise fail("is not known", column="EXPTIME", advice="a schedule needs the time of every exposure")
+
+
+def _acquired(one: Exposures, filters: Mapping[str, int]) -> dict[str, Any]:
+    seconds = max(round(float(one.exptime[0])), 1)
+    states = {word: _state(one.positions[prefix], seconds, prefix) for prefix, word in ELEMENTS.items()}
+    return {"filter": filters[str(one.filter[0])], **states, "seconds": seconds}
+
+
+def _state(at: Position, seconds: int, prefix: str) -> dict[str, Any]:
+    """Setting of an element in a single exposure."""
+    if not at.inside[0]:
+        return {"engage": False, "continuous": False}
+    turn = float(at.turn[0])
+    if not turn:
+        return {"engage": True, "continuous": False, "angle": float(at.angle[0]) % 360.0}
+    speed = turn / 6.0 / seconds
+    if speed > FASTEST * (1.0 + 1e-9):
+        what = f"{turn:g} deg in {seconds} s is {speed:.2g} turns a minute, more than {FASTEST:g}"
+        raise fail(what, column=f"{prefix}_TURN", advice="turn it less, or expose longer")
+    _check_half_turns(turn, prefix)
+    return {"engage": True, "continuous": True, "speed": speed}
+
+
+def _check_half_turns(turn: float, prefix: str, file: object = "") -> None:
+    if abs(turn / ALIKE - round(turn / ALIKE)) > 1e-6:
+        what = f"a turn of {turn:g} deg is none of half turns: the angle at which it began counts, and is not stated"
+        advice = f"choose speed and time so that 6 × speed × T is a multiple of {ALIKE:g} deg, or take it from the log"
+        raise fail(what, file=file, column=f"{prefix}_TURN", advice=advice)
+
+
+def _target(one: Exposures) -> str:
+    return {"clp": "calibration polariser", "moon": "Moon"}.get(str(one.kind[0]), str(one.kind[0]))
+
+
+def _type(one: Exposures) -> str:
+    kind = str(one.kind[0])
+    return "CAL-CAL" if one.clp_in[0] else TYPES.get(kind, "CAL-POL" if kind == "standard" else "LAB-OPT")
+
+
+def _local(mjd: float, site: Site) -> datetime.datetime:
+    """Local mean time, in whole hours from UTC."""
+    hours = round(site.longitude / 15.0) if math.isfinite(site.longitude) else 0
+    return datetime.datetime(1858, 11, 17) + datetime.timedelta(days=mjd, hours=hours)
+
+
+def _window(mjd: np.ndarray, exptime: np.ndarray, site: Site) -> dict[str, str]:
+    """A window about exposures; the whole night where their times are not known."""
+    known = np.isfinite(mjd)
+    if not known.any():
+        return {"start": "18:00:00", "end": "06:00:00"}
+    half = np.nan_to_num(exptime[known]) / 2.0 / 86400.0
+    edges = (mjd[known] - half).min() - SLACK / 1440.0, (mjd[known] + half).max() + SLACK / 1440.0
+    return dict(zip(("start", "end"), (f"{_local(float(t), site):%H:%M:%S}" for t in edges), strict=True))
+
+
+def _sexagesimal(value: float, most: int) -> str:
+    hundredths = round(value * 360000.0) % (most * 360000)
+    rest, fraction = divmod(hundredths, 100)
+    return f"{rest // 3600:02d}:{rest // 60 % 60:02d}:{rest % 60:02d}.{fraction:02d}"
+
+
+def _signed(value: float) -> str:
+    return ("-" if value < 0 else "+") + _sexagesimal(abs(value), 91)
+
+
+# --------------------------------------------------------------------------------------------------------- reading
+
+
+def _read(
+    content: Mapping[str, Any], where: Mapping[str, Any], name_of: Mapping[int, str], path: Any
+) -> Iterator[dict[str, Any]]:
+    for target in content["targets"]:
+        for number, one in enumerate(target.get("acquisition", [])):
+            name = str(target.get("target"))
+            place = f"{path}: target {name}, acquisition {number}"
+            try:
+                count, seconds = one["exposure"]["multiples"], one["exposure"]["T"]
+                number_of_filter, plate, polariser = one["filter"], one["hwp"], one["polarizer"]
+            except (KeyError, TypeError) as error:
+                raise fail(f"has no {error}", file=place, advice="see the format v4") from None
+            if number_of_filter not in name_of:
+                advice = f'give its name: filters = {{ "SDSS-r" = {number_of_filter} }} in the words'
+                raise fail(f"filter {number_of_filter} has no name", file=place, advice=advice)
+            began = one.get("executed", [])
+            if began and len(began) != count:
+                raise fail(f"has {len(began)} times of {count} exposures", file=place, advice="one for each")
+            kind = "clp" if polariser["engage"] else KINDS_OF.get(str(target.get("type")), "lamp")
+            there = where.get(name, {})
+            positions = {CALIBRATION_PLATE: plate, POLARISER: polariser}
+            for k in range(count):
+                yield {
+                    "target": name,
+                    "kind": "lamp" if kind == "clp" and not polariser["engage"] else kind,
+                    "mjd": _mjd(began[k], place) + seconds / 2 / 86400.0 if began else math.nan,
+                    "exptime": float(seconds),
+                    "filter": name_of[number_of_filter],
+                    "ra": 15.0 * _degrees(there.get("ra")),
+                    "dec": _degrees(there.get("dec")),
+                    "positions": {p: _position(state, p, seconds, place) for p, state in positions.items()},
+                }
+
+
+def _position(state: Mapping[str, Any], prefix: str, seconds: float, place: str) -> tuple[bool, float, float]:
+    if not state["engage"]:
+        return False, math.nan, 0.0
+    if not state.get("continuous"):
+        if "angle" not in state:
+            raise fail("is in the beam without an angle", file=place, column=prefix, advice="give it")
+        return True, float(state["angle"]), 0.0
+    turn = 6.0 * float(state.get("speed", 0.0)) * seconds
+    if prefix == POLARISER:
+        raise fail(
+            "turns during the exposure",
+            file=place,
+            column=prefix,
+            advice="leave it out, or take it at angles",
+        )
+    _check_half_turns(turn, prefix, place)
+    return True, 0.0, turn
+
+
+def _mjd(text: Any, place: str) -> float:
+    try:
+        began = datetime.datetime.fromisoformat(str(text).replace("Z", "+00:00"))
+    except ValueError:
+        raise fail(f"executed: {text!r} is no time", file=place, advice="as 2026-11-26T01:02:03Z") from None
+    began = began.astimezone(datetime.UTC).replace(tzinfo=None) if began.tzinfo else began
+    return (began - datetime.datetime(1858, 11, 17)) / datetime.timedelta(days=1)
+
+
+def _degrees(text: Any) -> float:
+    if text is None:
+        return math.nan
+    parts = [float(part) for part in str(text).strip("+-").split(":")]
+    return (-1.0 if str(text).startswith("-") else 1.0) * sum(p / 60.0**k for k, p in enumerate(parts))
