@@ -135,7 +135,7 @@ def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, 
     standards = standards_of(sources, plan.exposures(), plan.curves())
     lmax = np.asarray(standards.lmax).copy()
     if plan.star_lmax:
-        polarised = np.append(np.arange(n) - plan.unpolarised, [-1] * (len(names) - n))
+        polarised = np.append(np.arange(n) - plan.unpolarised, np.full(len(names) - n, -1))
         lmax = np.where(
             polarised < 0, lmax, np.resize(plan.star_lmax, polarised.max(initial=0) + 1)[polarised]
         )
