@@ -64,8 +64,8 @@ def folder(tmp_path_factory) -> Path:
     return path
 
 
-def test_there_are_ten_of_at_most_six_lines():
-    assert len(SCRIPTS) == 10
+def test_each_has_at_most_six_lines():
+    assert len(SCRIPTS) >= 10
     for title, script in SCRIPTS.items():
         lines = [line for line in script.splitlines() if line.strip()]
         assert 0 < len(lines) <= MOST_LINES, title

@@ -13,7 +13,6 @@ from small_run import SEED, SMALL, small_fit
 from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.detection_limits import (
-    PROBABILITY,
     DetectionLimits,
     detection_limits,
 )
@@ -76,7 +75,7 @@ def test_the_alarm_is_raised_with_the_stated_probability(found, examination):
         whole = limit.detected[0] * space.gram[:, places[probe.name].start]
         at_limit, below = (alarms(space, noise - share * whole, threshold) for share in (1.0, 0.9))
         # Other candidates raise the alarm as well, so that it is rather more probable than the effect alone makes it.
-        assert at_limit > PROBABILITY - 4 * np.sqrt(0.01 * 0.99 / draws), probe.name
+        assert at_limit > thresholds.PROBABILITY - 4 * np.sqrt(0.01 * 0.99 / draws), probe.name
         assert below < 0.985, probe.name
         checked += 1
     assert checked >= 3

@@ -67,7 +67,10 @@ def test_rows_of_one_star():
     """One number for a star with values in several bands; what contradicts itself names column and row."""
     table = sources()
     assert table.stars.tolist() == [0, 0, 2]
-    assert sources(FILTER=["", "", ""], SOURCE=[1, 2, 3]).columns().keys() == SOURCES.keys() - {"FILTER"}
+    assert sources(FILTER=["", "", ""], SOURCE=[1, 2, 3]).columns().keys() == SOURCES.keys() - {
+        "FILTER",
+        "SCATTER",
+    }
     for changes, what in (
         ({"FILTER": ["V", "V", "V"]}, "already"),
         ({"FILTER": ["V", "", "V"]}, "not unique"),

@@ -33,7 +33,6 @@ from walop_jax.calibration.accuracy import change_of_qu  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
 from walop_jax.diagnosis import grammar, thresholds  # noqa: E402
 from walop_jax.diagnosis.detection_limits import (  # noqa: E402
-    PROBABILITY,
     _columns,
     detection_limits,
 )
@@ -64,10 +63,10 @@ def one_shape_each(examination: Examination) -> Iterator[Probe]:
 
 
 def amplitude_at(rate: Callable[[float], float], predicted: float) -> float:
-    """The amplitude with a rate of `PROBABILITY`, over the predicted one: probits of the tried ones, interpolated."""
+    """The amplitude with a rate of `thresholds.PROBABILITY`, over the predicted one: interpolated probits."""
     rates = np.clip([rate(share * predicted) for share in TRIED], 1e-4, 1 - 1e-4)
     slope, level = np.polyfit(TRIED, stats.norm.ppf(rates), 1)
-    return float((stats.norm.ppf(PROBABILITY) - level) / slope)
+    return float((stats.norm.ppf(thresholds.PROBABILITY) - level) / slope)
 
 
 def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, float]]:

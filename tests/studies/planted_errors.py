@@ -127,7 +127,7 @@ ERRORS = (
             "start[place] += one_wave", "fit/test_search.py"),
     planted("fit/robust.py", "count / (count - 1) * gradients.T", "(count - 1) / count * gradients.T",
             "fit/test_robust.py"),
-    planted("fit/robust.py", "root[:, known] @ axis", "root[:, known] @ axis.T", "fit/test_robust.py"),
+    planted("fit/robust.py", "root[:, significant] @ axis", "root[:, significant] @ axis.T", "fit/test_robust.py"),
     # calibration
     planted("calibration/calibration.py", "0.5 * (result.covariance + result.covariance.T)",
             "0.25 * (result.covariance + result.covariance.T)", "calibration/test_calibration.py"),
@@ -162,7 +162,7 @@ ERRORS = (
             "jacobian.shape[0] - jacobian.shape[1]", "diagnosis/test_score.py"),
     planted("diagnosis/score.py", "- np.log1p(value)", "+ np.log1p(value)", "diagnosis/test_score.py"),
     planted("diagnosis/score.py", "t * s**2", "s**2", "diagnosis/test_score.py"),
-    planted("diagnosis/examination.py", "missing - 2.0 * np.sqrt", "missing + 2.0 * np.sqrt",
+    planted("diagnosis/search.py", "missing - 2.0 * np.sqrt", "missing + 2.0 * np.sqrt",
             "diagnosis/test_judging.py"),
     planted("diagnosis/exact.py", "information - np.diag(width**-2.0)", "information", "diagnosis/test_judging.py"),
     planted("diagnosis/trust.py", "2.0 * min(above, 1.0 - above)", "min(above, 1.0)", "diagnosis/test_trust.py"),

@@ -61,7 +61,7 @@ def simulate(
     stars: Annotated[int | None, STARS] = None,
     noiseless: bool = False,
     catalogue_seed: int | None = None,
-) -> Outcome[Any]:
+) -> Outcome[Simulated]:
     """Make a calibration set of an instrument whose as-built values are drawn from their priors.
 
     The light path is the one that a fit uses; noise is that of photons and of the detectors (30 electrons). What is

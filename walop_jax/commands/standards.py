@@ -73,7 +73,7 @@ def _plain(value: Any) -> Any:
 
 def _lines(table: Any) -> str:
     """The table for a terminal: per cent and degrees."""
-    shown = table["NAME", "RA", "DEC", "FILTER", "P", "P_ERR", "ANGLE", "SCATTER"].copy()
+    shown = table["NAME", "RA", "DEC", "FILTER", "P", "P_ERR", "ANGLE", "ANGLE_SCATTER"].copy()
     for name in ("P", "P_ERR"):
         shown[name] = 100.0 * shown[name]
         shown[name].info.format = ".3f"

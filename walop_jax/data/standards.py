@@ -1,6 +1,6 @@
 """Standard stars that come with the package: a dated table of published values, and what SOURCES needs of them.
 
-Equation    Q + iU = P exp(2i ANGLE); along it the error is P_ERR, across it 2 P √(ANGLE_ERR² + SCATTER²)
+Equation    Q + iU = P exp(2i ANGLE); along it the error is P_ERR, across it 2 P √(ANGLE_ERR² + ANGLE_SCATTER²)
 Limits      Of stars that are polarised by less than three errors the angle is not known: both errors are P_ERR. Where
             no angle is stated Q = U = 0, with the error √((P² + P_ERR²)/2).
             Stars that nobody has monitored are taken to vary by `USUAL_SCATTER`.
@@ -33,7 +33,7 @@ def shipped_standards() -> Any:
     degree, error = (np.asarray(table[name], float) for name in ("P", "P_ERR"))
     angle, stated, scatter = (
         np.deg2rad(np.asarray(table[name].to_value("deg"), float))
-        for name in ("ANGLE", "ANGLE_ERR", "SCATTER")
+        for name in ("ANGLE", "ANGLE_ERR", "ANGLE_SCATTER")
     )
     scatter = np.where(np.isfinite(scatter), scatter, np.deg2rad(USUAL_SCATTER))
     across = 2.0 * degree * np.hypot(np.nan_to_num(stated), scatter)
