@@ -66,6 +66,16 @@ class Affected(Displayed):
         """The catalogues that must be made again, each once."""
         return tuple(dict.fromkeys(night.catalogue for night in self.nights if night.again))
 
+    def _reason(self, night: NightShift) -> str:
+        """Why a night must be made again, in a few words; empty where it need not."""
+        if not night.again:
+            return ""
+        if night.most > self.limit:
+            return "again: shifted"
+        if night.lost or night.gained:
+            return f"again: {night.lost} results lost, {night.gained} gained"
+        return "again: one calibration is trusted, the other is not"
+
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
         return {
@@ -86,7 +96,7 @@ class Affected(Displayed):
                 f"{night.stars}",
                 *map(two_digits, (night.median, night.most, night.largest)),
                 *(f"{100 * one:+.4f} %" for one in (night.q, night.u)),
-                "again" if night.again else "",
+                self._reason(night),
             )
             for night in self.nights
         )
