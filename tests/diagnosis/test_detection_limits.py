@@ -17,7 +17,7 @@ from walop_jax.diagnosis.detection_limits import (
     detection_limits,
 )
 from walop_jax.diagnosis.examination import Examination, examine
-from walop_jax.diagnosis.hypotheses import probes
+from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.score import effective_trials, local_p
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.model.effects import effect_by_name
@@ -48,8 +48,11 @@ def found(fitted) -> DetectionLimits:
 
 @pytest.fixture(scope="module")
 def examination(fitted) -> Examination:
-    context = effect_context(fitted.model.template, fitted.calset.exposures)
-    return examine(fitted, list(probes(CATALOGUE, context)), np.random.default_rng(1))
+    calset = fitted.calset
+    asked = hypotheses(CATALOGUE, fitted.model.template, calset.exposures, len(calset.points))
+    return examine(
+        fitted, asked.names, np.random.default_rng(1), sentences=asked.sentences, parts=asked.parts
+    )
 
 
 def test_every_effect_has_a_limit_or_is_named_as_beyond_these_data(found):

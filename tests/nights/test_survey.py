@@ -259,7 +259,7 @@ def test_bad_input(quiet, single):
     free = next(p.name for p in one.parameters if p.prior is None and p.loose is None)
     with pytest.raises(DataError, match=r"says nothing of .*, which has a value of its own there"):
         stack([one, deaf, three], {free: {"per": "night"}})
-    scattered = dataclasses.replace(single, errors_from="residuals")
+    scattered = dataclasses.replace(single, errors_from="residuals").judged()
     with pytest.raises(DataError, match="do not explain its scatter"):
         stack([scattered])
     # The file to leave out is named, not what was typed into it.

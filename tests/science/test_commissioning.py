@@ -86,7 +86,7 @@ def test_the_strip_without_u_is_left_out_and_said():
     assert found.reached == pytest.approx(np.quantile(FIELD[with_u], 0.95))
     assert found.reached < 5e-4
     said = certificate(small_fit(), found).display().text()
-    assert "in 95 % of the field where one exposure measures u (80 % of it)" in said
+    assert "in 95 % of the field with u in one exposure (80 %)" in said
     assert np.quantile(error, 0.95) == pytest.approx(1e-2)
 
 

@@ -12,7 +12,7 @@ from walop_jax.commands.inputs import Effects, PathLike, calibration_of
 from walop_jax.io.display import Display
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Run
+    from walop_jax import Calibration, Diagnosis, FitResult, Run
 
 RUNS = Argument("Runs or calibrations, one for each night.", "RUN...", list[Path])
 TABLE = Option(
@@ -26,7 +26,7 @@ SHOWN = ("CHI2DOF", "ANGLE", "P_RATIO", "ZERO_Q", "ZERO_U", "ACCURACY")
 @command(stages=("reading", "writing"))
 def quality(
     job: Job,
-    runs: Annotated[Calibration | FitResult | Run | PathLike | Sequence[Any], RUNS],
+    runs: Annotated[Calibration | FitResult | Diagnosis | Run | PathLike | Sequence[Any], RUNS],
     *,
     output: Annotated[PathLike | None, TABLE] = None,
     limits: Annotated[PathLike | None, LIMITS] = None,

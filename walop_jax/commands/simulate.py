@@ -22,7 +22,7 @@ from walop_jax.commands.inputs import (
 from walop_jax.io.text import date_of, json_text, parse_toml, read_text, rounded
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, Effect, FitResult, ObservingPlan, Run
+    from walop_jax import Calibration, Diagnosis, Effect, FitResult, ObservingPlan, Run
     from walop_jax.model.effects import EffectKind
     from walop_jax.simulation.simulate import Simulated
     from walop_jax.simulation.truth import Template
@@ -55,7 +55,7 @@ def simulate(
     instrument: InstrumentLike = None,
     effect: Annotated[str | Sequence[str | Effect] | Mapping[str, Any] | None, EFFECT] = None,
     effects: Effects = None,
-    like: Annotated[Simulated | FitResult | Calibration | Run | PathLike | None, LIKE] = None,
+    like: Annotated[Simulated | FitResult | Diagnosis | Calibration | Run | PathLike | None, LIKE] = None,
     night: Annotated[int | None, NIGHT] = None,
     truth: Annotated[PathLike | None, Option("Write the true parameters here.", "FILE.json", Path)] = None,
     stars: Annotated[int | None, STARS] = None,

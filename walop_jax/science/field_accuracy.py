@@ -98,9 +98,7 @@ class FieldAccuracy:
                 )
         if self.reached > most:
             if self.without_u > 1.0 - SHARE and self.median <= most:
-                advice = (
-                    "observe the stars beside the strip without u with the calibration plate at 22.5° as well"
-                )
+                advice = "observe stars near the strip without u with the plate at 22.5° as well"
             else:
                 light = two_digits((self.reached / most) ** 2)  # errors fall with its square root
                 advice = f"{light} times the light; walop-jax plan RUN --goal {100 * most:.2g} says how long that takes"
@@ -150,10 +148,9 @@ class FieldAccuracy:
         known += f"; below {goal} over {100 * self.share:.0f} % of the field"
         lines = [("p of a star", known if complete else f"{known}, if nothing were missing")]
         if complete:
-            yes = f"yes: {two_digits(100 * self.reached)} % in {self.judged}"
-            lines.append(
-                (f"good for {goal}", f"no: {'; '.join(one.what for one in lacks)}" if lacks else yes)
-            )
+            verdict = [f"no: {lacks[0].what}", *(one.what for one in lacks[1:])] if lacks else []
+            verdict = verdict or [f"yes: {two_digits(100 * self.reached)} % in {self.judged}"]
+            lines += zip([f"good for {goal}", *[""] * (len(verdict) - 1)], verdict, strict=True)
             lines += [("what to do", one.advice) for one in lacks[:1] if one.advice != self.remedy]
         if self.limited_by:
             lines.append(("limited by", self.limited_by))
@@ -183,11 +180,7 @@ def reached(error: Float[np.ndarray, "*p"]) -> float:
 def judged(without_u: float) -> str:
     """The part of the field that `reached` is about, in words; `without_u` is the share that is left out."""
     part = f"{100 * SHARE:.0f} % of the field"
-    return (
-        f"{part} where one exposure measures u ({100 * (1.0 - without_u):.0f} % of it)"
-        if without_u > 0
-        else part
-    )
+    return f"{part} with u in one exposure ({100 * (1.0 - without_u):.0f} %)" if without_u > 0 else part
 
 
 def answered(result: FitResult, goal: float = GOAL) -> FitResult:
