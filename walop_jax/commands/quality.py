@@ -12,7 +12,8 @@ from walop_jax.commands.inputs import Effects, PathLike, calibration_of
 from walop_jax.io.display import Display
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, Diagnosis, FitResult, Run
+    from walop_jax import Calibration, FitResult, Run
+    from walop_jax.diagnosis.findings import Diagnosis
 
 RUNS = Argument("Runs or calibrations, one for each night.", "RUN...", list[Path])
 TABLE = Option(

@@ -22,7 +22,8 @@ from walop_jax.commands.inputs import (
 from walop_jax.io.text import date_of, json_text, parse_toml, read_text, rounded
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, Diagnosis, Effect, FitResult, ObservingPlan, Run
+    from walop_jax import Calibration, Effect, FitResult, ObservingPlan, Run
+    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.model.effects import EffectKind
     from walop_jax.simulation.simulate import Simulated
     from walop_jax.simulation.truth import Template
