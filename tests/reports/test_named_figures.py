@@ -178,7 +178,7 @@ def test_plates_go_by_their_names(source):
     n = len(model.parameters)
     one = dataclasses.replace(whole, model=model, values=model.start, covariance=np.zeros((n, n)))
     assert [axis.get_title() for axis in retardance_wavelength_figure(one).axes] == ["HWP2"]
-    assert retardance_figure(one).axes[0].get_title().startswith("retardance of HWP2 at")
+    assert retardance_figure(one).axes[0].get_title().startswith("HWP2 at")
     assert possible(FigureSource.of(one))["retardance"].about == "maps of the retardance of HWP2"
 
 

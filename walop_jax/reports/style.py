@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.collections import PatchCollection
-from matplotlib.colors import Normalize
+from matplotlib.colors import Normalize, to_rgb
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -218,7 +218,9 @@ def field_limits(low: float, high: float) -> tuple[float, float]:
 
 
 def _set_limits(axis: Axes, x: tuple[float, float], y: tuple[float, float]) -> None:
-    axis.set(xlim=field_limits(*x), ylim=field_limits(*y), facecolor="0.93")
+    axis.set(xlim=field_limits(*x), ylim=field_limits(*y))
+    if to_rgb(axis.get_facecolor()) == to_rgb("white"):  # axes of the caller keep their colour
+        axis.set_facecolor("0.93")
 
 
 def outer_labels(axes: Any) -> None:
