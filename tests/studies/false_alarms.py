@@ -22,7 +22,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from small_run import small_fit  # noqa: E402
 
-from walop_jax.diagnosis import trust  # noqa: E402
+from walop_jax.diagnosis import thresholds, trust  # noqa: E402
 from walop_jax.diagnosis.design import Design, pattern_scores  # noqa: E402
 from walop_jax.diagnosis.repeated_noise import repeated_noise  # noqa: E402
 from walop_jax.diagnosis.stated_conditions import Singles, scored, stated_conditions  # noqa: E402
@@ -54,7 +54,7 @@ def main() -> None:
         doubts = {
             "variance components": found_components(variance_components(drawn)),
             "single numbers": list(stated_conditions(drawn, scored(drawn, rivals))),
-            "patterns": pattern_scores(drawn, number).p_global < trust.ALARM,
+            "patterns": pattern_scores(drawn, number).p_global < thresholds.ALARM,
             "groups": any(trust._groups(drawn)),
             "repeated noise": any(repeated_noise(drawn)),
         }
