@@ -207,6 +207,12 @@ def test_exposures_without_a_time_are_refused(two):
         list(equations.split(dataclasses.replace(two[0], exposures=lost)))
 
 
+def test_values_without_finite_counts_are_refused(two):
+    """Where nights far from their common model have led it, numbers end."""
+    with pytest.raises(DataError, match=r"no finite counts .* leave out what is not trusted"):
+        night_equations(two[0], base_model(two[0]), {"half2.plate.quartz": np.inf}, {})
+
+
 @pytest.mark.parametrize("hours", [2.0, -7.0])
 def test_clocks_in_local_time_are_refused(two, hours):
     e = two[0].exposures

@@ -239,7 +239,7 @@ def night_equations(
     `changes` are the candidates (None: `candidates_of` each night), `number` the only night that is asked for. Nights
     whose `own` minimum is farther from the values than noise explains are linearised closer to it. `sets` is
     how many such sets come. Of sets too large for a table of derivatives no candidates are kept. Raises `DataError` as
-    `split` does.
+    `split` does, and where the model has no finite counts.
     """
     if isinstance(values, Mapping):
         values = np.array([values.get(p.name, p.start) for p in model.parameters])
@@ -260,6 +260,11 @@ def night_equations(
             known = candidates_of(model, some.exposures, model.catalogue) if changes is None else changes
             chi2, gradient, matrix = with_candidates(likelihood, there, known)
             census = likelihood.census
+        if not (np.isfinite(chi2) and np.isfinite(gradient).all() and np.isfinite(matrix).all()):
+            raise DataError(
+                f"{source}, night of MJD {evening}: the model has no finite counts or derivatives where the nights "
+                "meet; some night is far from it: fit each by itself (walop-jax refit), leave out what is not trusted"
+            )
         e = some.exposures
         found.append(
             Night(
