@@ -44,7 +44,7 @@ from oracle import forward  # noqa: E402
 from studies.sealed_optics import Hidden, vectors  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
-from walop_jax.data.records import CalibrationSet  # noqa: E402
+from walop_jax.data.records import CalibrationSet, Position  # noqa: E402
 from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
 from walop_jax.data.write import write_calibration_set  # noqa: E402
 from walop_jax.diagnosis.trust import examined  # noqa: E402
@@ -341,12 +341,12 @@ def mistaken(rng: np.random.Generator, calset: CalibrationSet) -> tuple[str, Cal
     elif kind == "angle":
         angle = e.clp_angle.copy()
         angle[rng.choice(through)] += 0.1 * size
-        new = dataclasses.replace(e, clp_angle=angle)
+        new = e.placed(CLP=Position(e.clp_in, angle))
     elif kind == "pair":
         angle = e.clp_angle.copy()
         i = int(rng.integers(len(through) - 1))
         angle[through[[i, i + 1]]] = angle[through[[i + 1, i]]]
-        new = dataclasses.replace(e, clp_angle=angle)
+        new = e.placed(CLP=Position(e.clp_in, angle))
     elif kind == "rotator":
         new = dataclasses.replace(e, rotator=e.rotator + 0.3 * size)
     elif kind == "catalogue":
