@@ -60,8 +60,8 @@ def distances(table: Any, ra: float, dec: float) -> Float[np.ndarray, " n"]:
     """Angles (deg) between the stars of a table and a direction (deg)."""
     from astropy.coordinates import angular_separation
 
-    there = (np.deg2rad(np.asarray(table[name].to_value("deg"), float)) for name in ("RA", "DEC"))
-    return np.rad2deg(angular_separation(*there, np.deg2rad(ra), np.deg2rad(dec)))
+    alpha, delta = (np.deg2rad(np.asarray(table[name].to_value("deg"), float)) for name in ("RA", "DEC"))
+    return np.rad2deg(angular_separation(alpha, delta, np.deg2rad(ra), np.deg2rad(dec)))
 
 
 def in_degrees(table: Any, name: str, values: Float[np.ndarray, " n"]) -> Any:
