@@ -6,7 +6,8 @@ import re
 
 import numpy as np
 import pytest
-from astropy.table import Table
+from astropy import units
+from astropy.table import QTable, Table
 from astropy.wcs import WCS
 from camera_files import CAMERAS, CENTRE, ascii_head, four, ldac, of_camera, photutils, some_stars
 
@@ -128,6 +129,16 @@ def test_flags_are_those_of_the_package_and_others_are_refused(tmp_path):
     said = "; ".join(read_camera_catalogue(ldac(tmp_path / "c.fits", columns)).remarks)
     assert "no flags of the stars" in said
     assert "MASK_FLAG: flags are read from" in said
+
+
+def test_right_ascensions_in_hours_are_converted_once(tmp_path):
+    """1 h is 15°, a number that could itself be hours."""
+    columns = {
+        "ALPHA_J2000": [1.0, 1.1] * units.hourangle, "DELTA_J2000": [-44.0, -44.1] * units.deg,
+        "FLUX_AUTO": [1e5, 2e5], "FLUXERR_AUTO": [300.0, 400.0], "FLAGS": [0, 0],
+    }  # fmt: skip
+    QTable(columns).write(tmp_path / "O1.ecsv")
+    assert read_camera_catalogue(tmp_path / "O1.ecsv").ra == pytest.approx([15.0, 16.5])
 
 
 def test_magnitudes_are_refused_whatever_their_name(tmp_path):

@@ -282,10 +282,6 @@ def _positions(
             ~(np.isfinite(ra) & np.isfinite(dec)), "is not finite", ", ".join(names), "remove these rows"
         )
         place.refuse(np.abs(dec) > 90.0, "is beyond ±90°", names[1], "declinations in degrees are needed")
-        if np.all(ra <= 24.0) and "h" in unit_of(
-            source.table.columns[source.names.index(_plain(names[0])[0])]
-        ):
-            ra = ra * 15.0
         return ra, dec
     pixels = _pair(source, known.pixel)
     if not pixels or "CRVAL1" not in header:
