@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import Effects, PathLike, calibration_of
+from walop_jax.commands.inputs import Diagnosed, Effects, PathLike, calibration_of
 from walop_jax.io.display import Display
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run
-    from walop_jax.diagnosis.findings import Diagnosis
 
 RUNS = Argument("Runs or calibrations, one for each night.", "RUN...", list[Path])
 TABLE = Option(
@@ -27,7 +26,7 @@ SHOWN = ("CHI2DOF", "ANGLE", "P_RATIO", "ZERO_Q", "ZERO_U", "ACCURACY")
 @command(stages=("reading", "writing"))
 def quality(
     job: Job,
-    runs: Annotated[Calibration | FitResult | Diagnosis | Run | PathLike | Sequence[Any], RUNS],
+    runs: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike | Sequence[Any], RUNS],
     *,
     output: Annotated[PathLike | None, TABLE] = None,
     limits: Annotated[PathLike | None, LIMITS] = None,
@@ -82,8 +81,11 @@ def quality(
             )
     job.begin("writing")
     new = table_of_nights(rows)
-    table, more = joined(new[:0], new) if output is None else append(output, new, allowed)
-    table = judge(table, allowed)
+    if output is None:
+        table, more = joined(new[:0], new)
+        table = judge(table, allowed)
+    else:
+        table, more = append(output, new, allowed)
     if figure is not None:
         save_figure(figure, quality_figure(table, allowed), overwrite=True)
     hashes = {row["CALHASH"] for row in rows}

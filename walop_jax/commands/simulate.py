@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
 from walop_jax.commands.inputs import (
+    Diagnosed,
     Effects,
     InstrumentLike,
     PathLike,
@@ -23,7 +24,6 @@ from walop_jax.io.text import date_of, json_text, parse_toml, read_text, rounded
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, Effect, FitResult, ObservingPlan, Run
-    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.model.effects import EffectKind
     from walop_jax.simulation.simulate import Simulated
     from walop_jax.simulation.truth import Template
@@ -56,7 +56,7 @@ def simulate(
     instrument: InstrumentLike = None,
     effect: Annotated[str | Sequence[str | Effect] | Mapping[str, Any] | None, EFFECT] = None,
     effects: Effects = None,
-    like: Annotated[Simulated | FitResult | Diagnosis | Calibration | Run | PathLike | None, LIKE] = None,
+    like: Annotated[Simulated | FitResult | Diagnosed | Calibration | Run | PathLike | None, LIKE] = None,
     night: Annotated[int | None, NIGHT] = None,
     truth: Annotated[PathLike | None, Option("Write the true parameters here.", "FILE.json", Path)] = None,
     stars: Annotated[int | None, STARS] = None,

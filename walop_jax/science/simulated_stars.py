@@ -21,6 +21,7 @@ from walop_jax.science.gathering import Columns
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import PhotonNoise
 from walop_jax.sky.directions import Pointing
+from walop_jax.sky.moon import sky_to_instrument
 
 POINTING = Pointing(ra=97.5, dec=-44.0, rotator=35.0)
 ELECTRONS = (2e4, 2e6)  # of a camera, log-uniform
@@ -72,9 +73,7 @@ def simulated_stars(
     flux = 4.0 * 10.0 ** draw.uniform(np.log10(ELECTRONS[0]), np.log10(ELECTRONS[1]), count)
 
     rotator = pointing.rotator_at(ra, dec)
-    turn = 2.0 * np.deg2rad(rotator)
-    seen = (qu[:, 0] + 1j * qu[:, 1]) * np.exp(-1j * turn)
-    stokes = np.stack([np.ones(count), seen.real, seen.imag], axis=1)
+    stokes = np.stack([np.ones(count), *sky_to_instrument(qu[:, 0], qu[:, 1], rotator)], axis=1)
     nodes = np.append(np.nan, colour_nodes(COLOURS))
     settings = dataclasses.replace(Settings.default(len(nodes), curve.name), teff=nodes)
     layout = plan_for_settings(instrument, settings, {curve.name: curve})
