@@ -131,25 +131,16 @@ def quality_figure(table: Any, limits: Limits) -> Figure:
             values = factor * np.ma.filled(np.ma.asarray(table[name], float), np.nan)
             error = factor * np.asarray(table[ERRORS[name]], float) if name in ERRORS else None
             outside = np.array([name in str(entry).split() for entry in table[OUTSIDE]])
-            axis.errorbar(
-                time,
-                values,
-                error,
-                fmt=marker,
-                ms=3,
-                lw=0.8,
-                color=AFTER,
-                label=name.removeprefix(f"{GAIN}_"),
-            )
+            camera = name.removeprefix(f"{GAIN}_")
+            axis.errorbar(time, values, error, fmt=marker, ms=3, lw=0.8, color=AFTER, label=camera)
             axis.plot(time[outside], values[outside], marker, ms=5, color=BEFORE, zorder=5)
         if limited in limits and limited != GAIN:
             low, high = (factor * value for value in limits[limited])
             axis.axhspan(low, high, color=QUIET, lw=0, zorder=0)
         axis.set_ylabel(label, fontsize=SMALL)
         if len(names) > 1:
-            axis.legend(
-                ncol=len(names), fontsize=SMALL, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0)
-            )
+            above = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
+            axis.legend(ncol=len(names), fontsize=SMALL, frameon=False, **above)
     calendar(axes[-1, 0], night)
     return figure
 
