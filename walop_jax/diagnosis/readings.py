@@ -221,7 +221,9 @@ def _signs_of_stars(calset: CalibrationSet, worst: Sequence[int]) -> Iterator[Al
         q, u = calset.sources.q[star], calset.sources.u[star]
         for column, signs in (("Q", (-1, 1)), ("U", (1, -1)), ("Q and U", (-1, -1))):
             if all(value != 0.0 for value, sign in zip((q, u), signs, strict=True) if sign < 0):
-                factors = [np.where(calset.sources.source == calset.sources.source[star], s, 1) for s in signs]
+                factors = [
+                    np.where(calset.sources.source == calset.sources.source[star], s, 1) for s in signs
+                ]
                 yield Alternative(
                     f"{column} of {calset.sources.name[star]} in SOURCES had the other sign",
                     "correct its row (docs: conventions)",
