@@ -38,7 +38,9 @@ from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.etalon import probed_gaps
 from walop_jax.model.effects.numbers import OF_SOURCES
 from walop_jax.model.effects.optics import DISPLACEMENTS, GENERATORS
-from walop_jax.model.elements import Element, PupilMapping, WavePlate
+from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.geometry import PupilMapping
+from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.slots import acts
 from walop_jax.model.specification import effect_context

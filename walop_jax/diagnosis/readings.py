@@ -24,7 +24,8 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from walop_jax.data.records import POLARISER, CalibrationSet, Exposures, Points, Position
+from walop_jax.data.kinds import POLARISER
+from walop_jax.data.records import CalibrationSet, Exposures, Points, Position
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
 from walop_jax.fit.model_file import base_model, model_like

@@ -24,7 +24,7 @@ from walop_jax.model.effects.factors import PLAIN, factor
 from walop_jax.model.effects.optics import AXES
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import NAME
-from walop_jax.model.plan import exposure_arrays
+from walop_jax.model.planning import exposure_arrays
 from walop_jax.model.sources import Sight
 
 OPTICAL = (*(f"{kind} {axis}" for kind in ("retardance", "diattenuation") for axis in AXES), "depolarisation")

@@ -34,8 +34,9 @@ from walop_jax.model.effects.change import (
     product,
 )
 from walop_jax.model.effects.factors import EXPOSURE, FIELD, SHAPE, WAVELENGTH
-from walop_jax.model.elements import AddedPolarisation, AirGap
 from walop_jax.model.elements.base import Element, Mueller
+from walop_jax.model.elements.simple import AddedPolarisation
+from walop_jax.model.elements.wave_plate import AirGap
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Component
 from walop_jax.model.ray import Ray
