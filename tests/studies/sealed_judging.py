@@ -95,6 +95,7 @@ def homes_of(where: str, law: str) -> set[str]:
             "catalogue": "standards",
             "band": "band",
             "angle": "polariser",
+            "rotator": "ahead of polariser",
             "pair": "polariser",
             "sky": "moon",
         }
