@@ -193,7 +193,7 @@ MOST_LINES = {
     "calibration": 2850,
     "posterior": 2400,
     "science": 6400,
-    "diagnosis": 7910,
+    "diagnosis": 7920,
     "nights": 2800,
     "plans": 2350,
     "paper": 860,
