@@ -496,7 +496,15 @@ def table(found: list[Outcome]) -> str:
     both = [o for o in products if o.before is not None]
     worse = [o for o in both if o.after and o.before and o.after.error > WORSE * o.before.error]
     rows.append(("matrix worse by more than 1.2 × after the diagnosis", rate(len(worse), len(both))))
-    rows.append(("that, and trusted", rate(sum(bool(o.after and o.after.trusted) for o in worse), len(both))))
+    above = [
+        o
+        for o in worse
+        if o.after and o.before and o.after.error > WORSE * max(o.before.error, o.after.stated)
+    ]
+    rows.append(("that, and worse than its own errors say by as much", rate(len(above), len(both))))
+    rows.append(
+        ("matrix worse, and trusted", rate(sum(bool(o.after and o.after.trusted) for o in worse), len(both)))
+    )
     disagree = [o for o in both if o.before and o.before.trusted and o.p < 1e-4]
     rows.append(("fit trusted while the diagnosis has p < 10⁻⁴", rate(len(disagree), len(both))))
     null = [o for o in found if o.text == "nothing"]
