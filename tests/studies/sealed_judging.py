@@ -27,7 +27,8 @@ TEFF, STAR_P, DRAWS = 5772.0, 0.02, 400
 class Judged(NamedTuple):
     """A product held against the truth: error of stars, pulls of stars (place, q or u) and of elements.
 
-    `stated` is the error that the covariance gives, rms over the stars; `chance` is the probability that a product with this covariance is `wrong` though the covariance is exact.
+    `stated` is the error that the covariance gives, rms over the stars; `chance` is the probability that a product with
+    this covariance is `wrong` though the covariance is exact.
     """
 
     trusted: bool
