@@ -135,10 +135,10 @@ MOST_REACHED = {
     "model.light": 4050,
     "likelihood.flux": 100,
     "diagnosis.score": 800,
-    "commands.matrix": 22950,
-    "commands.refit": 28400,
-    "commands.diagnose": 31550,
-    "commands.apply": 31100,
+    "commands.matrix": 16300,
+    "commands.refit": 27900,
+    "commands.diagnose": 31100,
+    "commands.apply": 30750,
 }
 """Lines that one must be able to follow from a module, all its imports followed: these may only become fewer."""
 
@@ -159,7 +159,7 @@ def followed() -> dict[str, set[str]]:
     for module, path in modules.items():
         tree = _AtRunTime().visit(ast.parse(path.read_text()))
         names = [name for _, name in imports(tree, module, path.name == "__init__.py")]
-        names = [str(public.get(name.removeprefix("walop_jax."), name)) for name in names]
+        names = [str(public.get(name.removeprefix("walop_jax."), name)) for name in names if "." in name]
         homes = (name if name in modules else name.rpartition(".")[0] for name in names)
         edges[module] = {home for home in homes if home in modules and home != PACKAGE.name}
     return edges

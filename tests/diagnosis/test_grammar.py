@@ -9,7 +9,7 @@ from own_instrument import OWN
 from walop_jax.data.records import Position
 from walop_jax.diagnosis import dependences, grammar
 from walop_jax.diagnosis.hypotheses import all_candidates, applicable, probes
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.instruments.description import parsed
 from walop_jax.likelihood.columns import Columns

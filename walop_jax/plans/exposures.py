@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.inverses import pseudo_inverse

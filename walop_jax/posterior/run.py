@@ -15,7 +15,7 @@ from walop_jax.calibration.calibration import Calibration, Matrix, Product
 from walop_jax.calibration.product import read_product
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.model_file import model_for
+from walop_jax.fit.base_model import model_for
 from walop_jax.fit.parameter_table import Fitted
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.verdict import STATED
