@@ -198,7 +198,7 @@ MOST_LINES = {
     "plans": 2350,
     "paper": 860,
     "reports": 3080,
-    "commands": 4790,
+    "commands": 4795,
 }
 """Lines of each room: raising one is a decision of its own."""
 

@@ -76,7 +76,8 @@ def body_direction(
         raise fail(
             "the site is not known",
             column="SITELAT, SITELONG, SITEELEV",
-            advice="add them to the header, or [site] to the description of the instrument",
+            advice="add them to the header, or [site] to the description of the instrument; a plan without the Moon "
+            "has moon_patches = 0",
         )
     with _offline():
         # Imported here: coordinates take half a second, and only Moon exposures need them.
