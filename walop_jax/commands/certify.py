@@ -79,7 +79,7 @@ class Certificate(Displayed):
         rows = [("ok" if check.passed else "FAILED", check.name, check.found) for check in self.checks]
         rows += requirement_rows(self.requirements)
         title = f"{self.path}: {'go' if self.go else 'NO GO'}"
-        return Display(title, head=("", "asked", "found"), rows=tuple(rows), notes=self.missing)
+        return Display(title, head=("", "requirement", "result"), rows=tuple(rows), notes=self.missing)
 
 
 @command(writes=(DOCUMENT,))

@@ -157,7 +157,8 @@ CAPTIONS: Mapping[str, str] = {
     f"refitting all other parameters, and with it. Combination of exposures: {{combination}}; {_NOISE}",
     "signature": "Signature of {effect}. Dots: residuals averaged over the field, with the field pattern of the effect "
     "in that camera as weight; errors from the scatter over the field. Line: the part explained by {effect}. Below: "
-    "the remaining residuals.",
+    "the remaining residuals. Where a camera is dark its error vanishes with its light: residuals in σ change sign "
+    "there from one angle to the next.",
     "whole": f"{_RESIDUALS}. Combination of exposures: {{combination}}; {_NOISE}",
     "ladder": "χ² per degree of freedom from the starting model to the last. In the grey band (5 standard deviations) "
     "a model explains the data.",
