@@ -317,7 +317,7 @@ def catalogue_tables() -> str:
     for effect in EFFECTS:
         if part := entries[effect.name].get("part"):
             lines += ["", f"### {part}", ""]
-            lines += ["| effect | parameter | unit | width | what it is |", "| --- | --- | --- | --- | --- |"]
+            lines += ["| effect | parameter | unit | width | meaning |", "| --- | --- | --- | --- | --- |"]
         choices = effect.neutral(Context()).choices()
         equation = re.split(r"\n(?=Symbols|Source)", effect.head().partition("Equation")[2])[0]
         told = [
