@@ -51,7 +51,7 @@ def hidden_in_words(summary: Mapping[str, Any]) -> str:
 
 _MJD_0 = datetime.datetime(1858, 11, 17)
 _MANY = 12
-_KINDS = {"clp": "through the polariser", "moon": "of the Moon sky", "standard": "of standard stars"}
+_KINDS = {"clp": "through the polariser", "moon": "of the moonlit sky", "standard": "of standard stars"}
 
 
 def data_in_words(product: Calibration | Product) -> tuple[tuple[str, str], ...]:
