@@ -197,8 +197,8 @@ MOST_LINES = {
     "nights": 2800,
     "plans": 2350,
     "paper": 860,
-    "reports": 3080,
-    "commands": 4790,
+    "reports": 3090,
+    "commands": 4795,
 }
 """Lines of each room: raising one is a decision of its own."""
 

@@ -37,7 +37,9 @@ VERDICTS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
         f"the old calibration {'still holds' if d.get('fits') and d.get('new_trusted') else 'does not hold'}"
     ),
     "survey": lambda d: "trusted" if d["trusted"] else "not trusted",
-    "watch": lambda d: "the calibration holds" if d["holds"] else "the calibration is not known to hold",
+    "watch": lambda d: (
+        "the calibration is still valid" if d["holds"] else "the calibration may be no longer valid"
+    ),
     "plan": lambda d: f"{d['what']}: {d['value']:.3g} {d['unit']}".rstrip(),
 }
 """Documents in a few words."""
