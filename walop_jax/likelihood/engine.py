@@ -59,7 +59,7 @@ class PointData(NamedTuple):
 
 
 def sharing(instrument: Instrument, plan: Plan, point: PointData | None = None) -> Sharing:
-    """What the cameras and the exposures of a plan have in common: fluxes, and at a point q, u of its star."""
+    """Common fluxes of cameras and of the exposures of a plan; at a point, common q, u of its star."""
     stars = None if point is None else point.stars
     return Sharing(instrument.cameras.together, plan.exposures.shared, stars)
 

@@ -6,7 +6,7 @@ Symbols     d a derivative of F a, the flux held; behind detectors that are not 
 Source      Kaufman's form of variable projection (Golub & Pereyra 2003, Inverse Problems 19, R1): the gradient
             is exact, and JᵀJ is the Fisher information with the flux marginalised; a star of a field that is off by
             δ ~ N(0, 1) in a direction adds A Aᵀ to the covariance of its r, A = ∂r/∂δ, and r ← (1 + A Aᵀ)^(−1/2) r
-            as well as d makes them independent again (`of_low_rank`)
+            as well as d makes them independent again (`inverses.of_low_rank`)
 Limits      where the flux is known, F = 1 and nothing is projected; where the shares of the arms are unknown
             (`Cameras.split`), y·a and a·a run over the cameras and exposures that have a flux in common (`Sharing`)
 """
@@ -98,12 +98,3 @@ def project_flux(
     power = shared.summed(along**2)
     share = shared.summed(columns * along) / xp.where(power > 0, power, 1.0)
     return shared.independent(columns - xp.where(xp.asarray(flux_known)[..., None], 0.0, share) * along)
-
-
-def of_low_rank(responses: Float[np.ndarray, "*p e k c"]) -> Float[np.ndarray, "*p e k c"]:
-    """U with 1 − U Uᵀ = (1 + A Aᵀ)^(−1/2), from A: with AᵀA = V D Vᵀ, U = A V √((1 − (1 + D)^(−1/2)) / D)."""
-    square, axes = np.linalg.eigh(np.einsum("...ekc,...ekd->...cd", responses, responses))
-    square = np.maximum(square, 0.0)
-    root = np.sqrt(1.0 + square)
-    size = 1.0 / np.sqrt(root * (1.0 + root))  # (1 − 1/√(1 + D)) / D without a difference of equal numbers
-    return responses @ (axes * size[..., None, :])[..., None, :, :]

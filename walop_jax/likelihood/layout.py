@@ -29,7 +29,8 @@ from walop_jax.data.records import (
 )
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.engine import PointData, sharing, star_responses
-from walop_jax.likelihood.flux import of_low_rank, project_flux
+from walop_jax.likelihood.flux import project_flux
+from walop_jax.likelihood.inverses import of_low_rank
 from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
 from walop_jax.model.chebyshev import Rectangle

@@ -253,7 +253,7 @@ class Likelihood:
 
     @cached_property
     def sharing(self) -> Sharing:
-        """What cameras, exposures and, point by point, the exposures of a star have in common."""
+        """Fluxes in common to cameras and exposures, and q, u in common to the exposures of a star, point by point."""
         stars = self.points.gathered("stars") if len(fields_of_stars(self.calset.sources)) else None
         return engine.sharing(self.model.template, self.plan)._replace(stars=stars)
 

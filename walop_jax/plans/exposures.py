@@ -27,8 +27,8 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.flux import Sharing, of_low_rank, project_flux
-from walop_jax.likelihood.inverses import pseudo_inverse
+from walop_jax.likelihood.flux import Sharing, project_flux
+from walop_jax.likelihood.inverses import of_low_rank, pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
