@@ -19,7 +19,8 @@ of an element, side from which it came, KIND (some of them, with stars or withou
 decade and a half about what the data just show. Stars are taken at the time of the first exposure, at 10 °C, for 60 s.
 
 Printed are each set, and the table: pulls and errors of the matrix between the points, and of stars with p = 2 %, at
-400 places, where |det| is 0.1 or more, of stars so faint that no detector shows a power of their counts. A set counts where the truth is Δχ² = 30 better than the base model.
+400 places, where |det| is 0.1 or more, of stars so faint that no detector shows a power of their counts. A set counts where
+the truth is Δχ² = 30 better than the base model.
 
 All stars share the error of one calibration, so that even an exact covariance puts many of them beyond three errors now
 and then (`chance.py`). Beside the number of products that are trusted and wrong stands therefore the number that their
