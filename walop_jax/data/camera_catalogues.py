@@ -24,7 +24,7 @@ from jaxtyping import Float, Int
 from walop_jax.data.schema import Column
 from walop_jax.data.table_files import read_table_file
 from walop_jax.data.units import Place, unit_of
-from walop_jax.data.user_tables import OF_STARS, InputTable, hints, in_memory, numeric_column
+from walop_jax.data.user_tables import OF_STARS, InputTable, hints, in_memory, numeric_column, sky_positions
 from walop_jax.io.errors import DataError, rows_text
 from walop_jax.io.fits_reading import open_fits
 from walop_jax.io.text import parse_toml, read_text, some
@@ -34,7 +34,7 @@ SHIPPED = ("sextractor", "photutils")
 BITS = (1, 2, 4, 8, 16)
 """Bits of FLAG that a catalogue may set."""
 BAD_PIXEL = 2
-OF_EXPOSURES = ("FILTER", "MJD", "TEMP", "HA", "CHWP_ANGLE", "CHWP_IN")
+OF_EXPOSURES = ("FILTER", "MJD", "TEMP", "HA", "CHWP_ANGLE", "CHWP_IN", "CHWP_TURN")
 """Columns, or words of a header, about the exposure: they go with its stars."""
 _LDAC, _HEADER = "LDAC_OBJECTS", "LDAC_IMHEAD"
 _FAINTEST_MAGNITUDE = 40.0
@@ -276,8 +276,7 @@ def _positions(
             return np.asarray(directions.icrs.ra.deg, float), np.asarray(directions.icrs.dec.deg, float)
         raise place.fail("holds no coordinates of astropy", names[0], "name two columns, in degrees")
     if names:
-        rule = Column("float", "deg", missing=np.nan)
-        ra, dec = (numeric_column(source, _plain(name)[0], rule) for name in names)
+        ra, dec = sky_positions(source, [_plain(name)[0] for name in names])
         place.refuse(
             ~(np.isfinite(ra) & np.isfinite(dec)), "is not finite", ", ".join(names), "remove these rows"
         )

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from walop_jax.data.records import CALIBRATION_PLATE
+from walop_jax.data.records import CALIBRATION_PLATE, Exposures
 from walop_jax.io.errors import errors_naming
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.parameters import check_names
@@ -229,13 +229,42 @@ class Available:
             patches=(),
             stars=(),
         ).exposures()
-        high = altitude(e.mjd, e.ra, e.dec, plan.site) >= self.altitude
-        dark = altitude(e.mjd, *body_direction("sun", e.mjd, plan.site), plan.site) < DARK
-        up = tuple(np.flatnonzero(high & dark).tolist())
-        if len(up) == total:
-            return up, []
-        why = "it is not dark" if not dark.all() else f"they are below {self.altitude:g}°"
-        return up, [f"{total - len(up)} of {total} {what} are left out: {why}{self._better()}"]
+        visible, why = self._visible(e)
+        if visible.all():
+            return tuple(range(total)), []
+        lost = total - int(visible.sum())
+        notes = [f"{lost} of {total} {what} are left out: {why}{self._better()}"]
+        return tuple(np.flatnonzero(visible).tolist()), notes
+
+    def _visible(self, exposures: Exposures) -> tuple[Bool[np.ndarray, " e"], str]:
+        """Exposures of the sky that are high enough, in the dark; and why others are not."""
+        mjd, site = exposures.mjd, self.plan.site
+        high = altitude(mjd, exposures.ra, exposures.dec, site) >= self.altitude
+        dark = altitude(mjd, *body_direction("sun", mjd, site), site) < DARK
+        return high & dark, "it is not dark" if not dark.all() else f"they are below {self.altitude:g}°"
+
+    def doubts(self, plan: ObservingPlan) -> tuple[str, ...]:
+        """Sentences on exposures of a plan that cannot be taken at the times that it gives them.
+
+        What is up is chosen at the begin of the night, before the order of the exposures is known.
+        """
+        exposures = plan.exposures()
+        exposures = exposures[exposures.direct("moon", "standard")]
+        if not len(exposures) or not plan.site.known:
+            return ()
+        visible, why = self._visible(exposures)
+        if visible.all():
+            return ()
+        lost = len(exposures) - int(visible.sum())
+        return (f"{lost} of {len(exposures)} exposures of the sky come too late in this order: {why}",)
+
+    def in_whole_seconds(self) -> Available:
+        """The same with exposure times of whole seconds, which schedules need."""
+        seconds = {
+            kind: tuple(dict.fromkeys(max(1.0, float(round(t))) for t in times))
+            for kind, times in self.seconds.items()
+        }
+        return dataclasses.replace(self, seconds=seconds)
 
     def _better(self) -> str:
         """The next time at which the Moon is full, high and the sky dark."""

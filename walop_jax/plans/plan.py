@@ -350,7 +350,7 @@ def plan_from(
         after=_errors(found, field, covariance(total)),
         beside=dict(_beside(found, problem, criterion)),
         observing_plan=plan,
-        notes=(*found.notes, *endless, *unseen),
+        notes=(*found.notes, *endless, *unseen, *chosen.available.doubts(plan)),
         any_plate=found.available.any_plate,
     )
 
