@@ -78,15 +78,15 @@ def read_calibration_set(*paths: str | os.PathLike[str], kinds: Collection[str] 
         raise fail("no file was given", advice="name at least one calibration set")
     sets: list[CalibrationSet] = []
     for path in paths:
-        one = _read_one(Path(path), kinds)
-        known = {entry.inputs[0].sha256: entry.inputs[0].path for entry in sets}
-        if one.inputs[0].sha256 in known:
+        calset = _read_one(Path(path), kinds)
+        path_of = {entry.inputs[0].sha256: entry.inputs[0].path for entry in sets}
+        if calset.inputs[0].sha256 in path_of:
             raise fail(
-                f"has the same bytes as {known[one.inputs[0].sha256]}",
+                f"has the same bytes as {path_of[calset.inputs[0].sha256]}",
                 file=path,
                 advice="name each file once: repeated data would shrink the errors",
             )
-        sets.append(one)
+        sets.append(calset)
     return sets[0] if len(sets) == 1 else merge_calibration_sets(*sets)
 
 
@@ -97,8 +97,8 @@ def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
         advice = "a calibration set is a FITS file (walop-jax docs files); walop_jax.from_arrays makes one of arrays"
         raise fail("is not a calibration set", file=path, advice=advice)
     with open_fits(path, "write the file again") as opened:
-        found = _from_hdus(opened, (*KINDS, *kinds))
-    return dataclasses.replace(found, inputs=(InputFile(path, opened.sha256),))
+        calset = _from_hdus(opened, (*KINDS, *kinds))
+    return dataclasses.replace(calset, inputs=(InputFile(path, opened.sha256),))
 
 
 def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
@@ -116,11 +116,14 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         if name in hdus:
             columns = column_names(hdus[name], place)
             if primary["CALVERS"] == 1:  # CLP and CHWP alone move there, whatever other columns are called
-                own = {*schema.TABLES[name], *(f"{prefix}_TURN" for prefix in (POLARISER, CALIBRATION_PLATE))}
-                columns = [column for column in columns if column in own]
+                defined = {
+                    *schema.TABLES[name],
+                    *(f"{prefix}_TURN" for prefix in (POLARISER, CALIBRATION_PLATE)),
+                }
+                columns = [column for column in columns if column in defined]
             rules = table_rules(name, columns, place)
-            tables[name], more = read_table(hdus[name], rules, place)
-            remarks += more
+            tables[name], odd = read_table(hdus[name], rules, place)
+            remarks += odd
         elif name not in ("FILTERS", "SOURCES"):
             raise place.fail("the extension is missing", advice="see the file format")
     return assembled(
@@ -170,9 +173,9 @@ def assembled(
         points = make_points(tables["POINTS"], instrument, Place(path, "POINTS"))
         place = Place(path, "INTENSITIES")
         check_cameras(instrument, tables["INTENSITIES"]["N"].shape[1], place, "N")
-        intensities, more = table_intensities(tables["INTENSITIES"], exposures, points, sources, place)
+        intensities, odd = table_intensities(tables["INTENSITIES"], exposures, points, sources, place)
         intensities, repeated = mask_repeats(intensities, exposures, path)
-        remarks += more + repeated + _idle(intensities, exposures, path)
+        remarks += odd + repeated + _idle(intensities, exposures, path)
     remarks += repeated_counts(intensities, exposures, points, path, compression)
     if compression is not None:
         remarks.append(remark(compression, len(points)))
@@ -226,8 +229,8 @@ def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], d
         image = name == "FLAG" or _IMAGE.fullmatch(name)
         kind = tables if name in (*schema.TABLES, EXTENSION) else images if image else None
         if kind is None:
-            known = (*schema.TABLES, EXTENSION, *four)
-            remarks.append(f"{opened.path} [{name or number}]: unknown extension ({nearest(name, known)})")
+            expected = (*schema.TABLES, EXTENSION, *four)
+            remarks.append(f"{opened.path} [{name or number}]: unknown extension ({nearest(name, expected)})")
         elif name in kind:
             raise fail("is there twice", file=opened.path, extension=name, advice="remove one")
         else:
@@ -268,7 +271,9 @@ def _frames(
     check_cameras(instrument, len(stack.counts), Place(path, "N0"), "")
     width, total = grid.width, grid.pixels
     corners = (0, width - 1, total - width, total - 1)
-    x, y = (np.concatenate(parts) for parts in zip(*(grid.xy(n, n + 1) for n in corners), strict=True))
+    x, y = (
+        np.concatenate(coordinates) for coordinates in zip(*(grid.xy(n, n + 1) for n in corners), strict=True)
+    )
     make_points({"POINT": np.arange(4), "X": x, "Y": y}, instrument, Place(path, "N0"))
     intensities = FrameIntensities(grid, (stack,))
     place, last = Place(path, "N0"), intensities.cameras - 1
@@ -378,13 +383,13 @@ def from_arrays(
         tables["SOURCES"] = _sources(sources)
     if filters:
         tables["FILTERS"] = filter_columns(filters)
-    found = _in_memory(
+    calset = _in_memory(
         tables,
         instrument=instrument,
         site=Site("", _NAN, _NAN, _NAN) if site is None else site,
         origin=origin,
     )
-    return dataclasses.replace(found, remarks=(*found.remarks, *_spoilt(counts)))
+    return dataclasses.replace(calset, remarks=(*calset.remarks, *_spoilt(counts)))
 
 
 def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationSet:
@@ -409,11 +414,11 @@ def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationS
 
 def _in_memory(tables: Mapping[str, Mapping[str, Any]], **said: Any) -> CalibrationSet:
     """A checked set of columns in memory; `said` as for `assembled`."""
-    made = {}
+    filled = {}
     for name, columns in tables.items():
         place = Place(NAME, name)
-        made[name] = table_of(columns, table_rules(name, list(columns), place), place)
-    return assembled(made, Path(NAME), **said)
+        filled[name] = table_of(columns, table_rules(name, list(columns), place), place)
+    return assembled(filled, Path(NAME), **said)
 
 
 def _spoilt(counts: np.ndarray) -> Iterator[str]:
@@ -425,8 +430,8 @@ def _spoilt(counts: np.ndarray) -> Iterator[str]:
             f"counts[{p}, {e}] (camera {' and '.join(str(k) for k in np.flatnonzero(~finite[p, e]))})"
             for p, e in places[:_SHOWN].tolist()
         )
-        more = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
-        yield f"{NAME}: not finite in {shown}{more}: not used in any camera"
+        suffix = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
+        yield f"{NAME}: not finite in {shown}{suffix}: not used in any camera"
 
 
 def _spread(name: str, values: Any, number: int) -> Any:

@@ -106,10 +106,10 @@ class Cube:
 
     def _check_stamp(self) -> None:
         try:
-            now = self.path.stat()
+            stat = self.path.stat()
         except OSError as error:
             raise self.place.fail(f"cannot be read: {error}") from error
-        if (now.st_size, now.st_mtime_ns) != self.stamp:
+        if (stat.st_size, stat.st_mtime_ns) != self.stamp:
             raise fail("the file has changed since it was opened", file=self.path, advice="read it again")
 
     def rows(self, start: int, stop: int) -> Float[np.ndarray, "e y x"]:
@@ -117,12 +117,12 @@ class Cube:
 
         Raises what `stored` raises.
         """
-        part = self.stored(start, stop)
-        values = part.astype(np.float64)
+        stored = self.stored(start, stop)
+        values = stored.astype(np.float64)
         if (self.scale, self.zero) != (1.0, 0.0):
             values = values * self.scale + self.zero
         if self.blank is not None:
-            values[part == self.blank] = np.nan
+            values[stored == self.blank] = np.nan
         return values
 
 
@@ -178,7 +178,7 @@ class FrameIntensities(Intensities):
         block = empty_block(*self.grid.xy(start, stop), self.exposures, self.cameras)
         first = 0
         for stack in self.stacks if stop > start else ():
-            here = slice(first, first + stack.exposures)
+            rows = slice(first, first + stack.exposures)
             counts, sigma, flag = self.read(stack, start, stop)
             used, _, impossible = usable(counts, sigma, flag)
             if np.any(impossible):
@@ -189,9 +189,9 @@ class FrameIntensities(Intensities):
                 what = f"is zero or negative in {where}, and {int(impossible.sum())} pixel(s) in all"
                 advice = "give the true error, or set the FLAG image"
                 raise stack.sigma[camera].place.fail(what, advice=advice)
-            block.used[:, here] = used
-            block.counts[:, here] = np.where(used[..., None], counts, 0.0)
-            block.sigma[:, here] = np.where(used[..., None], sigma, 1.0)
+            block.used[:, rows] = used
+            block.counts[:, rows] = np.where(used[..., None], counts, 0.0)
+            block.sigma[:, rows] = np.where(used[..., None], sigma, 1.0)
             first += stack.exposures
         return block
 
@@ -238,8 +238,10 @@ def frame_stack(images: Mapping[str, Any], exposures: int, path: Path) -> tuple[
             cubes[name] = dataclasses.replace(cube, scale=size * cube.scale, zero=size * cube.zero)
     check_units(units, "electron", Place(path, "BUNIT"))
     if len(grids) > 1:
-        one, other, *_ = grids.values()
-        raise fail(f"{one} and {other} do not lie on the same grid", file=path, advice="resample them first")
+        reference, second, *_ = grids.values()
+        raise fail(
+            f"{reference} and {second} do not lie on the same grid", file=path, advice="resample them first"
+        )
     grid = next(iter(grids))
     flag = cubes.get("FLAG")
     if flag is not None and flag.shape[1:] != (grid.height, grid.width):
@@ -284,10 +286,10 @@ def _cube(hdu: Any, exposures: int, place: Place) -> Cube:
 def read_grid(header: Any, place: Place) -> Grid:
     """Read the linear coordinates of the first two axes: CRPIX, CRVAL and CD, or CDELT with PC."""
     for axis, name in ((1, "X"), (2, "Y")):
-        found = str(header.get(f"CTYPE{axis}", "")).strip().upper()
-        if found != name:
+        axis_type = str(header.get(f"CTYPE{axis}", "")).strip().upper()
+        if axis_type != name:
             raise place.fail(
-                f"is {found!r} where {name!r} is needed", f"CTYPE{axis}", "field coordinates, linear"
+                f"is {axis_type!r} where {name!r} is needed", f"CTYPE{axis}", "field coordinates, linear"
             )
     if float(header.get("CROTA2", 0.0)) != 0.0:
         raise place.fail("is an obsolete rotation", "CROTA2", "write PC or CD")
@@ -362,11 +364,11 @@ class RowReader:
         closed[:] = True
         first = 0
         for stack in self.intensities.stacks:
-            here = slice(first, first + stack.exposures)
-            for array, own in ((counts, stack.counts), (sigma, stack.sigma)):
-                for camera, cube in enumerate(own):
-                    _read(cube, start, stop, array[camera, here])
-            closed[(here, *inside)] = False if stack.flag is None else _is_set(stack.flag, start, stop)
+            rows = slice(first, first + stack.exposures)
+            for array, stored in ((counts, stack.counts), (sigma, stack.sigma)):
+                for camera, cube in enumerate(stored):
+                    _read(cube, start, stop, array[camera, rows])
+            closed[(rows, *inside)] = False if stack.flag is None else _is_set(stack.flag, start, stop)
             first += stack.exposures
         return RawRows(jax.device_put(counts), jax.device_put(sigma), ~closed)
 

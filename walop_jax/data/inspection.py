@@ -104,7 +104,7 @@ class Inspection(Displayed):
         low_x, high_x, low_y, high_y = self.field
         counted = math.isfinite(self.median_counts)
         apart = "; standards are measured at places of their own" if self.sources else ""
-        some = f" at {self.looked_at} points looked at" if self.looked_at < self.points else ""
+        sampled_points = f" at {self.looked_at} points looked at" if self.looked_at < self.points else ""
         place = (self.instrument, self.telescope)
         noise = f"{self.noise_ratio**0.5:.4g} × the photon noise √N (median)"
         return Display(
@@ -123,7 +123,7 @@ class Inspection(Displayed):
                 ),
                 (
                     "used",
-                    f"{self.rows} of {self.possible} (exposure, point) pairs{some}{apart}",
+                    f"{self.rows} of {self.possible} (exposure, point) pairs{sampled_points}{apart}",
                 ),
                 ("flagged", ", ".join(f"{count} {name}" for name, count in self.flags.items()) or "none"),
                 (
@@ -170,7 +170,7 @@ def inspect(calset: CalibrationSet) -> Inspection:
     angles = np.unique(np.round(np.mod(e.clp_angle[e.clp_in & live], 180.0), 3))
     gaps = np.diff(np.append(angles, angles[:1] + 180.0))
     ratio = float(np.median(sample.ratio)) if sample.ratio.size else float("nan")
-    made = Inspection(
+    inspection = Inspection(
         instrument=calset.instrument,
         telescope=calset.site.telescope,
         origin=calset.origin,
@@ -194,12 +194,12 @@ def inspect(calset: CalibrationSet) -> Inspection:
         findings=(),
     )
     findings = [
-        *_findings(calset, made),
+        *_findings(calset, inspection),
         *_about_cameras(sample.by_camera),
         *_about_settings(calset.exposures, live),
     ]
     notes = [Finding("note", remark) for remark in calset.remarks]
-    return dataclasses.replace(made, findings=(*findings, *notes))
+    return dataclasses.replace(inspection, findings=(*findings, *notes))
 
 
 def _sample(calset: CalibrationSet) -> _Sample:
@@ -207,9 +207,9 @@ def _sample(calset: CalibrationSet) -> _Sample:
     rows = block.used & ~calset.exposures.flux_known
     counts, sigma = block.counts[rows], block.sigma[rows]
     ratio = np.where(counts > 0, sigma**2 / np.where(counts > 0, counts, 1.0), np.nan)
-    seen = np.isfinite(ratio).any(axis=0)
+    measured = np.isfinite(ratio).any(axis=0)
     by_camera = np.full(ratio.shape[1], np.nan)
-    by_camera[seen] = np.nanmedian(ratio[:, seen], axis=0)
+    by_camera[measured] = np.nanmedian(ratio[:, measured], axis=0)
     return _Sample(len(block.used), block.used, counts.ravel(), ratio[np.isfinite(ratio)], by_camera)
 
 
@@ -227,7 +227,7 @@ def _groups(calset: CalibrationSet, share: np.ndarray) -> tuple[Group, ...]:
     ]
     groups = []
     for key in dict.fromkeys(keys):
-        rows = np.array([n for n, other in enumerate(keys) if other == key])
+        rows = np.array([n for n, group in enumerate(keys) if group == key])
         angles = np.unique(np.round(e.clp_angle[rows][e.clp_in[rows]], 3))
         groups.append(Group(*key, len(rows), len(angles), float(share[rows].mean())))
     return tuple(groups)
@@ -282,8 +282,8 @@ def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
 
 def _about_cameras(noise_ratio: np.ndarray) -> Iterator[Finding]:
     """N_ERR²/N is the same in all cameras whose light is mostly counted in the same unit."""
-    known = noise_ratio[np.isfinite(noise_ratio)]
-    if known.size and known.max() > _UNEVEN * known.min():
+    finite = noise_ratio[np.isfinite(noise_ratio)]
+    if finite.size and finite.max() > _UNEVEN * finite.min():
         listed = ", ".join(f"N{k} {value:.3g}" for k, value in enumerate(noise_ratio))
         yield Finding(
             "doubt",

@@ -417,9 +417,9 @@ class CalibrationSet(Displayed):
         """
         block, e = self.intensities.block(0, len(self.points)), self.exposures
         used = block.used[:, :, None]
-        others = {name.lower(): values for name, values in e.columns().items()}
+        columns = {name.lower(): values for name, values in e.columns().items()}
         for name in ("exposure", "kind", "clp_in", "clp_angle"):
-            others.pop(name, None)
+            columns.pop(name, None)
         return {
             "counts": np.where(used, block.counts, np.nan),
             "errors": np.where(used, block.sigma, np.nan),
@@ -428,7 +428,7 @@ class CalibrationSet(Displayed):
             "angles": np.where(e.clp_in, e.clp_angle, np.nan),
             "kinds": e.kind,
             "source": np.where(block.source >= 0, np.append(self.sources.source, -1)[block.source], -1),
-            **others,
+            **columns,
             "instrument": self.instrument,
             "site": self.site,
             "filters": dict(self.filters),

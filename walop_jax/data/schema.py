@@ -183,9 +183,9 @@ def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]
     rules: dict[str, Column] = {}
     for prefix in (POLARISER, CALIBRATION_PLATE):
         inside, angle = f"{prefix}_IN", f"{prefix}_ANGLE"
-        there = inside in columns or angle in columns
-        rules[inside] = Column("bool", missing=None if there else False, remarked=there)
-        rules[angle] = dataclasses.replace(_ANGLE, remarked=there)
+        present = inside in columns or angle in columns
+        rules[inside] = Column("bool", missing=None if present else False, remarked=present)
+        rules[angle] = dataclasses.replace(_ANGLE, remarked=present)
     for name in columns:
         prefix, _, last = name.rpartition("_")
         if last == "TURN" and f"{prefix}_ANGLE" in columns:
@@ -221,11 +221,11 @@ def column_names(hdu: Any, place: Place) -> list[str]:
 
 def distinct(names: Iterable[str], place: Place) -> list[str]:
     """The names of columns; `DataError` if one is there twice."""
-    found = list(names)
-    for name in found:
-        if found.count(name) > 1:
+    columns = list(names)
+    for name in columns:
+        if columns.count(name) > 1:
             raise place.fail("the column is there twice", name, "remove or rename one of them")
-    return found
+    return columns
 
 
 def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[dict[str, Any], list[str]]:
@@ -237,8 +237,8 @@ def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[d
     names = column_names(hdu, place)
     for name, column in columns.items():
         if column.missing is None and name not in names:
-            others = sorted(set(names) - set(columns))
-            advice = f"add it{' (' + nearest(name, others) + ')' if others else ''}"
+            unknown = sorted(set(names) - set(columns))
+            advice = f"add it{' (' + nearest(name, unknown) + ')' if unknown else ''}"
             raise place.fail("the column is missing", name, advice)
     rows = int(hdu.header["NAXIS2"])
     if rows == 0:
@@ -384,25 +384,25 @@ def values_of(
 
 
 def plain_column(
-    given: Any, name: str, rule: Column, place: Place
+    column: Any, name: str, rule: Column, place: Place
 ) -> tuple[np.ndarray, Bool[np.ndarray, ...], str]:
     """The values of a column, where they are masked, and its unit; times become MJD (UTC) where days are wanted."""
-    if hasattr(given, "jd1") or np.asarray(given).dtype.kind == "M":
+    if hasattr(column, "jd1") or np.asarray(column).dtype.kind == "M":
         from astropy.time import Time
 
         if rule.unit != "d":
             raise place.fail("holds times", name, f"give numbers in {rule.unit or 'plain'}")
-        masked = np.asarray(getattr(given, "mask", False))
-        if not hasattr(given, "jd1"):
-            days = np.asarray(given)
+        masked = np.asarray(getattr(column, "mask", False))
+        if not hasattr(column, "jd1"):
+            days = np.asarray(column)
             masked = masked | np.isnat(days)
-            given = Time(np.where(masked, np.datetime64("2000-01-01"), days), scale="utc")
-        if not hasattr(given, "utc"):
+            column = Time(np.where(masked, np.datetime64("2000-01-01"), days), scale="utc")
+        if not hasattr(column, "utc"):
             raise place.fail("holds differences of times", name, "give dates")
-        values = np.asarray(getattr(given.utc.mjd, "unmasked", given.utc.mjd), dtype=float)
+        values = np.asarray(getattr(column.utc.mjd, "unmasked", column.utc.mjd), dtype=float)
         return values, np.broadcast_to(masked, values.shape), ""
-    unit = unit_of(given)
-    values, masked = without_mask(getattr(given, "value", given) if unit else given)
+    unit = unit_of(column)
+    values, masked = without_mask(getattr(column, "value", column) if unit else column)
     if values.dtype.names:
         raise place.fail("is no plain column", name, "give a column of numbers or texts")
     return values, masked, unit
@@ -460,12 +460,14 @@ def in_unit(values: Any, unit: str, name: str) -> Float[np.ndarray, "*s"]:
     `DataError` for a unit that cannot be converted and for what is not a number.
     """
     place = Place("", "")
-    given = unit_of(values)
-    plain = getattr(values, "value", values) if given and not hasattr(values, "colnames") else values
+    unit_given = unit_of(values)
+    plain = getattr(values, "value", values) if unit_given and not hasattr(values, "colnames") else values
     try:
         raw, masked = without_mask(plain)
         numbers = np.where(masked, np.nan, raw.astype(np.float64))
     except (TypeError, ValueError):
         raise place.fail("is not made of numbers", name, f"give numbers in {unit or 'fractions'}") from None
     flat = np.atleast_1d(numbers).astype(np.float64)
-    return (convert_unit(flat, given, unit, name, place) if given else flat).reshape(np.shape(numbers))
+    return (convert_unit(flat, unit_given, unit, name, place) if unit_given else flat).reshape(
+        np.shape(numbers)
+    )

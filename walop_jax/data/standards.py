@@ -38,10 +38,10 @@ def shipped_standards() -> Any:
     scatter = np.where(np.isfinite(scatter), scatter, np.deg2rad(USUAL_SCATTER))
     across = 2.0 * degree * np.hypot(np.nan_to_num(stated), scatter)
     across = np.where(degree > POLARISED * error, across, error)
-    known = np.isfinite(angle)
+    has_angle = np.isfinite(angle)
     either = np.sqrt(0.5 * (degree**2 + error**2))
-    error, across = np.where(known, error, either), np.where(known, across, either)
-    degree, angle = np.where(known, degree, 0.0), np.where(known, angle, 0.0)
+    error, across = np.where(has_angle, error, either), np.where(has_angle, across, either)
+    degree, angle = np.where(has_angle, degree, 0.0), np.where(has_angle, angle, 0.0)
     cos, sin = np.cos(2.0 * angle), np.sin(2.0 * angle)
     columns = {
         "SOURCE": np.array([order.index(name) for name in names]),

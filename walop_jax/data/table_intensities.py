@@ -172,7 +172,7 @@ def table_intensities(
     used, spoilt, impossible = usable(counts, sigma, flag)
     place.refuse(impossible, "is zero or negative", "N_ERR", "give the true error, or set FLAG")
     remarks = _judge(counts, used, spoilt, place)
-    source, more = _source_rows(table["SOURCE"], exposures, exposure, sources, used, place)
+    source, unlisted = _source_rows(table["SOURCE"], exposures, exposure, sources, used, place)
     intensities = TableIntensities(
         len(exposures),
         points,
@@ -184,7 +184,7 @@ def table_intensities(
         flag=flag,
         used=used,
     )
-    return intensities, remarks + more
+    return intensities, remarks + unlisted
 
 
 def _cameras(counts: np.ndarray, sigma: np.ndarray, exposures: Exposures, place: Place) -> None:
@@ -251,9 +251,9 @@ def _source_rows(
         rows = np.where((sources.source[at] == ids) & (ids >= 0), at, -1)
     standard = exposures.direct("standard")[exposure] & used
     if np.any(bad := standard & (rows < 0)):
-        known = ", ".join(str(entry) for entry in sources.source[:10]) or "none"
+        listed = ", ".join(str(entry) for entry in sources.source[:10]) or "none"
         what = f"a standard star needs a row of SOURCES; {ids[np.argmax(bad)]} is not one,"
-        place.refuse(bad, what, "SOURCE", f"SOURCES has {known}")
+        place.refuse(bad, what, "SOURCE", f"SOURCES has {listed}")
     indoors = [name for name, kind in KINDS.items() if not kind.from_sky and not kind.flux_known]
     lamp = np.isin(exposures.kind, indoors)[exposure] & used & (ids >= 0)
     place.refuse(lamp, "a lamp is no source of the sky,", "SOURCE", "write −1, or another KIND")
@@ -285,25 +285,27 @@ def mask_repeats(
 
     remarks: list[str] = []
     alike: list[str] = []
-    for first, *others in groups.values():
+    for first, *repeats in groups.values():
         rows = rows_of(first)
-        for other in others:
+        for repeat in repeats:
             ids, rows_again = (
-                f"exposures {exposures.exposure[first]} and {exposures.exposure[other]}",
-                rows_of(other),
+                f"exposures {exposures.exposure[first]} and {exposures.exposure[repeat]}",
+                rows_of(repeat),
             )
             if len(rows) and all(np.array_equal(v[rows], v[rows_again]) for v in (point, intensities.counts)):
                 remarks.append(f"{ids} are the same to the last bit, the second is not used")
                 used[rows_again] = False
             elif fine and np.isin(point[rows[used[rows]]], point[rows_again[used[rows_again]]]).any():
-                what = f"{ids} (rows {first} and {other}, counted from 0) have the same time and settings but"
+                what = (
+                    f"{ids} (rows {first} and {repeat}, counted from 0) have the same time and settings but"
+                )
                 advice = "no camera takes two exposures at once: correct the times, or write NaN"
                 raise Place(file, "EXPOSURES").fail(f"{what} different counts", "MJD", advice)
             else:
                 alike.append(ids)
     if alike:
-        more = f" (and {len(alike) - 1} pairs more)" if len(alike) > 1 else ""
-        remarks.append(f"{alike[0]} have the same time and settings but different counts{more}")
+        suffix = f" (and {len(alike) - 1} pairs more)" if len(alike) > 1 else ""
+        remarks.append(f"{alike[0]} have the same time and settings but different counts{suffix}")
     return intensities.using(used), remarks
 
 

@@ -211,7 +211,7 @@ def table_hdu(
 
     Raises `DataError`, naming `path`, for text that is not plain ASCII.
     """
-    made = []
+    fits_columns = []
     for column, rule in rules.items():
         if column not in columns and rule.missing is not None:
             continue
@@ -225,8 +225,8 @@ def table_hdu(
             code = f"{width if width > 1 else ''}{_CODES[rule.kind]}"
             if rule.kind == "int" and np.any(np.abs(values) > 2**31 - 1):
                 code = "K"
-        made.append(fits.Column(name=column, format=code, unit=rule.unit or None, array=values))
-    return fits.BinTableHDU.from_columns(made, name=name)
+        fits_columns.append(fits.Column(name=column, format=code, unit=rule.unit or None, array=values))
+    return fits.BinTableHDU.from_columns(fits_columns, name=name)
 
 
 def _ascii(value: str, column: str, place: Place) -> None:

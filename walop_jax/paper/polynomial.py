@@ -128,14 +128,14 @@ def fit_paper(
     """
     rows = polariser_exposures(calset, filter_name)
     block = calset.intensities.block(0, len(calset.points))
-    whole = np.flatnonzero(block.used[:, rows].all(axis=1))
-    if whole.size == 0:
+    complete = np.flatnonzero(block.used[:, rows].all(axis=1))
+    if complete.size == 0:
         raise DataError("INTENSITIES: no point has been measured at all polariser angles")
-    counts = block.counts[whole][:, rows]
+    counts = block.counts[complete][:, rows]
     states = polariser_states(calset.exposures.clp_angle[rows])
     coefficients, condition = fit_polynomials(measured_qu(counts), states)
     transmission = fit_transmissions(counts, states)
-    return with_test_stars(block.x[whole], block.y[whole], coefficients, condition, transmission, stars)
+    return with_test_stars(block.x[complete], block.y[complete], coefficients, condition, transmission, stars)
 
 
 def with_test_stars(
@@ -183,9 +183,9 @@ def fit_transmissions(counts: Float[np.ndarray, "p e 4"], states: QuPairs) -> Fl
     flux = counts.sum(axis=2)
     vectors = np.zeros((len(counts), 4, 3))
     for _ in range(_ROUNDS):
-        left = np.einsum("pek,pe,ei,ej->pkij", weight, flux**2, s, s, optimize=True)
+        normal = np.einsum("pek,pe,ei,ej->pkij", weight, flux**2, s, s, optimize=True)
         right = np.einsum("pek,pe,pek,ei->pki", weight, flux, counts, s, optimize=True)
-        vectors = np.linalg.solve(left, right[..., None])[..., 0]
+        vectors = np.linalg.solve(normal, right[..., None])[..., 0]
         vectors /= vectors[..., 0].mean(axis=1)[:, None, None]
         model = np.einsum("pki,ei->pek", vectors, s)
         flux = np.sum(weight * model * counts, axis=2) / np.sum(weight * model**2, axis=2)
@@ -251,13 +251,18 @@ def judge_patches(calset: CalibrationSet, calibration: Calibration) -> Patches:
     settings = analysis.reduced(Settings.of(e, analysis.instrument.patched().moving()))
     rows = []
     for k, m in enumerate(moon):
-        there = np.flatnonzero(block.used[:, m])
+        measured = np.flatnonzero(block.used[:, m])
         vectors = analysis.coloured(
-            settings[m : m + 1], block.x[there], block.y[there], np.full(len(there), float(e.teff[m]))
+            settings[m : m + 1],
+            block.x[measured],
+            block.y[measured],
+            np.full(len(measured), float(e.teff[m])),
         )
-        found = estimate(vectors, block.counts[there, m], block.sigma[there, m], np.arange(len(there)))
-        rows.append(_smooth_fit(found.qu, found.photon, sky[there, k]))
-    scale, offset, flatness, mean = (np.array(part) for part in zip(*rows, strict=True))
+        estimates = estimate(
+            vectors, block.counts[measured, m], block.sigma[measured, m], np.arange(len(measured))
+        )
+        rows.append(_smooth_fit(estimates.qu, estimates.photon, sky[measured, k]))
+    scale, offset, flatness, mean = (np.array(column) for column in zip(*rows, strict=True))
     depolarisation = float(np.median(scale))
     # Mean over the patch of (q, u) − δ R = (s − δ) <R> + c.
     departure = np.hypot(*((scale - depolarisation)[:, None] * mean + offset).T)
@@ -276,18 +281,18 @@ def _smooth_fit(
     good = np.isfinite(qu).all(axis=1)
     qu, covariance, sky = qu[good], covariance[good], sky[good]
     white = np.linalg.cholesky(np.linalg.inv(covariance)).swapaxes(1, 2)
-    one = np.broadcast_to(np.eye(2), (len(qu), 2, 2))
-    design = (white @ np.concatenate([sky[..., None], one], axis=2)).reshape(-1, 3)
+    weights = np.broadcast_to(np.eye(2), (len(qu), 2, 2))
+    design = (white @ np.concatenate([sky[..., None], weights], axis=2)).reshape(-1, 3)
     data = (white @ qu[..., None]).reshape(-1)
     along = (white @ sky[..., None]).reshape(-1)
     only = float(along @ data / (along @ along))
     pull = np.array([[1.0, 0.0, 0.0]])
     solution = np.linalg.lstsq(np.concatenate([design, pull]), np.append(data, only), rcond=None)[0]
-    left = data - design @ solution
+    residual = data - design @ solution
     return (
         only,
         solution[1:] + (solution[0] - only) * sky.mean(axis=0),
-        float(left @ left / max(len(left) - 3, 1)),
+        float(residual @ residual / max(len(residual) - 3, 1)),
         sky.mean(axis=0),
     )
 
@@ -339,12 +344,12 @@ def full_moon_scheme(
     # Standards: Δ at the centres, where the polynomials are interpolated.
     local = paper.between(centre_x, centre_y).coefficients
     true = _catalogue(calset, block, standard)
-    found = polynomial(local, measured_qu(block.counts[middle][:, standard]))
-    known = block.used[middle][:, standard]
-    delta_centre = _mean(found - true[middle], known[..., None], axis=1)
+    corrected = polynomial(local, measured_qu(block.counts[middle][:, standard]))
+    standard_used = block.used[middle][:, standard]
+    delta_centre = _mean(corrected - true[middle], standard_used[..., None], axis=1)
 
     # Moon: the patch is measured where the polynomials are closest to a centre, and is the same in all the box.
-    seen = polynomial(paper.coefficients, measured_qu(block.counts[grid][:, moon]))
+    moon_qu = polynomial(paper.coefficients, measured_qu(block.counts[grid][:, moon]))
     box = box_number(paper.x, paper.y)
     delta = np.empty_like(paper.delta)
     for b in range(BOXES_ALONG * BOXES_ALONG):
@@ -353,8 +358,8 @@ def full_moon_scheme(
             continue
         away = np.hypot(paper.x[inside] - centre_x[b], paper.y[inside] - centre_y[b])
         near = inside[away <= away.min() + 0.25 * BOX_WIDTH]
-        patch = seen[near].mean(axis=0) - delta_centre[b]
-        delta[inside] = np.average(seen[inside] - patch, axis=1, weights=weight)
+        patch = moon_qu[near].mean(axis=0) - delta_centre[b]
+        delta[inside] = np.average(moon_qu[inside] - patch, axis=1, weights=weight)
     return dataclasses.replace(paper, delta=delta)
 
 

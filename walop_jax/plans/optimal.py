@@ -560,24 +560,24 @@ def _filled(
         count = count + (np.arange(len(count)) == can[int(np.argmax(gain))])
 
 
-def _exchanged(some: _Some, count: Float[np.ndarray, " s"]) -> tuple[_Some, Float[np.ndarray, " _"], bool]:
+def _exchanged(support: _Some, count: Float[np.ndarray, " s"]) -> tuple[_Some, Float[np.ndarray, " _"], bool]:
     """One exchange that lowers the criterion, if there is one: the most promising by their slopes are tried."""
-    problem, value = some.experiment, some.value(count)
-    covariance = some.covariance(count)
-    phi = some.variances(covariance)
+    problem, value = support.experiment, support.value(count)
+    covariance = support.covariance(count)
+    phi = support.variances(covariance)
     # The worst targets, smoothly: the slope of the maximum alone would forget the next one.
     shares = problem.of_one(problem.relative(phi) ** _SHARPNESS)
     promising = lower_bound(problem, covariance, shares).tops
-    new = [top for top in promising if not any(_same(top, candidate) for candidate in some.chosen)]
+    new = [top for top in promising if not any(_same(top, candidate) for candidate in support.chosen)]
     used = np.flatnonzero(count)
-    some = _Some(problem, [*(some.chosen[i] for i in used), *new])
+    support = _Some(problem, [*(support.chosen[i] for i in used), *new])
     count = np.concatenate([count[used], np.zeros(len(new))])
-    y = covariance @ some.wide
-    slope = np.einsum("rsk,rk->s", some.gains(y), shares)
-    worst = some.worst(phi)
-    remaining = problem.budget - some.costs @ count
+    y = covariance @ support.wide
+    slope = np.einsum("rsk,rk->s", support.gains(y), shares)
+    worst = support.worst(phi)
+    remaining = problem.budget - support.costs @ count
     out, into = np.meshgrid(np.arange(len(used)), np.arange(len(count)), indexing="ij")
-    fits = (some.costs[into] - some.costs[out] <= remaining * (1 + 1e-9)) & (out != into)
+    fits = (support.costs[into] - support.costs[out] <= remaining * (1 + 1e-9)) & (out != into)
     promise = np.where(fits, slope[into] - slope[out], -np.inf)
     for flat in np.argsort(-promise, axis=None)[:_TRIED]:
         i, j = np.unravel_index(flat, promise.shape)
@@ -587,6 +587,6 @@ def _exchanged(some: _Some, count: Float[np.ndarray, " s"]) -> tuple[_Some, Floa
         changed[i] -= 1
         changed[j] += 1
         least = value * (1 - 1e-9)
-        if worst.value(changed) < least and some.value(changed) < least:
-            return some, changed, True
-    return some, count, False
+        if worst.value(changed) < least and support.value(changed) < least:
+            return support, changed, True
+    return support, count, False

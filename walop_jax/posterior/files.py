@@ -103,13 +103,13 @@ class Chain:
                     float(str(file.attrs["seconds"])),
                 )
                 count = len(file)
-            kept: list[Any] = [
+            arrays: list[Any] = [
                 HDFBackend(str(self.path), name=f"ensemble{n}", read_only=True) for n in range(count)
             ]
-            stretches = [Stretch(k.get_chain(), k.get_log_prob(), _shares(k)) for k in kept]
+            stretches = [Stretch(k.get_chain(), k.get_log_prob(), _shares(k)) for k in arrays]
             states = [
                 emcee_state(s.positions[-1], s.log_density[-1], k.random_state)
-                for s, k in zip(stretches, kept, strict=True)
+                for s, k in zip(stretches, arrays, strict=True)
             ]
         except Exception as error:  # whatever a damaged file brings about
             raise fail(f"cannot be read: {error}", file=self.path, advice=_ADVICE) from error

@@ -124,9 +124,9 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
     def _located(self, path: Path) -> Path:
         beside = self.folder.resolve()
         for folder in (Path(), beside, *beside.parents):
-            for there in (folder / path, folder / path.name):
-                if there.exists():
-                    return there
+            for candidate in (folder / path, folder / path.name):
+                if candidate.exists():
+                    return candidate
         raise fail(
             f"cannot be found, neither from {Path.cwd()} nor beside {self.folder}",
             file=path,
@@ -179,17 +179,17 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
 
     def display(self) -> Display:
         """The files, and the calibration if there is one."""
-        found = self.documents
+        documents = self.documents
         files = {"calibration": PRODUCT, "posterior": POSTERIOR}
         held = [name for name, file in files.items() if file in self]
-        facts = [("holds", ", ".join([*held, *found]) or "nothing")]
-        known = found.get("summary", {}).get("accuracy_of_p")
-        if known and found["summary"].get("trusted"):
-            share = f"below 0.1 % over {100 * known['share_below_goal']:.0f} % of it"
+        facts = [("holds", ", ".join([*held, *documents]) or "nothing")]
+        accuracy = documents.get("summary", {}).get("accuracy_of_p")
+        if accuracy and documents["summary"].get("trusted"):
+            share = f"below 0.1 % over {100 * accuracy['share_below_goal']:.0f} % of it"
             facts.append(
-                ("p of a star", f"{two_digits(100 * known['median'])} % (median of the field), {share}")
+                ("p of a star", f"{two_digits(100 * accuracy['median'])} % (median of the field), {share}")
             )
-        facts += [(name, VERDICTS[name](found[name])) for name in VERDICTS if name in found]
+        facts += [(name, VERDICTS[name](documents[name])) for name in VERDICTS if name in documents]
         inner = Display("") if self.calibration is None else self.calibration.display()
         return dataclasses.replace(
             inner, title=f"Run {self.folder}. {inner.title}".removesuffix(". "), facts=(*facts, *inner.facts)

@@ -442,21 +442,21 @@ class ObservingPlan:
         )
 
 
-def filter_curve(given: str | FilterCurve) -> FilterCurve:
+def filter_curve(curve: str | FilterCurve) -> FilterCurve:
     """A built-in filter, one of the narrow bands of `NARROW_BANDS` (flat-topped, 15 nm wide), or a curve, checked."""
-    if isinstance(given, FilterCurve):
-        given = _own_filter(given.name, given)
-    if isinstance(given, FilterCurve):
-        return given
-    if given in NARROW_BANDS:
+    if isinstance(curve, FilterCurve):
+        curve = _own_filter(curve.name, curve)
+    if isinstance(curve, FilterCurve):
+        return curve
+    if curve in NARROW_BANDS:
         offset = np.linspace(-0.015, 0.015, 61)
         throughput = np.exp(-np.log(2.0) * (offset / 0.0075) ** 6)
-        return FilterCurve(given, NARROW_BANDS[given] + offset, throughput)
-    if given in BUILTIN_FILTERS or single_wavelength(given) is not None:
-        return builtin_filter(given)
-    suggestion = nearest(given, (*BUILTIN_FILTERS, *NARROW_BANDS, "MONO-6500"))
+        return FilterCurve(curve, NARROW_BANDS[curve] + offset, throughput)
+    if curve in BUILTIN_FILTERS or single_wavelength(curve) is not None:
+        return builtin_filter(curve)
+    suggestion = nearest(curve, (*BUILTIN_FILTERS, *NARROW_BANDS, "MONO-6500"))
     raise ValueError(
-        f"filters: there is no filter {given!r}; {suggestion}; a filter of your own is a table [filters.{given}] with "
+        f"filters: there is no filter {curve!r}; {suggestion}; a filter of your own is a table [filters.{curve}] with "
         "wavelength (um) and throughput, in Python a FilterCurve"
     )
 

@@ -147,9 +147,9 @@ def _stars_of(plan: ObservingPlan, catalogue: Sources, true: Standards) -> tuple
     rows = np.unique(catalogue.stars)[: len(plan.star_names)]
     sources = Sources(**{f.name: getattr(catalogue, f.name)[rows] for f in dataclasses.fields(catalogue)})
     standards = standards_of(sources, plan.exposures(), plan.curves())
-    known = dict(zip((leaf.name for leaf in leaves(true)), np.asarray(values_of(true)), strict=True))
+    true_values = dict(zip((leaf.name for leaf in leaves(true)), np.asarray(values_of(true)), strict=True))
     values = zip((leaf.name for leaf in leaves(standards)), np.asarray(values_of(standards)), strict=True)
-    return sources, with_values(standards)(np.array([known.get(*pair) for pair in values]))
+    return sources, with_values(standards)(np.array([true_values.get(*pair) for pair in values]))
 
 
 def _scattered(
@@ -161,12 +161,12 @@ def _scattered(
 ) -> Cube:
     """Counts that the stars of a field have beyond those of their mean q, u: light is linear in them."""
     _, source = plan.layout()
-    seen, whole = source[:, :, None] == plan.standards, np.zeros_like(expected)
+    measured, scatter = source[:, :, None] == plan.standards, np.zeros_like(expected)
     for axis in "qu":
         moved = truth.changed("standard", **{axis: lambda value: value.at[plan.standards].add(_PROBE)})
-        own = plan.zero_scatter * rng.standard_normal(len(expected))
-        whole += np.where(seen, own[:, None, None] * (counts(moved) - expected) / _PROBE, 0.0)
-    return whole
+        deviation = plan.zero_scatter * rng.standard_normal(len(expected))
+        scatter += np.where(measured, deviation[:, None, None] * (counts(moved) - expected) / _PROBE, 0.0)
+    return scatter
 
 
 @dataclasses.dataclass(frozen=True)
@@ -239,8 +239,8 @@ def simulate(
     flux = fluxes(plan, None if steady else sky)
     expected = _expected(blank, truth, flux)
     if plan.zero_stars and plan.zero_scatter > 0 and not noiseless:
-        own = np.random.SeedSequence(seed if catalogue_seed is None else catalogue_seed).spawn(5)[4]
-        stars = np.random.default_rng(own)
+        seeds = np.random.SeedSequence(seed if catalogue_seed is None else catalogue_seed).spawn(5)[4]
+        stars = np.random.default_rng(seeds)
         expected += _scattered(plan, truth, expected, lambda other: _expected(blank, other, flux), stars)
     detector = PhotonNoise(plan.read_noise)
     if noiseless:
