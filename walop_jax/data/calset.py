@@ -68,7 +68,7 @@ _SAMPLE = 8  # image rows looked at when frames are opened; every block is check
 def read_calibration_set(*paths: str | os.PathLike[str], kinds: Collection[str] = ()) -> CalibrationSet:
     """Read and check one calibration set, merging several files into one.
 
-    Whole frames are not read, only described; their blocks are checked as they are read. What was odd but
+    Whole frames are not read, only described; their blocks are checked as they are read. Oddities that are
     harmless (unknown columns, masked rows, …) stands in `remarks`. `kinds` are kinds of exposures beyond `KINDS`,
     for sources of the caller's own.
 
@@ -262,7 +262,7 @@ def _idle(intensities: TableIntensities, exposures: Exposures, path: Path) -> li
 def _frames(
     images: Mapping[str, Any], exposures: Exposures, instrument: str, path: Path
 ) -> tuple[Intensities, Points]:
-    """Describe frames, and look at a few rows of pixels for what is wrong everywhere."""
+    """Describe frames, and check a few rows of pixels for faults of the whole."""
     if np.any(bad := exposures.direct("standard")):
         what = f"EXPOSURE {exposures.exposure[bad][0]} is a standard, and a pixel of a frame has no SOURCE"
         advice = "give standards in a table, in another file"

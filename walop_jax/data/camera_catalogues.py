@@ -1,8 +1,8 @@
 """Catalogues of single cameras as programs of photometry write them, by a map of the names of their columns.
 
 A map is a small TOML file: those of SExtractor and photutils stand beside this file, others are the user's. It says
-which columns are fluxes with their errors, positions on the sky or in pixels, and flags, and what the bits of the flags
-mean here. What a catalogue has under several names is read from the first that is there.
+which columns are fluxes with their errors, positions on the sky or in pixels, and flags, and the meaning of the bits
+of the flags. A quantity with several columns is read from the first one that the catalogue has.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class ColumnMap:
 class CameraCatalogue:
     """The stars of one camera: positions (deg), fluxes with errors (counts), and bits of FLAG.
 
-    `of_stars` are columns that go with the stars, `of_exposure` what is the same for all of them; `header` is that of
+    `of_stars` are columns that go with the stars, `of_exposure` the values that all of them share; `header` is that of
     the image, empty where the file has none. Fluxes that were not measured are NaN.
     """
 

@@ -158,7 +158,7 @@ def make_exposures(
     place: Place,
     kinds: Collection[str] | None = KINDS.keys(),
 ) -> Exposures:
-    """Check the EXPOSURES table (degrees, days, kelvin, …) for what every KIND needs.
+    """Check the EXPOSURES table (degrees, days, kelvin, …) for the columns that every KIND needs.
 
     `kinds` are those that KIND may have, None: any.
     """

@@ -337,7 +337,7 @@ class RawRows(NamedTuple):
 
 
 def float64(values: Array) -> Float[Array, ...]:
-    """Numbers from the words of big-endian float32; what is float64 stays so."""
+    """Numbers from the words of big-endian float32; float64 stays as it is."""
     if values.dtype != jnp.uint32:
         return values
     swapped = ((values & 0xFF) << 24) | ((values & 0xFF00) << 8) | ((values >> 8) & 0xFF00) | (values >> 24)
@@ -347,7 +347,7 @@ def float64(values: Array) -> Float[Array, ...]:
 class RowReader:
     """Reads image rows of all frames into arrays of `height` × `width` pixels, which each thread uses again and again.
 
-    What was made of the rows must be finished before the next ones are read.
+    Computations on the rows must be finished before the next ones are read.
     """
 
     def __init__(self, intensities: FrameIntensities, height: int, width: int) -> None:
@@ -373,7 +373,7 @@ class RowReader:
         return RawRows(jax.device_put(counts), jax.device_put(sigma), ~closed)
 
     def _buffers(self) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, "e h w"]]:
-        """This thread's arrays. Closed pixels hold zeros or what was there before, and are never used."""
+        """This thread's arrays. Values of closed pixels are undefined and never used."""
         if not hasattr(self._own, "buffers"):
             frames = self.intensities
             cubes = [cube for stack in frames.stacks for cube in (*stack.counts, *stack.sigma)]

@@ -1,6 +1,6 @@
 """Exposures from the words of an observatory: headers of FITS files, exports of a telescope's log, tables of words.
 
-A TOML file says which word is which column of EXPOSURES, in which unit, and what is to be made of it (docs: files): no
+A TOML file says which word is which column of EXPOSURES, in which unit, and how it is converted (docs: files): no
 code of an observatory's own. Expressions are arithmetic; nothing else is evaluated.
 """
 
@@ -45,7 +45,7 @@ _OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
 class Word:
     """Origin of a column: the first of `words` that is there, or a fixed `value`.
 
-    `values` replace what the word says (names of filters, kinds, positions), `unit` is that of the word, `expression`
+    `values` replace those of the word (names of filters, kinds, positions), `unit` is that of the word, `expression`
     makes the value of the column of x, the value in the unit of the column, and of other columns by name.
     """
 
@@ -59,7 +59,7 @@ class Word:
 
 @dataclasses.dataclass(frozen=True)
 class Words:
-    """The words of an observatory by column of EXPOSURES, and what else its files need (`TOP`)."""
+    """The words of an observatory by column of EXPOSURES, and the other entries of its file (`TOP`)."""
 
     columns: Mapping[str, Word]
     extension: int = 0
@@ -69,7 +69,7 @@ class Words:
 
 
 def read_words(path: str | os.PathLike[str]) -> Words:
-    """The words in a file. Raises `DataError` for a column that EXPOSURES do not have, and for what no word has."""
+    """The words in a file. Raises `DataError` for a column that EXPOSURES do not have, and for unknown keys."""
     with errors_naming(path):
         return words_of(parse_toml(read_text(path)))
 
@@ -115,7 +115,7 @@ def exposures_table(
     names = list(dict.fromkeys(name for row in rows for name in row))
     if "KIND" not in names:
         raise Place(records[0][0], "").fail(
-            "nothing says what was observed", "KIND", "add [KIND] to the words"
+            "the kind of the exposures is not known", "KIND", "add [KIND] to the words"
         )
     place = Place(", ".join(dict.fromkeys(file for file, _ in records)), "EXPOSURES")
     columns = {name: _column([row.get(name) for row in rows], name) for name in names}
@@ -255,7 +255,7 @@ def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any
         }
         if _text(value).upper() not in truth_values:
             raise place.fail(
-                f"{what} is neither true nor false", name, 'say what it means: values = { "…" = true }'
+                f"{what} is neither true nor false", name, 'give its meaning: values = { "…" = true }'
             )
         return truth_values[_text(value).upper()]
     number = _number(value, name, rule, word, place, what)
@@ -306,7 +306,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _column(values: Sequence[Any], name: str) -> np.ndarray:
-    """The values of all exposures; what some lack is what an absent column would hold."""
+    """The values of all exposures; missing ones are those of an absent column."""
     rule = EXPOSURES.get(name)
     missing = (
         False if name.endswith("_IN") else 0.0 if name.endswith("_TURN") else rule.missing if rule else np.nan

@@ -1,4 +1,4 @@
-"""Contents of a calibration set, and what is wrong with it: numbers and findings; nothing is printed here."""
+"""Contents and faults of a calibration set: numbers and findings; nothing is printed here."""
 
 from __future__ import annotations
 
@@ -254,7 +254,7 @@ def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
     if not calset.exposures.further:
         yield from _about_angles(made)
     if made.points < 2:
-        # What another instrument needs its own description says.
+        # The needs of other instruments are in their descriptions.
         severity = "fault" if calset.instrument in shipped() else "note"
         yield Finding(
             severity,

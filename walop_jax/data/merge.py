@@ -322,7 +322,7 @@ def _join_tables(
         joined,
         exposure=np.concatenate([t.exposure + n for t, n in zip(tables, first_exposure, strict=False)]),
         point=np.concatenate([row[n + t.point] for t, n in zip(tables, first_point, strict=False)]),
-        # The appended −1 is what a row without a source (−1, the last entry) becomes.
+        # The appended −1 is the entry of a row without a source (−1, the last entry).
         source=np.concatenate(
             [np.append(rows, -1)[t.source] for t, rows in zip(tables, source_rows, strict=True)]
         ),

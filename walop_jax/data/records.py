@@ -309,7 +309,7 @@ class Sources:
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """Intensities of some field points in all exposures, dense: what the likelihood is fed with.
+    """Intensities of some field points in all exposures, dense: the input of the likelihood.
 
     `counts` and `sigma` in electrons, camera by camera; `used` is False where there is no measurement, or a
     flagged or unusable one (counts 0 and sigma 1 stand there). `source` is a row of `Sources`, -1 for none.
@@ -391,7 +391,7 @@ class CalibrationSet(Displayed):
         return self.intensities.cameras
 
     def display(self) -> Display:
-        """Summary of what was observed, without reading frames."""
+        """Summary of the observations, without reading frames."""
         e, points = self.exposures, self.points
         kinds = ", ".join(f"{number} {kind}" for kind, number in Counter(e.kind.tolist()).items())
         facts = {

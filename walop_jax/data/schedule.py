@@ -54,8 +54,8 @@ def schedule_of(
 ) -> tuple[dict[str, Any], list[str]]:
     """The schedule of exposures in their order, and remarks; `names` are those of their targets.
 
-    `facts` are name, pi, observer, mode. Raises `DataError` for what a schedule cannot state: more than four filters,
-    other moving elements, a turn that is not one of half turns or faster than three turns a minute.
+    `facts` are name, pi, observer, mode. Raises `DataError` for exposures that no schedule can hold: more than four
+    filters, other moving elements, a turn that is not one of half turns or faster than three turns a minute.
     """
     facts, remarks = dict(facts or {}), list[str]()
     _check(exposures, filters)
@@ -107,7 +107,8 @@ def read_schedule(
     """The exposures of a schedule, the names of their targets, and remarks.
 
     An acquisition that was executed may hold `executed`, the UTC at which each exposure began. Without it times are not
-    known. Raises `DataError`, with target and acquisition, for what is missing or cannot be stated of an exposure.
+    known. Raises `DataError`, with target and acquisition, for missing entries and for states that an exposure cannot
+    have.
     """
     try:
         content = json.loads(read_text(path))

@@ -1,7 +1,7 @@
 """The columns of all tables, what their values must be, and the one way in which they become arrays.
 
 Columns go by name, in upper or lower case. A unit that can be converted is converted; a missing unit is that of the
-column (docs: files); anything else is refused. What comes out is native-endian. FITS tables, tables of users and arrays
+column (docs: files); anything else is refused. Arrays are native-endian. FITS tables, tables of users and arrays
 in memory differ only in how their values are had.
 """
 
@@ -27,7 +27,7 @@ CALVERS = 2
 
 
 class Rule(NamedTuple):
-    """Condition on the values of a column: where `broken` is true, what they are and what to do about it."""
+    """Condition on the values of a column: where `broken` is true, the fault and its remedy."""
 
     broken: Callable[[np.ndarray], np.ndarray]
     what: str
@@ -57,7 +57,7 @@ class Column:
     """One column of a table: its kind, its unit in memory, and its value where the file lacks it.
 
     `missing` None means that the column is required; `width` is the number of values in a row, or None for
-    as many as the file has. `shape_advice` says what a row should hold, `remarked` whether it is worth a remark
+    as many as the file has. `shape_advice` describes the row that is expected, `remarked` whether it is worth a remark
     that the column is not there, `rules` what holds for its values in any table.
     """
 
@@ -229,7 +229,7 @@ def distinct(names: Iterable[str], place: Place) -> list[str]:
 
 
 def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[dict[str, Any], list[str]]:
-    """Turn a FITS table into arrays by column name, in the units of `columns`, and remarks on what was odd.
+    """Turn a FITS table into arrays by column name, in the units of `columns`, and remarks on oddities.
 
     Raises `DataError` for a missing, duplicated or ill-typed column, a unit that cannot be converted, and a
     table without rows.
@@ -272,7 +272,7 @@ def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[d
 
 
 def table_of(given: Mapping[str, Any], columns: Mapping[str, Column], place: Place) -> dict[str, np.ndarray]:
-    """A table in memory, its columns by name, as `read_table` would have it; what is absent takes its default.
+    """A table in memory, its columns by name, as `read_table` returns it; absent columns have their defaults.
 
     Raises `DataError` for a column that is missing, ill-typed or of another shape than `columns` say, and for one that
     `columns` do not have.
@@ -337,8 +337,8 @@ def values_of(
     """The values of a column in the kind, unit and shape of its rule; numbers that are masked are NaN.
 
     `given` is a column of an astropy table, an array, a quantity, times or a list; `unit` that of one without. In a
-    table of a user (`lenient`) texts may be numbers and truth values, and an empty cell holds what an absent column
-    would.
+    table of a user (`lenient`) texts may be numbers and truth values, and an empty cell has the value of an absent
+    column.
 
     Raises `DataError`, with rows, for values of another kind or shape, for whole numbers, truth values and names that
     are masked, and as `convert_unit` does.
@@ -457,7 +457,7 @@ def in_unit(values: Any, unit: str, name: str) -> Float[np.ndarray, "*s"]:
     """Numbers that callers bring along (lists, scalars, quantities, columns) as native float64 in `unit`.
 
     Numbers without a unit are taken to have it, masked ones are NaN. `name` is what errors call them. Raises
-    `DataError` for a unit that cannot be converted and for what is not a number.
+    `DataError` for a unit that cannot be converted and for values that are not numbers.
     """
     place = Place("", "")
     unit_given = unit_of(values)

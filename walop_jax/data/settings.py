@@ -1,4 +1,4 @@
-"""Optical settings: what the optics of an instrument are computed for, field point apart; built-in filters."""
+"""Optical settings, for which the optics of an instrument are computed at a field point; built-in filters."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def _format(path: Path) -> str:
 
 
 def _content(path: Path) -> tuple[bytes, str]:
-    """The bytes of a file, unpacked, and the name of what they are."""
+    """The bytes of a file, unpacked, and the name of the file that they are of."""
     packed = unpacking(path)
     if packed is None:
         return path.read_bytes(), path.name
@@ -136,7 +136,7 @@ def _from_fits(path: Path, extension: str, needed: Collection[str]) -> tuple[Any
 
 
 def table_of_hdu(hdu: Any) -> Any:
-    """The astropy table of an extension: what is undefined is masked, and times are such."""
+    """The astropy table of an extension: undefined values are masked, times are astropy times."""
     from astropy.table import Table
 
     table = Table.read(hdu, character_as_bytes=False)
@@ -146,7 +146,7 @@ def table_of_hdu(hdu: Any) -> Any:
 
 
 def _hide_undefined(table: Any, hdu: Any) -> None:
-    """Mask what is undefined; astropy compares TNULL with scaled values."""
+    """Mask undefined values; astropy compares TNULL with scaled values."""
     from astropy.table import MaskedColumn
 
     for index, name in enumerate(hdu.columns.names):

@@ -198,7 +198,7 @@ def _cameras(counts: np.ndarray, sigma: np.ndarray, exposures: Exposures, place:
 
 
 def _judge(counts: np.ndarray, used: np.ndarray, spoilt: np.ndarray, place: Place) -> list[str]:
-    """Refuse data that cannot be what they should; remark on what has been masked."""
+    """Refuse data that cannot be measurements; remark on masked rows."""
     bad = np.flatnonzero(spoilt)
     if len(bad) > _SPOILT * len(spoilt):
         cameras = [f"N[{k}]" for k in range(counts.shape[1]) if not np.any(np.isfinite(counts[:, k]))]

@@ -86,7 +86,7 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
         raise place.fail(f"the unit {unit!r} is not known", name, f"use {wanted or 'no unit'}") from error
     target = units.Unit(wanted)
     if unit_given == target:
-        return values  # no arithmetic: what was written comes back bit for bit
+        return values  # no arithmetic: values come back bit for bit
     if _is_logarithmic(unit_given):
         advice = f"give the column in {wanted or 'fractions'}"
         if wanted == "electron":

@@ -49,7 +49,7 @@ class InputTable:
     """A table as it was read, to be handed back with columns added; `rows` is its length.
 
     `used` are the columns that were asked for and are there, `lacking` those that are not; `remarks` say how the table
-    was read, and what is odd in it.
+    was read, and on its oddities.
     """
 
     path: Path
@@ -236,8 +236,8 @@ def sky_positions(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Right ascensions and declinations (deg) of a table; as sexagesimal texts they are in hours and degrees.
 
-    Raises `DataError` for what is no angle, and for right ascensions without a unit that are hours: none beyond 24, of
-    a field that would be a fifteenth as wide as high.
+    Raises `DataError` for values that are no angles, and for right ascensions without a unit that are hours: none
+    beyond 24, of a field that would be a fifteenth as wide as high.
     """
     ra, dec = (_angles(source, *pair) for pair in zip(names, "hd", strict=True))
     column, finite = source.column(names[0]), np.isfinite(ra)

@@ -248,7 +248,7 @@ def import_transmissions(
 
     An exposure is a wavelength (a filter MONO-<Ångström>) and a state, unpolarised light first; rows that lack a
     camera are left out, exposures and points without any row too. MJD has no meaning, but tells exposures apart.
-    N_ERR is the share `error` of N, at least the rounding of what is printed. `remarks` say what was left out.
+    N_ERR is the share `error` of N, at least the rounding of the printed values. `remarks` list the rows left out.
 
     `instrument` is a shipped one, by default that which the titles of the exports name; `configurations` are those of
     the four cameras O1, E1, O2, E2; `tell` is told of the progress. Each file is read once.
@@ -365,7 +365,7 @@ def _dense(
 ) -> tuple[Float[np.ndarray, "w s p 4"], Float[np.ndarray, "w s p 4"]]:
     """Transmissions of all exports and the steps they are printed in, NaN where there are none.
 
-    What is there twice is refused, and so is a configuration that is none of the cameras.
+    Duplicates are refused, and so is a configuration that is none of the cameras.
     """
     values, step = np.full((2, len(wavelengths), len(angles), len(yx), 4), np.nan)
     owner = np.full(values.shape, -1)

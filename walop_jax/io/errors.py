@@ -19,7 +19,7 @@ _ALIKE, _SHORT = 0.75, 3
 
 
 class DataError(ValueError):
-    """An input cannot be trusted; the message says what is wrong, where, and what to do about it.
+    """An input cannot be trusted; the message states fault, place and remedy.
 
     >>> walop.read("nowhere.fits")
     Traceback (most recent call last):
@@ -39,7 +39,7 @@ def fail(
 
 
 def printable(text: str) -> str:
-    """The text on one line: what a terminal cannot show (of a damaged header, of a hostile name) as its escape."""
+    """The text on one line, with escapes for unprintable characters (of a damaged header, of a hostile name)."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -65,7 +65,8 @@ def rows_text(rows: Sequence[int] | np.ndarray) -> str:
 def nearest(name: str, names: Iterable[str]) -> str:
     """Advise on a name that does not exist: the names most like it, or some of those that there are.
 
-    Of a mapping the values are what the names mean: where none is much like it, those are taken that have a word of it.
+    Of a mapping the values are the meanings of the names: where none is much like it, those are taken that have a word
+    of it.
     """
     meanings = names if isinstance(names, Mapping) else {}
     names = sorted(set(names))

@@ -88,14 +88,14 @@ def _as_votable(table: Table) -> Any:
 
 
 def stacked(first: Any, second: Any) -> Any:
-    """The rows of two tables as one; what a row has no column for is masked."""
+    """The rows of two tables as one; cells without a value are masked."""
     return vstack([first, second], metadata_conflicts="silent")
 
 
 def write_table(path: str | os.PathLike[str], table: Table, *, overwrite: bool = False) -> None:
     """Write an astropy table in the format of the name; whole or not at all.
 
-    Raises `DataError` as `atomic_path` does, for an unknown extension, and for what the format cannot hold.
+    Raises `DataError` as `atomic_path` does, for an unknown extension, and for columns that the format cannot hold.
     """
     kind = table_format(path)
     with atomic_path(path, overwrite=overwrite) as temporary, warnings.catch_warnings():

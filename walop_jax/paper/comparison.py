@@ -212,7 +212,7 @@ class Comparison(Displayed):
         )
 
     def columns(self) -> dict[str, tuple[np.ndarray, str]]:
-        """One row per point, the grid first: position, errors of both methods, what the paper gives."""
+        """One row per point, the grid first: position, errors of both methods, the values of the paper."""
         places = (self.grid, self.between)
         count = len(self.between.x)
         on_grid = np.arange(len(self.grid.x) + count) < len(self.grid.x)

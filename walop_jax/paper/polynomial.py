@@ -5,7 +5,7 @@
 
 Step 1      Unweighted least squares on the states behind the calibration polariser, point by point.
 Step 2      A transmission model T_k = s₁ + s₂ q + s₃ u (+ s₄ q² + s₅ u²) per camera predicts 100 stars with
-            p ≤ 5 %; the mean differences Δq, Δu between what the polynomial makes of them and what they are
+            p ≤ 5 %; the mean differences Δq, Δu between the result of the polynomial and the truth
             are taken off; μ and σ of what remains characterise the point.
 
 The squares of T_k: light is linear, so s₄ = s₅ = 0; behind a polariser q² + u² is constant and they cannot be told
@@ -16,7 +16,7 @@ Full Moon   The field is divided into 5 × 5 boxes. In each, standard stars at t
             whole box; the patches, with their polarisation so known, give Δq, Δu of every other point of the box.
 Checks      A patch need not be what single Rayleigh scattering says (neutral points, aerosol, cloud). Seen with the
             joint model, (q, u) of exposure m at point i is compared with s_m R_mi + c_m, R the Rayleigh sky for δ = 1:
-              flat       χ² of what is left per degree of freedom: structure that no smooth sky has;
+              flat       χ² of the residuals per degree of freedom: structure that no smooth sky has;
               Rayleigh   departure D_m of the patch's mean from δ R, δ the median of all patches' s_m.
             Weight of a patch: 1 / (1 + (D/D₀)²) / max(1, χ²/dof), D₀ = 0.05 %.
 """
@@ -86,7 +86,7 @@ class PaperCalibration:
         return polynomial(self.coefficients, measured) - self.delta[:, None]
 
     def between(self, x: Float[np.ndarray, " m"], y: Float[np.ndarray, " m"]) -> PaperCalibration:
-        """Coefficients and Δ interpolated bilinearly to other positions: what the paper says cannot be done.
+        """Coefficients and Δ interpolated bilinearly to other positions, which the paper excludes.
 
         Raises ValueError where the points are no regular grid.
         """

@@ -1,4 +1,4 @@
-"""Possible observations and their costs: filters, plates, exposure times, what is up, the time beside exposing.
+"""Possible observations and their costs: filters, plates, exposure times, visibility, overheads.
 
 Their file (docs: files) is that of an observing plan, of which the polariser angles are ignored, with a few entries
 more.
@@ -68,7 +68,7 @@ class CandidateExposure(NamedTuple):
 
     Angles of the polariser repeat themselves after `turn` (deg): half a turn, or a whole one where it is not ideal. The
     place of an exposure is the phase (rad) of its angle θ in that turn; where the plate is free, that of the direction
-    2α − θ in which light is polarised behind the plate at α, with which what is seen changes quickly, and that of α.
+    2α − θ in which light is polarised behind the plate at α, with which counts change quickly, and that of α.
     """
 
     kind: str
@@ -165,7 +165,7 @@ class Available:
 
     @classmethod
     def read(cls, content: Mapping[str, Any], folder: Path) -> Available:
-        """From the entries of a file; raises ValueError for what is not known or not allowed."""
+        """From the entries of a file; raises ValueError for unknown or impossible ones."""
         content, options = dict(content), {}
         for name in ("altitude", "places"):
             if name in content:
@@ -181,7 +181,7 @@ class Available:
         return cls(plan_of(content, folder), Costs(**costs), seconds, **options)
 
     def choices(self) -> tuple[tuple[CandidateExposure, ...], tuple[str, ...]]:
-        """All choices, and in words what had to be left out, with what would do."""
+        """All choices, and remarks on those left out, with a remedy."""
         plan, notes = self.plan, []
         up: dict[str, tuple[int, ...]] = {}
         for kind, total in (("moon", plan.moon_patches), ("standard", len(plan.star_names))):
@@ -217,7 +217,7 @@ class Available:
                 yield dataclasses.replace(blank, number=number, place=place)
 
     def _up(self, kind: str, total: int) -> tuple[tuple[int, ...], list[str]]:
-        """Numbers of what is up in the dark, and what to say of the rest."""
+        """Numbers of those that are up in the dark, and remarks on the others."""
         if not total:
             return (), []
         plan, what = self.plan, "Moon patches" if kind == "moon" else "standards"
@@ -246,7 +246,7 @@ class Available:
     def doubts(self, plan: ObservingPlan) -> tuple[str, ...]:
         """Sentences on exposures of a plan that cannot be taken at the times that it gives them.
 
-        What is up is chosen at the begin of the night, before the order of the exposures is known.
+        Visibility is checked at the begin of the night, before the order of the exposures is known.
         """
         exposures = plan.exposures()
         exposures = exposures[exposures.direct("moon", "standard")]

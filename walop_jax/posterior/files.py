@@ -65,14 +65,14 @@ def _write_hdf5(
 class Chain:
     """The chain of emcee in the folder of a run: `emcee.backends.HDFBackend(path, name="ensemble0")`, … reads it.
 
-    `fingerprint` says what it was sampled from, and with.
+    `fingerprint` identifies data, model and options of the sample.
     """
 
     def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, str]) -> None:
         self.path, self.fingerprint = Path(folder) / CHAIN, dict(fingerprint)
 
     def save(self, states: Sequence[State], stretches: Sequence[Stretch], seconds: float) -> None:
-        """Write all ensembles with their states at the end, in the place of what is there."""
+        """Write all ensembles with their states at the end, in place of the former ones."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
 
         def fill(file: h5py.File) -> None:

@@ -97,7 +97,7 @@ def _chain(
 @functools.lru_cache(maxsize=1)
 def _kernels(with_gradient: Callable[..., tuple[Array, Array]]) -> tuple[Callable[..., Any], ...]:
     """Compiled functions that begin a chain and take a step, for one density."""
-    blackjax = importlib.import_module("blackjax")  # optional: what does not import it does not need it
+    blackjax = importlib.import_module("blackjax")  # optional
 
     def log_density(position: Array, arrays: tuple[Any, ...]) -> Array:
         # Value and gradient are known together; this hands both to whoever differentiates.

@@ -225,11 +225,11 @@ LEVELS = {"68": (0.1587, 0.8413), "95": (0.0228, 0.9772)}
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Options of `sample`. `interval` is the length of a block, hence of what a kill can lose, in steps; whole blocks
+    """Options of `sample`. `interval` is the length of a block, which a killed run can lose, in steps; whole blocks
     are done, so that there are never more steps than `maximum_steps`.
 
     `sampler` is a name (`emcee`, `nuts`), `FILE.py:CLASS`, or a `Sampler`; `walkers` and `moves` are options of emcee,
-    `walkers` 0 standing for twice the number of sampled coefficients, at least 64. `parameters` names what is
+    `walkers` 0 standing for twice the number of sampled coefficients, at least 64. `parameters` are the names of those
     sampled (None: the physics coefficients); samplers of the exact posterior sample all and show these in figures.
     Every `thin`-th step is stored (0: as is usual for the sampler). `checks` is the number of draws compared with the
     exact posterior. Raises ValueError for what makes no sense.

@@ -47,7 +47,7 @@ SAME_FIT = 0.05  # standard errors
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """The folder of a run; everything in it is read when it is asked for. None stands for what is not there.
+    """The folder of a run; files are read when they are needed. None stands for files that are missing.
 
     `catalogue` are the effects that its model may have, `data` the sets of its fit (default: where they were, in the
     folder of the run, or beside it).
@@ -110,7 +110,7 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
     def calset(self) -> CalibrationSet:
         """The data of the fit.
 
-        Raises `DataError` where the run does not say what they were, and where they are not there or have changed.
+        Raises `DataError` where the run does not name them, and where they are missing or have changed.
         """
         inputs = () if self.product is None else self.product.inputs
         if not inputs:

@@ -113,7 +113,7 @@ class Sampler(abc.ABC):
 
     @abc.abstractmethod
     def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
-        """Return the ensemble after `steps` more steps, and what they gave."""
+        """Return the ensemble after `steps` more steps, and their results."""
 
 
 def make_sampler(

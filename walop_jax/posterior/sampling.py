@@ -42,12 +42,12 @@ SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy")
 
 
 class Ensembles:
-    """The ensembles of a run and what they have stored so far: every `thin`-th step of blocks of `interval` steps."""
+    """The ensembles of a run and their stored steps: every `thin`-th step of blocks of `interval` steps."""
 
     def __init__(
         self, sampler: Sampler, density: Density, options: Options, chain: Chain | None = None
     ) -> None:
-        """Takes up what is in `chain`, or starts."""
+        """Resumes from `chain` where it exists, or starts."""
         self.sampler, self.density = sampler, density
         self.options, self.chain = options, chain
         self.thin = options.thin or sampler.thin
@@ -158,7 +158,7 @@ def fingerprint(target: Target, options: Options) -> dict[str, str]:
     parameters = [(p.name, p.start, p.free, p.tie, p.scale) for p in model.parameters]
     priors = [(p.name, p.prior, p.loose) for p in model.parameters]
     chain = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
-    for name in ("maximum_steps", "draws", "checks"):  # how long, and what is made of it: free to change
+    for name in ("maximum_steps", "draws", "checks"):  # length and summary: free to change
         del chain[name]
     for name in ("sampler", "walkers", "moves"):  # have an entry of their own
         del chain[name]
@@ -222,7 +222,7 @@ def sample(
     if chain is not None and chain.path.exists():
         if not resume:
             raise fail("holds a chain already", file=folder, advice="go on with --resume, or --overwrite it")
-        chain.load()  # what is not of this fit is refused before the work
+        chain.load()  # a chain of another fit is refused before the work
     if sampler.exact:
         posterior = ExactPosterior(target, choose_sampled(target, options.parameters), options.inflate)
         seconds = 0.0
@@ -308,7 +308,7 @@ def sandwich_adjusted(
                 errors; C (`robust`) that from residuals (`fit.robust`), both of all parameters of the model
     Source      open-faced sandwich: Shaby 2014, Journal of Computational and Graphical Statistics 23, 853
     Limits      C = H⁻¹: nothing changes. Ω is not the symmetric root of that paper but lower triangular; both give
-                draws of covariance C where those of the sampler have H⁻¹, and what is skew in them stays skew. Chains
+                draws of covariance C where those of the sampler have H⁻¹, and their skewness stays. Chains
                 stay as they were sampled.
 
     `errors_from` names the origin of C in the result.

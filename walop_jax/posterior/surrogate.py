@@ -120,7 +120,7 @@ class Surrogate:
 
     @property
     def monitored_names(self) -> tuple[str, ...]:
-        """Names of what is sampled, as people quote it."""
+        """Names of the sampled parameters."""
         return (*(self.names[i] for i in self.sampled), *((INFLATION,) if self.inflate else ()))
 
     def monitored(self, z: Float[np.ndarray, "... k"]) -> Float[np.ndarray, "... q"]:

@@ -106,7 +106,7 @@ class Stop:
             )
 
     def document(self) -> dict[str, Any]:
-        """The stop as plain data, with what is as usual left out from `kind` on."""
+        """The stop as plain data, usual values left out from `kind` on."""
         later = {"kind": "clp", "number": 0, "place": None, "seconds": None, "turn": 0.0}
         return {k: v for k, v in dataclasses.asdict(self).items() if k not in later or v != later[k]}
 
@@ -582,7 +582,7 @@ def _entries(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _written(value: Any) -> Any:
-    """Lists and tables as TOML has them, OUT for what is out."""
+    """Lists and tables as TOML has them, OUT for elements that are out."""
     if isinstance(value, Mapping):
         return {name: _written(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):

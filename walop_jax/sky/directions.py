@@ -2,7 +2,7 @@
 
     east = X sin R + Y cos R,    north = X cos R − Y sin R      on the tangent plane (deg), R = ROTATOR
 
-X and Y are coordinates on the sky: what the optics distort between sky and detector is in the WCS of an image, not in
+X and Y are coordinates on the sky: the distortion between sky and detector is in the WCS of an image, not in
 them. The axes of the instrument are carried along great circles from the field centre to a star (docs: conventions), so
 that +X has at the star the position angle
 
