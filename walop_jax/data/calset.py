@@ -115,12 +115,11 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         place = Place(path, name)
         if name in hdus:
             columns = column_names(hdus[name], place)
-            if primary["CALVERS"] == 1:  # CLP and CHWP alone move there, whatever other columns are called
-                defined = {
-                    *schema.TABLES[name],
-                    *(f"{prefix}_TURN" for prefix in (POLARISER, CALIBRATION_PLATE)),
-                }
-                columns = [column for column in columns if column in defined]
+            if (
+                primary["CALVERS"] == 1 and name == "EXPOSURES"
+            ):  # CLP and CHWP alone move, whatever else is there
+                turns = [f"{prefix}_TURN" for prefix in (POLARISER, CALIBRATION_PLATE)]
+                columns = [column for column in columns if column in {*schema.EXPOSURES, *turns}]
             rules = table_rules(name, columns, place)
             tables[name], odd = read_table(hdus[name], rules, place)
             remarks += odd
@@ -318,6 +317,7 @@ def from_arrays(
     filters: Mapping[str, Any] | None = None,
     sources: Mapping[str, Any] | None = None,
     source: Any = None,
+    sky: Any = None,
     origin: str = "",
     **exposures: Any,
 ) -> CalibrationSet:
@@ -328,9 +328,10 @@ def from_arrays(
     exposure in degrees, NaN where it is out. `kinds` is the KIND of every exposure, or one for all.
 
     Any other column of EXPOSURES goes by its name in small letters, one value or one for each exposure: `mjd`,
-    `filter`, `teff`, `temp`, `ha`, `ra`, `dec`, `rotator`, `chwp_in`, `chwp_angle`, … (docs: files). `sources` are
-    the columns of SOURCES, `source` (point, exposure) the SOURCE of every intensity, −1 for none; `filters` are
-    `FilterCurve`s by name. Quantities are converted.
+    `filter`, `teff`, `temp`, `ha`, `ra`, `dec`, `rotator`, `chwp_in`, `chwp_angle`, … (docs: files). `sources` are the
+    columns of SOURCES, `source` (point, exposure) the SOURCE of every intensity, −1 for none; `sky` the level of the
+    sky that was subtracted from the counts, in their shape; `filters` are `FilterCurve`s by name. Quantities are
+    converted.
 
     Raises `DataError`, naming column and row, for whatever a file would be refused for.
 
@@ -379,6 +380,9 @@ def from_arrays(
             "N_ERR": errors[point, exposure],
         },
     }
+    if sky is not None:
+        level = np.broadcast_to(in_unit(sky, "electron", "sky"), counts.shape)
+        tables["INTENSITIES"] = {**tables["INTENSITIES"], "SKY": level[point, exposure]}
     if sources is not None:
         tables["SOURCES"] = _sources(sources)
     if filters:

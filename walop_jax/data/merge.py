@@ -330,7 +330,15 @@ def _join_tables(
             name: np.concatenate([getattr(table, name) for table in tables])
             for name in ("counts", "sigma", "flag", "used")
         },
+        sky=_joined_sky(tables),
     ), joined
+
+
+def _joined_sky(tables: Sequence[TableIntensities]) -> np.ndarray | None:
+    """The level of the sky in all tables, 0 in those that do not state it."""
+    if all(table.sky is None for table in tables):
+        return None
+    return np.concatenate([np.zeros_like(t.counts) if t.sky is None else t.sky for t in tables])
 
 
 def _earlier_ones(points: Points) -> Int[np.ndarray, " p"]:

@@ -129,6 +129,7 @@ INTENSITIES: Mapping[str, Column] = {
     "N_ERR": _COUNTS,
     "FLAG": Column("int", missing=0),
 }
+SKY = dataclasses.replace(_COUNTS, missing=np.nan)
 _SHARE = within(1.0, "fractions are wanted: are these per cent?", "exceeds 1")
 _FRACTION = Column("float", rules=(finite("remove the source"), _SHARE))
 _ERROR = Column("float", rules=(_POSITIVE,))
@@ -172,9 +173,11 @@ def check(table: Mapping[str, np.ndarray], columns: Mapping[str, Column], place:
 def table_rules(name: str, columns: Collection[str], place: Place) -> Mapping[str, Column]:
     """The columns of a table of a calibration set, where a file has `columns` (in capitals).
 
-    EXPOSURES has a pair `<P>_IN`, `<P>_ANGLE` for every moving element. Raises `DataError` for half a pair and for a
-    prefix that is none.
+    EXPOSURES has a pair `<P>_IN`, `<P>_ANGLE` for every moving element, INTENSITIES may have SKY. Raises `DataError`
+    for half a pair and for a prefix that is none.
     """
+    if name == "INTENSITIES" and "SKY" in columns:
+        return {**INTENSITIES, "SKY": SKY}
     return TABLES[name] if name != "EXPOSURES" else {**EXPOSURES, **_moving_columns(columns, place)}
 
 

@@ -39,7 +39,8 @@ class TableIntensities(Intensities):
     """One row per (exposure, point), in the order of the file.
 
     `exposures` is their number in the set; `exposure`, `point` and `source` are rows of its tables (`source` −1: none),
-    `counts` and `sigma` electrons as in the file, `flag` its bits, `used` which rows take part.
+    `counts` and `sigma` electrons as in the file, `flag` its bits, `used` which rows take part. `sky` is the level of
+    the sky that was subtracted from the counts (electrons), 0 where it is not known; None: nowhere.
     """
 
     exposures: int
@@ -51,6 +52,7 @@ class TableIntensities(Intensities):
     sigma: Float[np.ndarray, "r k"]
     flag: Int[np.ndarray, " r"]
     used: Bool[np.ndarray, " r"]
+    sky: Float[np.ndarray, "r k"] | None = None
 
     @functools.cached_property
     def _by_point(self) -> tuple[Int[np.ndarray, " u"], Int[np.ndarray, " b"]]:
@@ -153,7 +155,7 @@ def table_intensities(
 
     Raises `DataError` for identifiers that do not exist, repeated (EXPOSURE, POINT) pairs, errors that are
     not positive, too many spoilt rows, nothing used, counts that are all equal, a single camera
-    that sees light of unknown flux only, and another number of errors than of counts.
+    that sees light of unknown flux only, another number of errors than of counts, and a sky below 0.
     """
     _cameras(table["N"], table["N_ERR"], exposures, place)
     exposure = _rows_of(table["EXPOSURE"], exposures.exposure, "EXPOSURE", "EXPOSURES", place)
@@ -183,6 +185,7 @@ def table_intensities(
         sigma=sigma,
         flag=flag,
         used=used,
+        sky=_sky(table, place),
     )
     return intensities, remarks + unlisted
 
@@ -195,6 +198,19 @@ def _cameras(counts: np.ndarray, sigma: np.ndarray, exposures: Exposures, place:
     if errors != number:
         what = f"has {errors} value(s) in a row, N has {number}"
         raise place.fail(what, "N_ERR", "give the error of every camera")
+
+
+def _sky(table: dict[str, Any], place: Place) -> Float[np.ndarray, "r k"] | None:
+    """The level of the sky, 0 where it is not known; None without it."""
+    if "SKY" not in table:
+        return None
+    sky = np.where(np.isnan(table["SKY"]), 0.0, table["SKY"])
+    if sky.shape != table["N"].shape:
+        raise place.fail(f"has {sky.shape[1]} value(s) in a row", "SKY", "give the sky of every camera, as N")
+    place.refuse(
+        (sky < 0) | np.isinf(sky), "is below 0 or infinite", "SKY", "the level that was subtracted, or NaN"
+    )
+    return sky
 
 
 def _judge(counts: np.ndarray, used: np.ndarray, spoilt: np.ndarray, place: Place) -> list[str]:

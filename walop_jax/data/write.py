@@ -152,6 +152,8 @@ def set_tables(calset: CalibrationSet) -> dict[str, dict[str, np.ndarray]]:
             "FLAG": intensities.flag,
         },
     }
+    if intensities.sky is not None:
+        tables["INTENSITIES"]["SKY"] = intensities.sky
     if len(sources):
         tables["SOURCES"] = sources.columns()
     if calset.filters:
