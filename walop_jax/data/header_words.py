@@ -22,7 +22,7 @@ import numpy as np
 from walop_jax.data.records import KINDS
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, table_of, table_rules
 from walop_jax.data.table_files import read_table_file
-from walop_jax.data.units import Place, convert_unit
+from walop_jax.data.units import Place, convert_unit, sexagesimal
 from walop_jax.io.errors import errors_naming, fail, nearest
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.io.toml import Reader
@@ -35,6 +35,7 @@ TOP: Mapping[str, Any] = {"extension": int, "rows": str, "filters": Mapping[str,
 filters and facts of schedules (`data.schedule`)."""
 _SEXAGESIMAL = re.compile(r"[+-]?\d+[: ]\d+[: ]\d+(\.\d*)?")
 _MOVES = re.compile(r"[A-Z][A-Z0-9_]*_(IN|ANGLE|TURN)")
+_INSIDE = dict.fromkeys(("t", "true", "1", "in"), True) | dict.fromkeys(("f", "false", "0", "out"), False)
 _OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
     ast.Pow: operator.pow, ast.Mod: operator.mod, ast.USub: operator.neg, ast.UAdd: operator.pos,
@@ -243,21 +244,12 @@ def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any
     if rule.kind == "str":
         return _text(value)
     if rule.kind == "bool":
-        truth_values = {
-            "T": True,
-            "TRUE": True,
-            "1": True,
-            "IN": True,
-            "F": False,
-            "FALSE": False,
-            "0": False,
-            "OUT": False,
-        }
-        if _text(value).upper() not in truth_values:
+        text = _text(value).lower()
+        if text not in _INSIDE:
             raise place.fail(
                 f"{what} is neither true nor false", name, 'give its meaning: values = { "…" = true }'
             )
-        return truth_values[_text(value).upper()]
+        return _INSIDE[text]
     number = _number(value, name, rule, word, place, what)
     if rule.kind == "int":
         if number != round(number):
@@ -278,9 +270,7 @@ def _number(value: Any, name: str, rule: Column, word: Word, place: Place, what:
                 f"{what} is no date", name, "as 2026-11-26T01:02:03, or a number of days"
             ) from None
     if isinstance(value, str) and rule.unit in ("deg", "h") and _SEXAGESIMAL.fullmatch(value.strip()):
-        head, *sexagesimal = re.split("[: ]", value.strip())
-        sign = -1.0 if head.startswith("-") else 1.0
-        number = sign * (abs(float(head)) + float(sexagesimal[0]) / 60.0 + float(sexagesimal[1]) / 3600.0)
+        number = sexagesimal(value)
         if not word.unit:
             raise place.fail(
                 f"{what} may be hours or degrees", name, 'say unit = "hourangle" or unit = "deg"'

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, Exposures, Position, Site, Sources
+from walop_jax.data.units import sexagesimal
 from walop_jax.io.errors import fail
 from walop_jax.io.text import read_text
 
@@ -261,8 +262,8 @@ def _read(
                     "mjd": _mjd(began[k], place) + seconds / 2 / 86400.0 if began else math.nan,
                     "exptime": float(seconds),
                     "filter": name_of[number_of_filter],
-                    "ra": 15.0 * _degrees(coordinates.get("ra")),
-                    "dec": _degrees(coordinates.get("dec")),
+                    "ra": 15.0 * sexagesimal(coordinates.get("ra")),
+                    "dec": sexagesimal(coordinates.get("dec")),
                     "positions": {p: _position(state, p, seconds, place) for p, state in positions.items()},
                 }
 
@@ -293,10 +294,3 @@ def _mjd(text: Any, place: str) -> float:
         raise fail(f"executed: {text!r} is no time", file=place, advice="as 2026-11-26T01:02:03Z") from None
     began = began.astimezone(datetime.UTC).replace(tzinfo=None) if began.tzinfo else began
     return (began - datetime.datetime(1858, 11, 17)) / datetime.timedelta(days=1)
-
-
-def _degrees(text: Any) -> float:
-    if text is None:
-        return math.nan
-    digits = [float(digit) for digit in str(text).strip("+-").split(":")]
-    return (-1.0 if str(text).startswith("-") else 1.0) * sum(p / 60.0**k for k, p in enumerate(digits))

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 USUAL_SCATTER = 0.27
 """Degrees, the smallest variability of an angle that was found (Cotton et al. 2024, arXiv:2410.23466)."""
@@ -53,20 +52,4 @@ def shipped_standards() -> Any:
     }
     for number, (name, values) in enumerate(columns.items()):
         table.add_column(values, index=number if number == 0 else number + 1, name=name)
-    return table
-
-
-def distances(table: Any, ra: float, dec: float) -> Float[np.ndarray, " n"]:
-    """Angles (deg) between the stars of a table and a direction (deg)."""
-    from astropy.coordinates import angular_separation
-
-    alpha, delta = (np.deg2rad(np.asarray(table[name].to_value("deg"), float)) for name in ("RA", "DEC"))
-    return np.rad2deg(angular_separation(alpha, delta, np.deg2rad(ra), np.deg2rad(dec)))
-
-
-def in_degrees(table: Any, name: str, values: Float[np.ndarray, " n"]) -> Any:
-    """The table with one more column of angles (deg)."""
-    from astropy import units
-
-    table[name] = values * units.deg
     return table

@@ -238,12 +238,19 @@ def _judge(counts: np.ndarray, used: np.ndarray, spoilt: np.ndarray, place: Plac
     return remarks
 
 
+def _positions(ids: np.ndarray, known: np.ndarray) -> Int[np.ndarray, " r"]:
+    """Positions of identifiers among those known, −1 where they are not there."""
+    if not len(known):
+        return np.full(len(ids), -1)
+    order = np.argsort(known, kind="stable")
+    at = order[np.minimum(np.searchsorted(known[order], ids), len(known) - 1)]
+    return np.where(known[at] == ids, at, -1)
+
+
 def _rows_of(ids: np.ndarray, known: np.ndarray, column: str, table: str, place: Place) -> np.ndarray:
     """Turn identifiers into rows of the table that defines them."""
-    order = np.argsort(known, kind="stable")
-    at = np.minimum(np.searchsorted(known[order], ids), len(known) - 1)
-    rows = order[at]
-    if np.any(absent := known[rows] != ids):
+    rows = _positions(ids, known)
+    if np.any(absent := rows < 0):
         first = ids[np.argmax(absent)]
         near = known[np.argmin(np.abs(known - first))]
         what = f"{column} {first} does not exist in {table}, asked for"
@@ -260,11 +267,7 @@ def _source_rows(
     place: Place,
 ) -> tuple[np.ndarray, list[str]]:
     """Turn SOURCE into rows of SOURCES; a standard needs one, any other source may be unlisted."""
-    rows = np.full(len(ids), -1, dtype=np.int64)
-    if len(sources):
-        order = np.argsort(sources.source, kind="stable")
-        at = order[np.minimum(np.searchsorted(sources.source[order], ids), len(order) - 1)]
-        rows = np.where((sources.source[at] == ids) & (ids >= 0), at, -1)
+    rows = np.where(ids >= 0, _positions(ids, sources.source), -1)
     standard = exposures.direct("standard")[exposure] & used
     if np.any(bad := standard & (rows < 0)):
         listed = ", ".join(str(entry) for entry in sources.source[:10]) or "none"

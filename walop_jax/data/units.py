@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -32,6 +33,14 @@ class Place:
     def remark(self, what: str, column: str) -> str:
         """A sentence about a column of this table."""
         return f"{self.file} [{self.extension}] {column}: {what}"
+
+
+def sexagesimal(text: str | None) -> float:
+    """The number of a text ±d:m:s, in the unit of d; NaN for None."""
+    if text is None:
+        return float("nan")
+    digits = [float(part) for part in re.split("[: ]", text.strip().strip("+-"))]
+    return (-1.0 if text.strip().startswith("-") else 1.0) * sum(d / 60.0**k for k, d in enumerate(digits))
 
 
 def unit_of(column: Any) -> str:

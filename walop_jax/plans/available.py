@@ -21,19 +21,12 @@ from walop_jax.io.errors import errors_naming
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.parameters import check_names
 from walop_jax.simulation.observing_plan import EXPOSED, OUT, ObservingPlan, Stop, is_plan, plan_of
+from walop_jax.sky.directions import separation
 from walop_jax.sky.moon import altitude, body_direction
 
-Direction = Float[np.ndarray, "2 *e"] | tuple[Any, Any]
 DARK = -12.0  # altitude of the Sun (deg) below which the sky is dark enough for Moon and stars
 _FULL = 120.0  # distance of Moon and Sun (deg) from which the Moon is as good as full
 _SEARCHED, _STEP = 60.0, 1.0 / 24.0  # days in which a better time is looked for, and its steps
-
-
-def separation(one: Direction, other: Direction) -> Float[np.ndarray, "*e"]:
-    """Angle (deg) between directions: right ascension and declination (deg)."""
-    (a, d), (b, e) = np.deg2rad(one), np.deg2rad(other)
-    cosine = np.sin(d) * np.sin(e) + np.cos(d) * np.cos(e) * np.cos(a - b)
-    return np.asarray(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,11 +190,8 @@ class Available:
                     blank = Stop(
                         0.0 if kind == "clp" else None, name, stops[0], moving, kind=kind, seconds=seconds
                     )
-                    members = (
-                        (blank,)
-                        if kind == "clp" or (kind == "lamp" and plan.lamps)
-                        else tuple(self._members(blank, up.get(kind, ())))
-                    )
+                    indoors = kind == "clp" or (kind == "lamp" and plan.lamps)
+                    members = (blank,) if indoors else tuple(self._members(blank, up.get(kind, ())))
                     if members:
                         candidates.append(CandidateExposure(kind, name, where, seconds, members))
                     if kind == "clp" and self.any_plate and stops[0] == plan.plate[0]:
@@ -209,11 +199,9 @@ class Available:
         return tuple(candidates), tuple(notes)
 
     def _members(self, blank: Stop, numbers: tuple[int, ...]) -> Iterator[Stop]:
-        single = self.places and blank.kind == "standard"
         for number in numbers:
-            for place in (
-                range(self.plan.standard_grid**2) if single and number < self.plan.standards else (None,)
-            ):
+            single = self.places and blank.kind == "standard" and number < self.plan.standards
+            for place in range(self.plan.standard_grid**2) if single else (None,):
                 yield dataclasses.replace(blank, number=number, place=place)
 
     def _up(self, kind: str, total: int) -> tuple[tuple[int, ...], list[str]]:
@@ -272,5 +260,5 @@ class Available:
         site = self.plan.site
         moon, sun = body_direction("moon", mjd, site), body_direction("sun", mjd, site)
         high = altitude(mjd, *moon, site) >= self.altitude + self.plan.separations[1]
-        good = np.flatnonzero(high & (altitude(mjd, *sun, site) < DARK) & (separation(moon, sun) > _FULL))
+        good = np.flatnonzero(high & (altitude(mjd, *sun, site) < DARK) & (separation(*moon, *sun) > _FULL))
         return f"; mjd = {mjd[good[0]]:.2f} would do" if len(good) else "; choose another night (mjd)"

@@ -27,7 +27,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind
-from walop_jax.plans.available import Available, separation
+from walop_jax.plans.available import Available
 from walop_jax.plans.criteria import (
     APART,
     NAMED,
@@ -50,6 +50,7 @@ from walop_jax.plans.optimal import (
     worth,
 )
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.sky.directions import separation
 
 _NOTHING = 1e-6  # of the prior information: less of it makes no plan
 _ALIKE = 3.0  # deg: angles of the plate that are taken as one
@@ -163,9 +164,7 @@ class ExposurePlan(Displayed):
             "any_plate": self.any_plate,
             "truncation": self.truncation,
             "goal": self.goal,
-            "minutes_to_goal": None
-            if self.needed is None
-            else dict(zip(("best", "least"), self.needed, strict=True)),
+            "minutes_to_goal": self.needed and dict(zip(("best", "least"), self.needed, strict=True)),
             "draws": len(self.after),
             "share_below_goal": self.share,
             "beside": dict(self.beside),
@@ -272,9 +271,9 @@ def plan_exposures(
     )
     if progress is not None:
         progress("criterion")
-    field = None if apart or len(choices.model.template.cameras.pairs) != 2 else field_errors(choices)
-    if field is None and criterion in ("worst", "mean"):
-        field = field_errors(choices)  # raises, with advice
+    two_arms = len(choices.model.template.cameras.pairs) == 2
+    over_field = criterion in ("worst", "mean")  # raises, with advice, for other numbers of arms
+    field = field_errors(choices) if over_field or (two_arms and not apart) else None
     return plan_from(
         choices, minutes, criterion_by_name(choices, field, criterion), field,
         known=None if known is None else information_of(known, choices.names, choices.effects),
@@ -493,7 +492,7 @@ def _ordered(found: Candidates, plan: Allocation) -> list[Line]:
     while sky:
         same = [line for line in sky if key(line) == key(sky[0])]
         last = done[-1] if done and done[-1] in where else same[0]
-        after = min(same, key=lambda line: float(separation(where[last], where[line])))
+        after = min(same, key=lambda line: float(separation(*where[last], *where[line])))
         done.append(after)
         sky.remove(after)
     return done
@@ -520,7 +519,7 @@ def _changes(found: Candidates, lines: list[Line]) -> Iterator[float]:
             time += costs.position * sum(choice.positions[p] != a for p, a in last.positions.items())
         if choice.kind in ("moon", "standard"):
             (pointing,) = _pointings(found, [line])
-            time += 0.0 if previous is None else costs.slew * float(separation(previous, pointing))
+            time += 0.0 if previous is None else costs.slew * float(separation(*previous, *pointing))
             previous = pointing
         last = choice
         yield time

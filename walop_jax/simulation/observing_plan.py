@@ -47,9 +47,7 @@ NARROW_BANDS: Mapping[str, float] = {"NB-580": 0.580, "NB-660": 0.660}  # centre
 _SPACING = 0.004  # d between exposures
 _GOLDEN = 0.5 * (3.0 - np.sqrt(5.0))  # of a turn: spreads any number of angles evenly
 _ZERO_EDGE = 0.9  # of the field
-_SPREAD = np.array(
-    [1.0 / 1.324717957244746, 1.0 / 1.324717957244746**2]
-)  # Roberts 2018: evenly in two dimensions
+_SPREAD = 1.0 / 1.324717957244746 ** np.array([1.0, 2.0])  # Roberts 2018: evenly in two dimensions
 _STANDARD_EDGE = 0.8  # of the field: 5 × 5 centres of boxes that fill it
 EXPOSED: Mapping[str, float] = {
     name: kind.seconds for name, kind in KINDS.items() if kind.seconds is not None

@@ -329,9 +329,8 @@ def fluxes(plan: ObservingPlan, rng: np.random.Generator | None) -> Float[np.nda
     transparency = rng.uniform(*TRANSPARENCY, used.shape[1])
     illumination = rng.uniform(0.9, 1.1, used.shape[0])
     field = [np.mean(TRANSPARENCY)] * (len(plan.star_names) - plan.standards)
-    brightness = np.concatenate(
-        [rng.uniform(*TRANSPARENCY, plan.standards), field, [1.0]]
-    )  # the last: no star
+    stars = rng.uniform(*TRANSPARENCY, plan.standards)
+    brightness = np.concatenate([stars, field, [1.0]])  # the last: no star
     return 4.0 * electrons * illumination[:, None] * transparency * brightness[source]
 
 

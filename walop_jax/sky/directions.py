@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from astropy import units
-from astropy.coordinates import SkyCoord
+from astropy.coordinates import SkyCoord, angular_separation
 from astropy.wcs import WCS
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
@@ -61,7 +61,7 @@ class Pointing:
         self, ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
         """Distance of directions from the field centre (deg)."""
-        return np.asarray(_directions(self.ra, self.dec).separation(_directions(ra, dec)).deg, float)
+        return separation(self.ra, self.dec, ra, dec)
 
     def rotator_at(
         self, ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"]
@@ -71,6 +71,11 @@ class Pointing:
         outward = np.asarray(centre.position_angle(stars).deg)
         back = np.asarray(stars.position_angle(centre).deg) + 180.0
         return np.mod(self.rotator + np.where(self.separation(ra, dec) > 0.0, back - outward, 0.0), 360.0)
+
+
+def separation(ra: Any, dec: Any, other_ra: Any, other_dec: Any) -> Float[np.ndarray, "*n"]:
+    """Angle between directions (all in degrees)."""
+    return np.asarray(np.rad2deg(angular_separation(*map(np.deg2rad, (ra, dec, other_ra, other_dec)))))
 
 
 def galactic(
