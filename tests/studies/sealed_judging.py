@@ -12,7 +12,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import matrix_slopes
 from walop_jax.data.settings import Settings
 from walop_jax.diagnosis.findings import Diagnosis
-from walop_jax.model.effects import EFFECTS
+from walop_jax.model.effects import EFFECTS, Described, FreeForm, OtherDescription
 from walop_jax.model.effects.change import Change
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import effect_context
@@ -95,6 +95,7 @@ def homes_of(where: str, law: str) -> set[str]:
             "catalogue": "standards",
             "band": "band",
             "angle": "polariser",
+            "rotator": "ahead of polariser",
             "pair": "polariser",
             "sky": "moon",
         }
@@ -147,7 +148,10 @@ def right_of(one: Sealed, diagnosis: Diagnosis) -> str:
         texts = []
         for name in names:
             effect = next((kind for kind in EFFECTS if kind.name == name), None)
-            texts += name.split("; ") if effect is None else effect.neutral(context).in_sentences(bare)
+            if effect is not None:
+                texts += effect.neutral(context).in_sentences(bare)
+            elif name not in (Described.name, FreeForm.name, OtherDescription.name):
+                texts += name.split("; ")
         return {home_of(text, bare) for text in texts}
 
     told, classes = [], []
