@@ -32,6 +32,7 @@ from jaxtyping import Bool, Float
 from scipy import special
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import log_evidence_ratio
@@ -434,6 +435,21 @@ def _stated(calset: CalibrationSet) -> Iterator[_Stated]:
             what = f"TEFF of exposures of kind {kind}"
             yield _Stated(what, "K", remedy, "a measured spectrum of their light", typical, warmer, stated)
     yield from _of_sky(calset)
+    table = calset.intensities
+    if isinstance(table, TableIntensities) and table.sky is not None and table.sky.any():
+        remedy, shown_by = "subtract the sky anew", "the same stars under a sky of another level"
+        less = functools.partial(_with_less_sky, calset, table)
+        yield _Stated(
+            "the light of the sky that is left, in units of SKY,", "", remedy, shown_by, 0.1, less, 0.0
+        )
+
+
+def _with_less_sky(calset: CalibrationSet, table: TableIntensities, share: float) -> CalibrationSet:
+    """The set from whose counts a further share of the sky is subtracted."""
+    assert table.sky is not None
+    return dataclasses.replace(
+        calset, intensities=dataclasses.replace(table, counts=table.counts - share * table.sky)
+    )
 
 
 def _moved(
