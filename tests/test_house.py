@@ -193,10 +193,10 @@ MOST_LINES = {
     "calibration": 2850,
     "posterior": 2400,
     "science": 6400,
-    "diagnosis": 7920,
+    "diagnosis": 7930,
     "nights": 2800,
-    "plans": 2350,
-    "paper": 860,
+    "plans": 2370,
+    "paper": 870,
     "reports": 3090,
     "commands": 4795,
 }
