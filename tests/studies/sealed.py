@@ -19,8 +19,8 @@ of an element, side from which it came, KIND (some of them, with stars or withou
 decade and a half about what the data just show. Stars are taken at the time of the first exposure, at 10 °C, for 60 s.
 
 Printed are each set, and the table: pulls and errors of the matrix between the points, and of stars with p = 2 %, at
-400 places, where |det| is 0.1 or more, of stars so faint that no detector shows a power of their counts. A set counts where
-the truth is Δχ² = 30 better than the base model.
+400 places, where |det| is 0.1 or more, of stars so faint that no detector shows a power of their counts. A set counts
+where the truth is Δχ² = 30 better than the base model.
 
 All stars share the error of one calibration, so that even an exact covariance puts many of them beyond three errors now
 and then (`chance.py`). Beside the number of products that are trusted and wrong stands therefore the number that their
@@ -557,6 +557,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=3.0)
     parser.add_argument("--budget", type=float, default=np.inf, help="minutes after which no set is begun")
     parser.add_argument("--refit-only", action="store_true")
+    parser.add_argument("--table", type=Path, help="file of the table so far, written after every set")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     found, end = [], time.monotonic() + 60.0 * options.budget
@@ -565,6 +566,9 @@ def main() -> int:
             break
         found.append(outcome(number, options))
         print(line(number, found[-1]), flush=True)
+        if options.table:
+            options.table.write_text(table(found) + "\n", encoding="utf-8")
+        jax.clear_caches()  # the programs of every set are others
     print(table(found))
     return 0
 
