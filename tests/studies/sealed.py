@@ -241,7 +241,7 @@ def sealed(number: int, seed: int, side: int) -> Sealed:
     what = ("nothing", "tables")[number % 12] if number % 12 < 2 else "physics"
     one = draw(rng, calset) if what == "physics" else None
     expected = counts(params, data, calset, one)
-    counted = rng.poisson(expected) + 5.0 * rng.standard_normal(expected.shape)
+    counted = rng.poisson(np.clip(expected, 0.0, None)) + 5.0 * rng.standard_normal(expected.shape)
     sigma = np.sqrt(np.maximum(counted, 1.0) + 25.0)
     table = TableIntensities.of(calset.intensities, calset.points)
     order = {
@@ -305,7 +305,7 @@ def counts(
         if one.where == "gain":
             expected = expected * (1.0 + change)
         elif one.where == "power of counts":
-            expected = expected * (1.0 + change * (expected / ELECTRONS) ** one.gamma)
+            expected = expected * (1.0 + change * np.clip(expected / ELECTRONS, 0.0, None) ** one.gamma)
         else:
             other = expected[:, [1, 2, 3, 0]]
             expected = expected + np.abs(change) * other
