@@ -19,8 +19,8 @@ of an element, side from which it came, KIND (some of them, with stars or withou
 decade and a half about what the data just show. Stars are taken at the time of the first exposure, at 10 °C, for 60 s.
 
 Printed are each set, and the table: pulls and errors of the matrix between the points, and of stars with p = 2 %, at
-400 places, where |det| is 0.1 or more, of stars so faint that no detector shows a power of their counts. A set counts where
-the truth is Δχ² = 30 better than the base model.
+400 places, where |det| is 0.1 or more, of stars so faint that no detector shows a power of their counts. A set counts
+where the truth is Δχ² = 30 better than the base model.
 
 All stars share the error of one calibration, so that even an exact covariance puts many of them beyond three errors now
 and then (`chance.py`). Beside the number of products that are trusted and wrong stands therefore the number that their
@@ -241,7 +241,7 @@ def sealed(number: int, seed: int, side: int) -> Sealed:
     what = ("nothing", "tables")[number % 12] if number % 12 < 2 else "physics"
     one = draw(rng, calset) if what == "physics" else None
     expected = counts(params, data, calset, one)
-    counted = rng.poisson(expected) + 5.0 * rng.standard_normal(expected.shape)
+    counted = rng.poisson(np.clip(expected, 0.0, None)) + 5.0 * rng.standard_normal(expected.shape)
     sigma = np.sqrt(np.maximum(counted, 1.0) + 25.0)
     table = TableIntensities.of(calset.intensities, calset.points)
     order = {
@@ -305,7 +305,7 @@ def counts(
         if one.where == "gain":
             expected = expected * (1.0 + change)
         elif one.where == "power of counts":
-            expected = expected * (1.0 + change * (expected / ELECTRONS) ** one.gamma)
+            expected = expected * (1.0 + change * np.clip(expected / ELECTRONS, 0.0, None) ** one.gamma)
         else:
             other = expected[:, [1, 2, 3, 0]]
             expected = expected + np.abs(change) * other
@@ -557,6 +557,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=3.0)
     parser.add_argument("--budget", type=float, default=np.inf, help="minutes after which no set is begun")
     parser.add_argument("--refit-only", action="store_true")
+    parser.add_argument("--table", type=Path, help="file of the table so far, written after every set")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     found, end = [], time.monotonic() + 60.0 * options.budget
@@ -565,6 +566,9 @@ def main() -> int:
             break
         found.append(outcome(number, options))
         print(line(number, found[-1]), flush=True)
+        if options.table:
+            options.table.write_text(table(found) + "\n", encoding="utf-8")
+        jax.clear_caches()  # the programs of every set are others
     print(table(found))
     return 0
 
