@@ -23,6 +23,8 @@ from walop_jax.model.cameras import DetectorPart, ExposurePart, GhostPart, Mixin
 from walop_jax.model.effects.change import (
     KINDS,
     OPPOSITE,
+    SINGLE,
+    SLOW,
     AtPoint,
     Change,
     Grows,
@@ -30,6 +32,7 @@ from walop_jax.model.effects.change import (
     Scalar,
     SlotTerm,
     Term,
+    Tried,
     in_exposures,
 )
 from walop_jax.model.effects.factors import COUNTS, EXPOSURE, FIELD, WAVELENGTH
@@ -174,8 +177,27 @@ _WITH: Mapping[str, tuple[str, ...]] = {
 }
 
 
+_CAMERA = (
+    Tried(along=("counts",), among=("alone", "all")),
+    Tried(along=("harmonics to 6", *SLOW, *SINGLE, "side", "night", "step", "exposure", "kind")),
+    Tried(("tilt",), ("harmonics to 1",), ("alone", "all")),  # an image that goes in a circle
+    Tried(("tilt", "focus"), SLOW),
+    Tried(("tilt",), (*SINGLE, "kind", "side"), ("alone", "arm")),
+)
+_ARM = (
+    Tried(along=(*SLOW, *SINGLE, "night")),
+    Tried(("rings",)),
+    Tried(("tilt",), (*SLOW, *SINGLE, "kind")),
+)
+_LIGHT = Tried(along=("steady", *SLOW, *SINGLE, "kind")), Tried(among=("all",))
+
+
 def _grows(instrument: Instrument, change: Change) -> Grows:
-    return Grows(_WITH.get(stage_of(change), ()), None)
+    stage = stage_of(change)
+    tried = _LIGHT if stage == "median" else (Tried(among=("alone", "all")),)
+    if change.kind == "gain":
+        tried = _CAMERA if change.place in instrument.cameras.names else _ARM
+    return Grows(_WITH.get(stage, ()), None, tried)
 
 
 def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:

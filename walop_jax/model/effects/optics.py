@@ -22,6 +22,8 @@ from jaxtyping import Array, Float
 from walop_jax.model import mueller
 from walop_jax.model.effects.change import (
     KINDS,
+    SINGLE,
+    SLOW,
     AtPoint,
     Change,
     Grows,
@@ -29,6 +31,7 @@ from walop_jax.model.effects.change import (
     Scalar,
     SlotTerm,
     Term,
+    Tried,
     in_exposures,
     itself,
     product,
@@ -53,6 +56,14 @@ GENERATORS = (
 """Kinds of which all others are sums."""
 ADDED = ("added polarisation q", "added polarisation u")
 DISPLACEMENTS = ("displacement x", "displacement y")
+GROUPS = (
+    *(tuple(f"{what} {axis}" for axis in "qu") for what in ("diattenuation", "retardance")),
+    ("diattenuation v",),
+    ("retardance v",),
+    ("depolarisation",),
+    *((f"{what} {axis}",) for what in ("diattenuation", "retardance") for axis in ("radial", "diagonal")),
+)
+"""Kinds that a diagnosis tries, those of one phenomenon together."""
 
 
 def generators_of(kind: str) -> tuple[tuple[str, float, tuple[str, ...]], ...]:
@@ -189,16 +200,41 @@ def _beside(instrument: Instrument, element: Element, change: Change) -> Instrum
     return instrument.inserted(element, **{"before" if change.where == "ahead of" else "after": change.place})
 
 
+_FIELD = ("even", "tilt", "r2", "astigmatic")
+_OF_FIELD_KINDS = {"q": _FIELD[:3], "u": _FIELD[:3], "radial": _FIELD[:1], "diagonal": _FIELD[:1]}
+
+
+def _tried_in(place: str, kind: str) -> tuple[Tried, ...]:
+    """What is tried of optics; a linear kind has its astigmatic patterns as kinds."""
+    over = _OF_FIELD_KINDS.get(kind.rpartition(" ")[2], _FIELD)
+    return {
+        "sky": (Tried(over, ("steady", *SLOW)), Tried(along=(*SINGLE, "kind"))),
+        "train": (Tried(over, ("steady", "colour", *SLOW)), Tried(among=("all",))),
+        "film": (Tried(over, ("steady", *SLOW, "harmonics to 2")), Tried(along=(*SINGLE, "side"))),
+        "moving": (Tried(over, ("harmonics to 2",)),),
+    }[place]
+
+
+_TURN = (
+    Tried(_FIELD, ("steady", *SLOW)),
+    Tried(("even",), ("harmonics to 6", *SINGLE, "side", "night", "step", "spell", "exposure")),
+    Tried(("tilt", "r2"), ("harmonics to 1",)),  # a beam that wanders over a film that is not uniform
+)
+
+
 def _grows(instrument: Instrument, change: Change) -> Grows:
     """Optics with what a ray knows, and with the angle of the element that they are of; the polariser by exposure."""
-    polariser = instrument.polariser
+    kind, polariser = change.kind, instrument.polariser
     if _is_ahead(instrument, change):
-        return Grows((FIELD, EXPOSURE), None)
+        return Grows((FIELD, EXPOSURE), None, _tried_in("sky", kind))
     if change.where != "of":
-        return Grows((FIELD, WAVELENGTH, EXPOSURE))
+        return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=_tried_in("train", kind))
     if polariser is not None and change.place == polariser.name:
-        return Grows((FIELD, EXPOSURE), None)
-    return Grows((FIELD, WAVELENGTH, EXPOSURE), instrument.element(change.place).moves or "")
+        # A circular retarder is its turn.
+        tried = _TURN if kind == "turn" else () if kind == "retardance v" else _tried_in("film", kind)
+        return Grows((FIELD, EXPOSURE), None, tried)
+    tried = (Tried(along=("step", "spell")),) if kind == "turn" else _tried_in("moving", kind)
+    return Grows((FIELD, WAVELENGTH, EXPOSURE), instrument.element(change.place).moves or "", tried)
 
 
 def _is_ahead(instrument: Instrument, change: Change) -> bool:
@@ -251,7 +287,12 @@ def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 def _grows_added(instrument: Instrument, change: Change) -> Grows:
     """Anything where light from the sky has it alone, nothing behind."""
-    return Grows((FIELD, EXPOSURE), None) if _is_ahead(instrument, change) else Grows()
+    tried = (
+        Tried(("tilt", "r2")),  # the same everywhere it is diattenuation
+        Tried(("even", "tilt", "r2"), SLOW),
+        Tried(along=(*SINGLE, "kind")),
+    )
+    return Grows((FIELD, EXPOSURE), None, tried) if _is_ahead(instrument, change) else Grows()
 
 
 def _displaced(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -285,12 +326,16 @@ KINDS |= {
         _displaced,
         lambda change: change.place,
         _OF_FIELD,
-        lambda *_: Grows((FIELD, EXPOSURE)),
+        lambda *_: Grows((FIELD, EXPOSURE), tried=(Tried(("even", "tilt", "r2"), ("steady", *SLOW)),)),
         slots=itself("whole"),
     )
     for name in DISPLACEMENTS
 }
 _OF_FRINGES = "narrow bands a nanometre apart, or the same band at another temperature"
 KINDS["fringes"] = Kind(
-    "share", _fringes, test=_OF_FRINGES, grows=lambda *_: Grows((SHAPE,)), slots=_slots_of_fringes
+    "share",
+    _fringes,
+    test=_OF_FRINGES,
+    grows=lambda *_: Grows((SHAPE,), tried=(Tried(among=("alone", "all")),)),
+    slots=_slots_of_fringes,
 )
