@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from walop_jax.data.records import Exposures
 from walop_jax.diagnosis import thresholds
 from walop_jax.likelihood import limits
-from walop_jax.model.plan import hours_of
+from walop_jax.model.planning import hours_of
 from walop_jax.sky.nights import first_of_nights
 
 FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median

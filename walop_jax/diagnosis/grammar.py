@@ -43,8 +43,9 @@ from walop_jax.model.effects.change import BAND, KINDS, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.etalon import probed_gaps
 from walop_jax.model.effects.numbers import OF_QU
-from walop_jax.model.effects.optics import ADDED, DISPLACEMENTS, GROUPS
-from walop_jax.model.elements import PupilMapping, WavePlate
+from walop_jax.model.effects.optics import ADDED, DISPLACEMENTS, GENERATORS, GROUPS
+from walop_jax.model.elements.geometry import PupilMapping
+from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.slots import acts
 from walop_jax.model.specification import effect_context
@@ -162,9 +163,10 @@ class Subject(NamedTuple):
     inside: Mask | None = None
 
     @classmethod
-    def of(cls, *bases: Base, inside: Mask | None = None) -> Subject:
+    def of(cls, *bases: Base, inside: Mask | None = None, **among: Sequence[Base]) -> Subject:
         """Each alone, and all of several together."""
-        return cls({"alone": bases, "all": [tuple(itertools.chain(*bases))][: len(bases) - 1]}, (), inside)
+        every = [tuple(itertools.chain(*bases))][: len(bases) - 1]
+        return cls({"alone": bases, "all": every, **among}, (), inside)
 
 
 def _base(kinds: Iterable[str], where: str, place: str, origin: str = "") -> Base:
@@ -191,8 +193,10 @@ def _subjects(instrument: Instrument, exposures: Exposures, *, over_field: bool)
     groups = [group for group in GROUPS if over_field or not group[0].endswith(("radial", "diagonal"))]
     for places in _places(instrument, exposures):
         inside = sky if polariser is not None and places == [("ahead of", polariser.name)] else None
-        for group in groups:
-            yield Subject.of(*(_base(group, *place) for place in places), inside=inside)
+        anything = [_base(GENERATORS, *place) for place in places]
+        for number, group in enumerate(groups):
+            bases = (_base(group, *place) for place in places)
+            yield Subject.of(*bases, inside=inside, anything=[] if number else anything)
     if polariser is not None and sky.any():
         yield Subject.of(_base(ADDED, "ahead of", polariser.name), inside=sky)
     moving = {element.moves: element for element in instrument.train() if element.moves}
@@ -259,8 +263,7 @@ def _of_cameras(
     cameras, arms = instrument.cameras.names, instrument.arms if len(instrument.arms) > 1 else ()
     gains = {name: _base(("gain",), "of", name) for name in (*cameras, *(arm.name for arm in arms))}
     pairs = [tuple(itertools.chain(*(gains[name] for name in arm.analyser.cameras))) for arm in arms]
-    every = Subject.of(*(gains[name] for name in cameras))
-    yield Subject({**every.bases, "arm": pairs}, turning)
+    yield Subject.of(*(gains[name] for name in cameras), arm=pairs)._replace(prefixes=turning)
     if arms:
         yield Subject.of(*(gains[arm.name] for arm in arms))
     for origin in ("", OPPOSITE) if over_field else ():

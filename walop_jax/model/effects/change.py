@@ -26,10 +26,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from walop_jax.data.records import POLARISER
+from walop_jax.data.kinds import POLARISER
 from walop_jax.model.conventions import OF_WALOP, Units
 from walop_jax.model.effects.factors import Factor, factor
-from walop_jax.model.instrument import Instrument, Scalar
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.light_path import Scalar
 from walop_jax.model.parameters import check_names
 from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays
@@ -66,8 +67,8 @@ AMPLITUDES = {
 class Tried(NamedTuple):
     """Factors with which a diagnosis tries changes: each pattern over the field with each form of dependence.
 
-    Patterns and forms are those of `diagnosis.dependences`; `among` says which changes have the same ones, each with
-    its amplitude: each alone, those of the cameras of an arm, or of all cameras or arms.
+    Patterns and forms are those of `diagnosis.dependences`; `among` says which changes are tried together, each with
+    its amplitude: each alone, those of the cameras of an arm, of all cameras or arms, or anything optics can do there.
     """
 
     over: tuple[str, ...] = ("even",)
