@@ -51,12 +51,12 @@ PATTERNS: Mapping[str, tuple[str, ...]] = {
     "focus": ("", "r2"),
     "rings": tuple(f"ring {degree}" for degree in thresholds.RINGS),
 }
-"""Patterns over the field (`Tried.over`): factors that have an amplitude each."""
+"""Patterns over the field (`Combinations.over`): factors that have an amplitude each."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Dependences:
-    """Factors that exposures can tell apart: groups of them, each factor with an amplitude, by form (`Tried.along`).
+    """Factors that exposures can tell apart: groups by form (`Combinations.along`), each factor with an amplitude.
 
     `over_field` says that points are enough for a pattern; factors may ask for the angles of elements of some
     `prefixes`, and are those of exposures that are `inside`.

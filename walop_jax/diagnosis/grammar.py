@@ -152,7 +152,7 @@ Mask = Bool[np.ndarray, " e"]
 
 
 class Subject(NamedTuple):
-    """Changes that have the same dependences, by what is tried together (`Tried.among`).
+    """Changes that have the same dependences, by what is tried together (`Combinations.among`).
 
     They may grow with the angles of elements of some `prefixes`, and are seen in exposures that are `inside` (None: in
     all of them).

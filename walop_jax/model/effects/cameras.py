@@ -27,12 +27,12 @@ from walop_jax.model.effects.change import (
     SLOW,
     AtPoint,
     Change,
+    Combinations,
     Grows,
     Kind,
     Scalar,
     SlotTerm,
     Term,
-    Tried,
     in_exposures,
 )
 from walop_jax.model.effects.factors import COUNTS, EXPOSURE, FIELD, WAVELENGTH
@@ -178,23 +178,23 @@ _WITH: Mapping[str, tuple[str, ...]] = {
 
 
 _CAMERA = (
-    Tried(along=("counts",), among=("alone", "all")),
-    Tried(along=("harmonics to 6", *SLOW, *SINGLE, "side", "night", "step", "exposure", "kind")),
-    Tried(("tilt",), ("harmonics to 1",), ("alone", "all")),  # an image that goes in a circle
-    Tried(("tilt", "focus"), SLOW),
-    Tried(("tilt",), (*SINGLE, "kind", "side"), ("alone", "arm")),
+    Combinations(along=("counts",), among=("alone", "all")),
+    Combinations(along=("harmonics to 6", *SLOW, *SINGLE, "side", "night", "step", "exposure", "kind")),
+    Combinations(("tilt",), ("harmonics to 1",), ("alone", "all")),  # an image that goes in a circle
+    Combinations(("tilt", "focus"), SLOW),
+    Combinations(("tilt",), (*SINGLE, "kind", "side"), ("alone", "arm")),
 )
 _ARM = (
-    Tried(along=(*SLOW, *SINGLE, "night")),
-    Tried(("rings",)),
-    Tried(("tilt",), (*SLOW, *SINGLE, "kind")),
+    Combinations(along=(*SLOW, *SINGLE, "night")),
+    Combinations(("rings",)),
+    Combinations(("tilt",), (*SLOW, *SINGLE, "kind")),
 )
-_LIGHT = Tried(along=("steady", *SLOW, *SINGLE, "kind")), Tried(among=("all",))
+_LIGHT = Combinations(along=("steady", *SLOW, *SINGLE, "kind")), Combinations(among=("all",))
 
 
 def _grows(instrument: Instrument, change: Change) -> Grows:
     stage = stage_of(change)
-    tried = _LIGHT if stage == "median" else (Tried(among=("alone", "all")),)
+    tried = _LIGHT if stage == "median" else (Combinations(among=("alone", "all")),)
     if change.kind == "gain":
         tried = _CAMERA if change.place in instrument.cameras.names else _ARM
     return Grows(_WITH.get(stage, ()), None, tried)

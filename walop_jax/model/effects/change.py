@@ -64,7 +64,7 @@ AMPLITUDES = {
 """Amplitudes of changes, by the parameter of `described` that holds them."""
 
 
-class Tried(NamedTuple):
+class Combinations(NamedTuple):
     """Factors with which a diagnosis tries changes: each pattern over the field with each form of dependence.
 
     Patterns and forms are those of `diagnosis.dependences`; `among` says which changes are tried together, each with
@@ -85,7 +85,7 @@ class Grows(NamedTuple):
 
     allowed: tuple[str, ...] = ()
     angle: str | None = ""
-    tried: tuple[Tried, ...] = ()
+    tried: tuple[Combinations, ...] = ()
 
 
 class NoSlotError(ValueError):

@@ -14,11 +14,11 @@ from walop_jax.model.effects.change import (
     SKY,
     SLOW,
     Change,
+    Combinations,
     Grows,
     Kind,
     SlotTerm,
     Term,
-    Tried,
     add,
     in_exposures,
     itself,
@@ -53,9 +53,13 @@ def _with_ray(instrument: Instrument, change: Change) -> Grows:
     """Plates with what a ray knows, and with their own angle."""
     holders = [p for p in instrument.places(WavePlate) if f"{change.place}.".startswith(f"{p}.")]
     moves = instrument.element(holders[0]).moves if holders else None
-    tried = (Tried(_FIELD, ("steady", *SLOW)), Tried(along=("step",)), Tried(among=("all",)))
+    tried = (
+        Combinations(_FIELD, ("steady", *SLOW)),
+        Combinations(along=("step",)),
+        Combinations(among=("all",)),
+    )
     if change.kind != "axis" or change.place not in holders:
-        tried = (Tried(_FIELD),) if change.kind == "thickness" else (Tried(),)
+        tried = (Combinations(_FIELD),) if change.kind == "thickness" else (Combinations(),)
     return Grows((FIELD, WAVELENGTH, EXPOSURE), moves or "", tried)
 
 
@@ -107,10 +111,10 @@ def _polarised(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 def _of_patch(instrument: Instrument, change: Change) -> Grows:
     """Of one patch of the sky, which is an exposure; of a star what changes with time and from filter to filter."""
     if change.place != SKY:
-        return Grows((EXPOSURE, WAVELENGTH), tried=(Tried(),))
+        return Grows((EXPOSURE, WAVELENGTH), tried=(Combinations(),))
     if change.kind == "polarisation":
-        return Grows(tried=(Tried(),))
-    return Grows((EXPOSURE,), None, (Tried(along=("patch",)),))
+        return Grows(tried=(Combinations(),))
+    return Grows((EXPOSURE,), None, (Combinations(along=("patch",)),))
 
 
 def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -163,7 +167,7 @@ KINDS["shift"] = Kind(
     "wavelength",
     _of_instrument,
     test=_OF_BAND,
-    grows=lambda *_: Grows(tried=(Tried(),)),
+    grows=lambda *_: Grows(tried=(Combinations(),)),
     slots=itself("whole"),
 )
 _OF_ROTATOR = "a polariser aligned in the laboratory: an independent zero of the angle"

@@ -26,12 +26,12 @@ from walop_jax.model.effects.change import (
     SLOW,
     AtPoint,
     Change,
+    Combinations,
     Grows,
     Kind,
     Scalar,
     SlotTerm,
     Term,
-    Tried,
     in_exposures,
     itself,
     product,
@@ -203,41 +203,33 @@ def _beside(instrument: Instrument, element: Element, change: Change) -> Instrum
 
 
 _FIELD = ("even", "tilt", "r2", "astigmatic")
-_OF_FIELD_KINDS = {"q": _FIELD[:3], "u": _FIELD[:3], "radial": _FIELD[:1], "diagonal": _FIELD[:1]}
-
-
-def _tried_in(place: str, kind: str) -> tuple[Tried, ...]:
-    """What is tried of optics; a linear kind has its astigmatic patterns as kinds."""
-    over = _OF_FIELD_KINDS.get(kind.rpartition(" ")[2], _FIELD)
-    anything = Tried(_FIELD[:3], ("steady", *SLOW), ("anything",))  # coated, tilted and stressed at once
-    return {
-        "sky": (Tried(over, ("steady", *SLOW)), Tried(along=(*SINGLE, "kind")), anything),
-        "train": (Tried(over, ("steady", "colour", *SLOW)), Tried(among=("all",)), anything),
-        "film": (Tried(over, ("steady", *SLOW, "harmonics to 2")), Tried(along=(*SINGLE, "side"))),
-        "moving": (Tried(over, ("harmonics to 2",)),),
-    }[place]
-
-
+_NOT_IN_OTHER_KINDS = {"q": _FIELD[:3], "u": _FIELD[:3], "radial": _FIELD[:1], "diagonal": _FIELD[:1]}
+_ANYTHING = Combinations(_FIELD[:3], ("steady", "hours", "kelvin"), ("anything",))
 _TURN = (
-    Tried(_FIELD, ("steady", *SLOW)),
-    Tried(("even",), ("harmonics to 6", *SINGLE, "side", "night", "step", "spell", "exposure")),
-    Tried(("tilt", "r2"), ("harmonics to 1",)),  # a beam that wanders over a film that is not uniform
+    Combinations(_FIELD, ("steady", *SLOW)),
+    Combinations(along=("harmonics to 6", *SINGLE, "side", "night", "step", "spell", "exposure")),
+    Combinations(("tilt", "r2"), ("harmonics to 1",)),  # a beam that wanders over a film that is not uniform
 )
 
 
 def _grows(instrument: Instrument, change: Change) -> Grows:
     """Optics with what a ray knows, and with the angle of the element that they are of; the polariser by exposure."""
     kind, polariser = change.kind, instrument.polariser
+    over = _NOT_IN_OTHER_KINDS.get(kind.rpartition(" ")[2], _FIELD)
+    always = Combinations(over, ("steady", *SLOW))
     if _is_ahead(instrument, change):
-        return Grows((FIELD, EXPOSURE), None, _tried_in("sky", kind))
+        return Grows((FIELD, EXPOSURE), None, (always, Combinations(along=(*SINGLE, "kind")), _ANYTHING))
     if change.where != "of":
-        return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=_tried_in("train", kind))
+        more = Combinations(over, ("colour",)), Combinations(among=("all",)), _ANYTHING
+        return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=(always, *more))
     if polariser is not None and change.place == polariser.name:
-        # A circular retarder is its turn.
-        tried = _TURN if kind == "turn" else () if kind == "retardance v" else _tried_in("film", kind)
-        return Grows((FIELD, EXPOSURE), None, tried)
-    tried = (Tried(along=("step", "spell")),) if kind == "turn" else _tried_in("moving", kind)
-    return Grows((FIELD, WAVELENGTH, EXPOSURE), instrument.element(change.place).moves or "", tried)
+        film = always, Combinations(over, ("harmonics to 2",)), Combinations(along=(*SINGLE, "side"))
+        as_a_turn = {"turn": _TURN, "retardance v": ()}
+        return Grows((FIELD, EXPOSURE), None, as_a_turn.get(kind, film))
+    tried = (
+        Combinations(along=("step", "spell")) if kind == "turn" else Combinations(over, ("harmonics to 2",))
+    )
+    return Grows((FIELD, WAVELENGTH, EXPOSURE), instrument.element(change.place).moves or "", (tried,))
 
 
 def _is_ahead(instrument: Instrument, change: Change) -> bool:
@@ -291,9 +283,9 @@ def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 def _grows_added(instrument: Instrument, change: Change) -> Grows:
     """Anything where light from the sky has it alone, nothing behind."""
     tried = (
-        Tried(("tilt", "r2")),  # the same everywhere it is diattenuation
-        Tried(("even", "tilt", "r2"), SLOW),
-        Tried(along=(*SINGLE, "kind")),
+        Combinations(("tilt", "r2")),  # the same everywhere it is diattenuation
+        Combinations(("even", "tilt", "r2"), SLOW),
+        Combinations(along=(*SINGLE, "kind")),
     )
     return Grows((FIELD, EXPOSURE), None, tried) if _is_ahead(instrument, change) else Grows()
 
@@ -327,7 +319,7 @@ KINDS |= {
         _displaced,
         lambda change: change.place,
         _OF_FIELD,
-        lambda *_: Grows((FIELD, EXPOSURE), tried=(Tried(("even", "tilt", "r2"), ("steady", *SLOW)),)),
+        lambda *_: Grows((FIELD, EXPOSURE), tried=(Combinations(("even", "tilt", "r2"), ("steady", *SLOW)),)),
         slots=itself("whole"),
     )
     for name in DISPLACEMENTS
@@ -337,6 +329,6 @@ KINDS["fringes"] = Kind(
     "share",
     _fringes,
     test=_OF_FRINGES,
-    grows=lambda *_: Grows((SHAPE,), tried=(Tried(among=("alone", "all")),)),
+    grows=lambda *_: Grows((SHAPE,), tried=(Combinations(among=("alone", "all")),)),
     slots=_slots_of_fringes,
 )
