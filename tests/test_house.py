@@ -186,7 +186,7 @@ MOST_LINES = {
     "instruments": 250,
     "data": 5850,
     "sky": 450,
-    "model": 9620,
+    "model": 9630,
     "likelihood": 3360,
     "simulation": 1130,
     "fit": 2200,

@@ -44,7 +44,8 @@ def standards(
     if near is not None:
         away = separation(ra, dec, *_direction(near))
         table["DISTANCE"] = Quantity(away, "deg")
-        table, ra, dec = (column[np.argsort(away, kind="stable")] for column in (table, ra, dec))
+        nearest = np.argsort(away, kind="stable")
+        table, ra, dec = table[nearest], ra[nearest], dec[nearest]
     if up is not None:
         given: Any = default_name() if instrument is None else instrument
         place: Any = given.site if hasattr(given, "site") else read_description(given).place

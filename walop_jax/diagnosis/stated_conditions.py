@@ -10,7 +10,8 @@ So each number has its own efficient score (`score`), with the derivative
 of the whitened residuals r with respect to the number c that the set states, fluxes solved for anew. A row knows of the
 field only its own place, so that scale and angle are sums of X and Y, row by row.
 
-The coordinates and times of sky exposures, the site and ROTATOR are asked in the same way. A number of the instrument
+The coordinates and times of sky exposures, the site and ROTATOR are asked in the same way, and the share of the sky
+(SKY) that is left in the counts. A number of the instrument
 that is thought to be known, and is not, looks much like these: the prior of each parameter, and those of each element
 together, are rivals with the column (mean − value)/width. So are terms of one camera with one amplitude: a
 non-linearity (its counts squared), a pedestal, scattered light (the median counts of an exposure), light of another
