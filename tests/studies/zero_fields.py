@@ -17,8 +17,11 @@ import numpy as np
 from matrix_at import matrix_at
 
 import walop_jax as walop
-from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import matrices
+from walop_jax.data.settings import Settings
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.observing_plan import polariser_turn
 from walop_jax.simulation.simulate import PhotonNoise, Simulated
 
@@ -61,9 +64,12 @@ def main() -> None:
         for seed in range(given.sets):
             run = walop.simulate(plan, seed=seed)
             calset = run.calset if share == 1.0 else shortened(run, share, seed)
-            fit = walop.refit(calset)
-            ratio.append(fit.chi2 / fit.dof)
-            matrix, covariance = Calibration.from_fit(fit).matrix(x, y)
+            result = fit(Likelihood.of(calset, walop.base_model(calset, throughput_degree=2)))
+            ratio.append(result.chi2 / result.dof)
+            instrument = result.model.instrument(result.values)
+            every = result.model.selection() @ result.covariance @ result.model.selection().T
+            settings = Settings.default(len(x), str(calset.exposures.filter[0]))
+            matrix, covariance = matrices(instrument, settings, calset.filters, x, y, every)
             error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, [0, 3]]
             errors.append(error)
             pulls.append((matrix - matrix_at(run.truth, calset, x, y))[:, [0, 3]] / error)
