@@ -67,9 +67,8 @@ def main() -> None:
             result = fit(Likelihood.of(calset, walop.base_model(calset, throughput_degree=2)))
             ratio.append(result.chi2 / result.dof)
             instrument = result.model.instrument(result.values)
-            every = result.model.selection() @ result.covariance @ result.model.selection().T
             settings = Settings.default(len(x), str(calset.exposures.filter[0]))
-            matrix, covariance = matrices(instrument, settings, calset.filters, x, y, every)
+            matrix, covariance = matrices(instrument, settings, calset.filters, x, y, result.covariance)
             error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, [0, 3]]
             errors.append(error)
             pulls.append((matrix - matrix_at(run.truth, calset, x, y))[:, [0, 3]] / error)
