@@ -209,7 +209,8 @@ class DetectionLimits(Displayed):
         worst = self.mistakes[0]
         return (
             "a systematic error too small to be detected could still bias q or u by "
-            f"{two_digits(100 * worst.error[0])} % (median over the field, stars with p ≤ 5 %; {two_digits(100 * worst.error[1])} % at worst): "
+            f"{two_digits(100 * worst.error[0])} % (median over the field, stars with p ≤ 5 %; "
+            f"{two_digits(100 * worst.error[1])} % at worst): "
             f"{worst.in_words}"
         )
 
