@@ -22,7 +22,7 @@ from walop_jax.diagnosis.score import ScoreSpace, ScoreTable, effective_trials
 from walop_jax.model.effects import Described
 
 TOGETHER = 1e8  # numbers of columns that are there at a time
-DRAWS = 400  # of noise: a fifth of them give the number of trials to 11 %
+DRAWS = 200  # of noise: a fifth of them give the number of trials to 16 %
 _SHOWN = 3
 
 
