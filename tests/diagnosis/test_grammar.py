@@ -14,7 +14,7 @@ from walop_jax.diagnosis import dependences, grammar, thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import all_candidates, applicable, probes, said_by
 from walop_jax.diagnosis.score import ScoreSpace, ScoreTable
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.instruments.description import parsed
 from walop_jax.likelihood.columns import Columns
