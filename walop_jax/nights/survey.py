@@ -15,7 +15,6 @@ import dataclasses
 import functools
 import itertools
 import math
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -34,9 +33,9 @@ from walop_jax.model.effects import EffectKind
 from walop_jax.model.laws import Law
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights.algebra import Solution
-from walop_jax.nights.breaks import Break, part_of, shape_of
+from walop_jax.nights.breaks import Break
 from walop_jax.nights.changes import scan
-from walop_jax.nights.equations import Together, night_numbers
+from walop_jax.nights.equations import EffectAmplitude, Together, night_numbers
 from walop_jax.science.field_accuracy import NODES, SIZE, TOLERANCE, judged, reached
 
 Vector = Float[np.ndarray, " _"]
@@ -240,7 +239,8 @@ class Survey(Displayed):
     def _product(self, mjd: float) -> Calibration:
         """The calibration of a moment, whether it is valid or not."""
         full, (value, covariance) = self._full, self.values_at(mjd)
-        model, names = full.model, [_in_model(name) for name in self.data.names]
+        model, every = full.model, self.data.parameters
+        names = [p.in_model if isinstance(p, EffectAmplitude) else p.name for p in every]
         there = [k for k, name in enumerate(names) if name in model.names and self.laws[k] is not None]
         select = np.zeros((len(model.names), len(there)))
         select[[model.index(names[k]) for k in there], np.arange(len(there))] = 1.0
@@ -262,12 +262,11 @@ class Survey(Displayed):
         context = effect_context(model.template, like.exposures)
         candidates = [
             p for p, law, has in zip(self.data.parameters, self.laws, self.data.has_value, strict=True)
-            if law is not None and not has and p.name not in model.names
+            if law is not None and not has and p.name not in model.names and isinstance(p, EffectAmplitude)
         ]  # fmt: skip
-        taken: dict[str, str] = {}
+        taken: dict[str, tuple[int, int]] = {}
         for p in candidates:
-            # Names of parts, not `Parameter.part`, which files of nights do not hold.
-            part, shape = part_of(p.name), shape_of(p.name)
+            part, (group, member) = p.part, (shape := p.shape)
             if taken.setdefault(part, shape) != shape or part in self.reference.model.effect_names:
                 raise fail(
                     f"{p.name} is one shape of its effect, and the model has another",
@@ -275,11 +274,7 @@ class Survey(Displayed):
                 )
             kind: EffectKind = next(one for one in model.catalogue if one.name == part)
             if part not in model.effect_names:
-                group, _, member = shape.partition("#")
-                chosen = (
-                    kind.probes(context)[int(group)][int(member or 0)] if shape else kind.neutral(context)
-                )
-                model = with_effects(model, [chosen], context)
+                model = with_effects(model, [kind.probes(context)[group][member]], context)
         values, old = model.start, [model.index(name) for name in like.model.names]
         values[old] = like.values
         return dataclasses.replace(like, model=model, values=values, covariance=np.zeros((len(values),) * 2))
@@ -408,8 +403,3 @@ class Survey(Displayed):
             rows,
             tuple(dict.fromkeys((*verdict.warnings, *self.advice))),
         )
-
-
-def _in_model(name: str) -> str:
-    """The name that a parameter or candidate has in a model."""
-    return re.sub("#[0-9]+", "", name)
