@@ -31,7 +31,6 @@ def standards(
     ('VI Cyg 12', 'R')
     """
     import numpy as np
-    from astropy.units import Quantity
 
     from walop_jax.data.records import Site
     from walop_jax.data.standards import shipped_standards
@@ -43,7 +42,7 @@ def standards(
     ra, dec = (np.asarray(table[name].to_value("deg"), float) for name in ("RA", "DEC"))
     if near is not None:
         away = separation(ra, dec, *_direction(near))
-        table["DISTANCE"] = Quantity(away, "deg")
+        table["DISTANCE"] = away * table["RA"].unit
         nearest = np.argsort(away, kind="stable")
         table, ra, dec = table[nearest], ra[nearest], dec[nearest]
     if up is not None:
@@ -51,7 +50,7 @@ def standards(
         place: Any = given.site if hasattr(given, "site") else read_description(given).place
         height = altitude(np.full(len(ra), up), ra, dec, Site(*place[:4]))
         order = np.arange(len(ra)) if near is not None else np.argsort(-height, kind="stable")
-        table["ALTITUDE"] = Quantity(height, "deg")
+        table["ALTITUDE"] = height * table["RA"].unit
         table = table[order[height[order] >= LOWEST]]
     rows = [{name: _plain(row[name]) for name in table.colnames} for row in table]
     return Outcome(table, {**table.meta, "standards": rows}, _lines(table))
