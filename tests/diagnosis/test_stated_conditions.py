@@ -15,6 +15,7 @@ from small_run import SEED, SMALL, small_fit, small_fit_with_plate
 
 from walop_jax.calibration.accuracy import change_of_qu
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.could_hide import hidden_errors
 from walop_jax.calibration.matrix import first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
@@ -299,7 +300,8 @@ def test_what_could_hide_is_ranked_by_what_it_does_to_stars():
     seen = []
     for number in range(len(hidden)):
         one = Hidden(*(getattr(hidden, f.name)[number : number + 1] for f in dataclasses.fields(Hidden)))
-        seen.append(np.nanmedian(dataclasses.replace(calibration, hidden=one).protection(x, y)[0]))
+        hiding = dataclasses.replace(calibration, hidden=one)
+        seen.append(np.nanmedian(hidden_errors(hiding, x, y, hiding.usual_settings())[0]))
     assert len(seen) > 3
     assert all(after <= 1.3 * before for before, after in itertools.pairwise(seen))  # 0: out of the beam
 

@@ -14,7 +14,7 @@ from walop_jax.calibration.matrix import matrix_slopes
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import in_memory
 from walop_jax.diagnosis.trust import examined
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.io.names import PLANNED
 from walop_jax.io.text import json_text

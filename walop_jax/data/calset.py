@@ -22,6 +22,7 @@ from walop_jax.data.checks import (
     make_sources,
 )
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
+from walop_jax.data.hdus import filter_columns
 from walop_jax.data.kinds import CALIBRATION_PLATE, KINDS, POLARISER
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import (
@@ -53,7 +54,7 @@ from walop_jax.data.table_intensities import (
     usable,
 )
 from walop_jax.data.units import Place, check_units, unit_of
-from walop_jax.data.write import EXTENSION, filter_columns, read_compression, remark, set_tables
+from walop_jax.data.write import EXTENSION, read_compression, remark, set_tables
 from walop_jax.io.errors import fail, nearest
 from walop_jax.io.fits_reading import OpenFile, open_fits
 
@@ -161,7 +162,7 @@ def assembled(
     place = Place(path, "EXPOSURES")
     exposures = make_exposures(tables["EXPOSURES"], filters, site, place, kinds)
     remarks += doubts_about(instrument, site, exposures, place)
-    sources = empty_sources()
+    sources = Sources.none()
     if "SOURCES" in tables:
         sources = make_sources(tables["SOURCES"], Place(path, "SOURCES"), filters)
     if images:
@@ -236,12 +237,6 @@ def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], d
         remarks += [f"{opened.path} [{name}]: unknown extension, not used" for name in images]
         images.clear()
     return tables, images
-
-
-def empty_sources() -> Sources:
-    """Return a table without sources."""
-    none = np.zeros(0)
-    return Sources(np.zeros(0, dtype=np.int64), np.zeros(0, dtype="U1"), none, none, none, none, none)
 
 
 def with_builtins(filters: dict[str, FilterCurve], exposures: Exposures) -> dict[str, FilterCurve]:

@@ -194,7 +194,7 @@ def make_exposures(
     moon, standard = (kind == "moon") & ~clp_in, (kind == "standard") & ~clp_in
     for name in ("MJD", "RA", "DEC", "ROTATOR"):
         bad = moon & ~np.isfinite(table[name])
-        place.refuse(bad, "is not finite", name, "the Moon sky needs time and pointing")
+        place.refuse(bad, "is not finite", name, "the moonlit sky needs time and pointing")
     bad = standard & ~np.isfinite(table["ROTATOR"])
     place.refuse(bad, "is not finite", "ROTATOR", "a standard needs it")
     low, high = EPHEMERIS_MJD

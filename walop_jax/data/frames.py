@@ -20,46 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from walop_jax.data.records import Block, DataFlag, Intensities, Points
+from walop_jax.data.grid import Grid, read_grid
+from walop_jax.data.records import Block, DataFlag, Intensities
 from walop_jax.data.table_intensities import empty_block, usable
 from walop_jax.data.units import Place, check_units, convert_unit
 from walop_jax.io.errors import fail
 
 _LONG = 1 << 28  # (exposure, pixel) pairs: gigabytes of frames, which are not counted without a word
 _SLAB = 1 << 19  # values of one camera that are looked at together when whole frames are gone through
-
-
-@dataclasses.dataclass(frozen=True)
-class Grid:
-    """The linear map from pixels to field coordinates (FITS standard, section 8.1).
-
-    (x, y) = `value` + `matrix` · (pixel − `reference`), in degrees, pixels counted from 1 as FITS does;
-    `width` pixels in a row, `height` rows. Points run along the rows.
-    """
-
-    width: int
-    height: int
-    reference: tuple[float, float]
-    value: tuple[float, float]
-    matrix: tuple[tuple[float, float], tuple[float, float]]
-
-    @property
-    def pixels(self) -> int:
-        """Number of pixels."""
-        return self.width * self.height
-
-    def xy(self, start: int, stop: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-        """Return the field coordinates (degrees) of the points `start:stop`."""
-        row, column = np.divmod(np.arange(start, stop), self.width)
-        i, j = column + (1.0 - self.reference[0]), row + (1.0 - self.reference[1])
-        (xi, xj), (yi, yj) = self.matrix
-        return self.value[0] + (xi * i + xj * j), self.value[1] + (yi * i + yj * j)
-
-    @functools.cached_property
-    def points(self) -> Points:
-        """All pixels as field points, numbered from 0."""
-        x, y = self.xy(0, self.pixels)
-        return Points(point=np.arange(len(x), dtype=np.int32), x=x, y=y)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -281,41 +249,6 @@ def _cube(hdu: Any, exposures: int, place: Place) -> Cube:
         blank=int(blank) if blank is not None and bitpix > 0 else None,
         stamp=(stat.st_size, stat.st_mtime_ns),
     )
-
-
-def read_grid(header: Any, place: Place) -> Grid:
-    """Read the linear coordinates of the first two axes: CRPIX, CRVAL and CD, or CDELT with PC."""
-    for axis, name in ((1, "X"), (2, "Y")):
-        axis_type = str(header.get(f"CTYPE{axis}", "")).strip().upper()
-        if axis_type != name:
-            raise place.fail(
-                f"is {axis_type!r} where {name!r} is needed", f"CTYPE{axis}", "field coordinates, linear"
-            )
-    if float(header.get("CROTA2", 0.0)) != 0.0:
-        raise place.fail("is an obsolete rotation", "CROTA2", "write PC or CD")
-
-    def matrix(i: int, j: int) -> float:
-        if any(f"CD{a}_{b}" in header for a in (1, 2) for b in (1, 2)):
-            return float(header.get(f"CD{i}_{j}", 0.0))
-        return float(header.get(f"CDELT{i}", 1.0)) * float(header.get(f"PC{i}_{j}", 1.0 if i == j else 0.0))
-
-    scale = [
-        float(convert_unit(np.ones(1), str(header.get(f"CUNIT{n}") or "deg"), "deg", f"CUNIT{n}", place)[0])
-        for n in (1, 2)
-    ]
-    grid = Grid(
-        width=int(header["NAXIS1"]),
-        height=int(header["NAXIS2"]),
-        reference=(float(header.get("CRPIX1", 0.0)), float(header.get("CRPIX2", 0.0))),
-        value=(scale[0] * float(header.get("CRVAL1", 0.0)), scale[1] * float(header.get("CRVAL2", 0.0))),
-        matrix=(
-            (scale[0] * matrix(1, 1), scale[0] * matrix(1, 2)),
-            (scale[1] * matrix(2, 1), scale[1] * matrix(2, 2)),
-        ),
-    )
-    if np.linalg.det(np.array(grid.matrix)) == 0 or not np.all(np.isfinite(grid.matrix)):
-        raise place.fail("the coordinates are singular", "CDELT, PC, CD", "write the pixel scale in degrees")
-    return grid
 
 
 # --------------------------------------------------------------------------------------- image rows as they lie on disk

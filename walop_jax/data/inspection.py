@@ -307,7 +307,7 @@ def _about_angles(made: Inspection) -> Iterator[Finding]:
     elif number < _FEW_ANGLES:
         yield Finding(
             "doubt",
-            f"only {number} polariser angles",
+            f"only {number} polariser angles modulo 180°",
             "with fewer than 8, polariser errors cannot be told from instrument errors",
         )
 
@@ -319,13 +319,13 @@ def about_exposures(exposures: Exposures) -> Iterator[Finding]:
         yield Finding(
             "note",
             "the polariser turns through half a turn only",
-            "a full turn tells a wobble of its rotation from the instrument",
+            "a full turn is needed to separate an encoder wobble from the instrument",
         )
     if not np.any(e.direct("moon", "standard")):
         yield Finding(
             "note",
-            "no light of known polarisation but through the polariser (neither Moon sky nor standards)",
-            "the zero of the polariser and a polarising telescope cannot be seen without",
+            "the only light of known polarisation is that through the polariser (neither moonlit sky nor standards)",
+            "without these, neither the zero of the polariser nor telescope polarisation can be measured",
         )
 
 

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from walop_jax.data.frames import FrameIntensities, Grid
+from walop_jax.data.frames import FrameIntensities
+from walop_jax.data.grid import Grid
 from walop_jax.data.records import (
     Block,
     CalibrationSet,

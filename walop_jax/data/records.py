@@ -257,6 +257,12 @@ class Sources:
     def __len__(self) -> int:
         return len(self.source)
 
+    @classmethod
+    def none(cls) -> Sources:
+        """A table without sources."""
+        none = np.zeros(0)
+        return cls(np.zeros(0, dtype=np.int64), np.zeros(0, dtype="U1"), none, none, none, none, none)
+
     @property
     def stars(self) -> Int[np.ndarray, " s"]:
         """For each row the first row of its star."""

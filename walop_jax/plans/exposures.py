@@ -16,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -24,10 +25,10 @@ from jaxtyping import Array, Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.flux import Sharing, project_flux
-from walop_jax.likelihood.inverses import pseudo_inverse
+from walop_jax.likelihood.inverses import of_low_rank, pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
@@ -141,6 +142,8 @@ def candidates(
     factor, flux, exptime = _factor(available.plan, few), fluxes(plan, None), plan.exposures().exptime
     noise, floor = PhotonNoise(plan.read_noise), model.template.cameras.floor
     shared = Sharing(model.template.cameras.together)
+    of_mean = {f"standard.{plan.star_names[-1]}.{axis}" for axis in "qu"} if plan.zero_stars else set()
+    means = [place for place, i in enumerate(model.free) if model.names[i] in of_mean]
     responses = []
     for number, draw in enumerate(values):
         tell(f"expected counts of instrument {number + 1} of {draws}")
@@ -153,8 +156,10 @@ def candidates(
         for rows in [slice(start, stop)] if polarised else [slice(i, i + 1) for i in range(start, stop)]:
             at = likelihood.used[:, rows.start]
             electrons = flux[at, rows.start] * choice.seconds / exptime[rows.start]
+            star = choice.kind == "standard"
+            scatter = plan.zero_scatter if star and choice.stops[0].number == plan.standards else 0.0
             light = Illumination(
-                electrons, noise, floor, shared, 1.0 if choice.kind == "standard" else factor
+                electrons, noise, floor, shared, 1.0 if star else factor, dict.fromkeys(means, scatter)
             )
             counts = tuple((unit[at, rows], slopes[at, rows]) for unit, slopes in responses)
             if polarised:
@@ -286,7 +291,8 @@ class Illumination(NamedTuple):
     """Light of an exposure: `flux` (electron) at its points, noise, what shares a flux.
 
     No error is smaller than `floor`, a share of the mean counts of all cameras, as in a fit (`Cameras.floor`). `scale`
-    leads from these points to those of the plan.
+    leads from these points to those of the plan. `scatter` is the rms of single stars around a parameter, by its place;
+    each exposure counts as one of other stars.
     """
 
     flux: Float[np.ndarray, " p"]
@@ -294,6 +300,7 @@ class Illumination(NamedTuple):
     floor: float
     shared: Sharing
     scale: float
+    scatter: Mapping[int, float] = MappingProxyType({})
 
     def sigma(self, counts: Float[np.ndarray, "p a b"], cameras: int) -> Float[np.ndarray, "p a b"]:
         """Standard errors of counts; `cameras` is the axis of these."""
@@ -307,6 +314,10 @@ class Illumination(NamedTuple):
         weight = 1.0 / self.sigma(flux * unit, 2)
         columns = np.moveaxis(slopes * (flux * weight)[..., None], -1, 0)
         projected = project_flux(columns, unit * weight, False, self.shared)
+        if any(self.scatter.values()):
+            stars = np.stack([size * projected[place] for place, size in self.scatter.items()], axis=-1)
+            alone = Sharing(stars=of_low_rank(stars[:, :, None]))
+            projected = alone.independent(projected[..., None, :])[..., 0, :]
         flat = projected.transpose(2, 0, 1, 3).reshape(unit.shape[1], len(projected), -1)
         return self.scale * flat @ flat.swapaxes(1, 2)
 

@@ -195,8 +195,8 @@ class ExposurePlan(Displayed):
                 100.0 * np.median(errors[:, measurable]) for errors in (self.before, self.after)
             )
             facts["over the field"] = (
-                f"error of p {middle:.3g} % in the median ({without:.3g} % without them), below 0.1 % in "
-                f"{100 * self.share:.0f} % of the field where one exposure measures u"
+                f"error of p {middle:.3g} % (median over the field; {without:.3g} % without them), below 0.1 % "
+                f"in {100 * self.share:.0f} % of the field where one exposure measures u"
             )
         if self.needed is not None:
             facts[f"{digits(self.goal, '.3g')}{unit} takes"] = (
@@ -206,7 +206,7 @@ class ExposurePlan(Displayed):
         variance_of_plan = self.criterion.variance(self.value)
         for name, other_value in self.beside.items():
             factor = self.criterion.variance(other_value) / variance_of_plan
-            variance = "the same variance" if f"{factor:.2g}" == "1" else f"{factor:.2g} times the variance"
+            variance = "equally good" if f"{factor:.2g}" == "1" else f"{factor:.2g} times the variance"
             facts[name] = f"{digits(other_value, '.3g')}{unit}; {variance}"
         rows = tuple(
             (
@@ -225,7 +225,7 @@ class ExposurePlan(Displayed):
         return Display(
             title=f"Plan of {sum(line.times for line in self.lines)} exposures for {self.observing_plan.name}",
             facts=tuple(facts.items()),
-            head=("KIND", "FILTER", "POSITIONS", ">POLARISER", ">EXPOSURES", ">TIME / s", ">WITHOUT IT"),
+            head=("KIND", "FILTER", "POSITIONS", ">POLARISER", ">EXPOSURES", ">TIME / s", ">LOSS IF OMITTED"),
             rows=rows,
             notes=self.notes,
         )

@@ -430,7 +430,7 @@ class PosteriorSample(Drawn):
                     number of intensities less the fluxes
         Limits      the flux is at its best value, not integrated over. Rows that share a flux are not independent
 
-        Raises ValueError where the data are not at hand, and where rows share a flux.
+        Raises ValueError where the data are not at hand, and where rows share a flux, or the q, u of a star.
         """
         likelihood = self.likelihood
         if likelihood is None:
@@ -438,6 +438,11 @@ class PosteriorSample(Drawn):
         if likelihood.plan.exposures.shared is not None:
             raise ValueError(
                 "exposures share their flux (KIND steady): their rows cannot be left out one by one"
+            )
+        if not likelihood.sharing.single:
+            raise ValueError(
+                "exposures share q and u of the stars of a field (SCATTER of SOURCES): their rows cannot be left out "
+                "one by one"
             )
         used, per_row = likelihood.used, np.broadcast_to(likelihood.data_per_row, likelihood.used.shape)
         chi2 = np.empty((*self.draws.shape[:2], int(used.sum())))

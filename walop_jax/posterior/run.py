@@ -15,7 +15,7 @@ from walop_jax.calibration.calibration import Calibration, Matrix, Product
 from walop_jax.calibration.product import read_product
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.model_file import model_for
+from walop_jax.fit.base_model import model_for
 from walop_jax.fit.parameter_table import Fitted
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.verdict import STATED
@@ -37,7 +37,9 @@ VERDICTS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
         f"the old calibration {'still holds' if d.get('fits') and d.get('new_trusted') else 'does not hold'}"
     ),
     "survey": lambda d: "trusted" if d["trusted"] else "not trusted",
-    "watch": lambda d: "the calibration holds" if d["holds"] else "the calibration is not known to hold",
+    "watch": lambda d: (
+        "the calibration is still valid" if d["holds"] else "the calibration may be no longer valid"
+    ),
     "plan": lambda d: f"{d['what']}: {d['value']:.3g} {d['unit']}".rstrip(),
 }
 """Documents in a few words."""
