@@ -12,9 +12,9 @@ from frame_run import frame_run
 from frames_file import write_frames
 
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.data.frames import Grid
+from walop_jax.data.grid import Grid
 from walop_jax.data.records import Intensities
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import MeasuredPoints, PointReader, bytes_per_point, thinned

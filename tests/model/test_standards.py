@@ -12,7 +12,7 @@ from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.schema import SOURCES, table_of
 from walop_jax.data.settings import builtin_filter
 from walop_jax.data.units import Place
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.columns import columns, own_columns

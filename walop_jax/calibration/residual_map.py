@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.calibration.matrix import ResidualMap, residual_names
-from walop_jax.data.frames import Grid
+from walop_jax.data.grid import Grid
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.likelihood import engine, limits

@@ -5,7 +5,7 @@ Information  of an exposure e: J_eᵀ J_e, J_e the derivatives of its whitened r
 Polariser    Light is linear, so that counts and their derivatives are series of low degree in 2θ, and in 2α where the
              calibration plate may stand at any angle α: they are computed at `NODES` angles and known at all. The
              information, which divides by the variance of the counts, is a series of high degree in the direction
-             2α − θ behind the plate, of a lower one in α, cut at `ORDERS`; `Candidates.truncation` is what is lost.
+             2α − θ behind the plate, of a lower one in α, cut at `ORDERS`; `Candidates.truncation` is the loss.
 Draws        of the instrument as built, from the priors or around a calibration: the best plan depends on it.
 Limits       Detectors are linear. Exposures know of each other only by the parameters. Changes between exposures
              (slews, filters) cost time when the plan is put in order; the bound without them stays a bound.
@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.inverses import of_low_rank, pseudo_inverse
@@ -72,7 +72,7 @@ class Candidates:
     """Everything that could be observed, with the information that each exposure would bring.
 
     `families` go with `choices`, their information scaled to the field points of the plan. `values` (draw, parameter)
-    are all parameters of the instruments that were drawn, `prior` what is known of the free ones beforehand, `names`
+    are all parameters of the instruments that were drawn, `prior` the information on the free ones beforehand, `names`
     of these. `truncation` is the largest error of the information between the angles that were computed, in units of
     the mean diagonal of each parameter; `notes` say what had to be left out. `effects` are those that are to be told
     apart, parameters of the model as well, with whether their size is known.
