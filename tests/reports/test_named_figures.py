@@ -20,7 +20,7 @@ from walop_jax.commands.plot import plot
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.write import write_calibration_set
 from walop_jax.diagnosis.figure_data import write_figure_data
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model import mueller

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.apply import calibration_for
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import Diagnosed, Effects, PathLike, table_of
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command
+from walop_jax.commands.products import Diagnosed, Effects, table_of
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run

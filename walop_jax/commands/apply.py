@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, command_of
 from walop_jax.commands.each import EACH, SCHEDULER, WORKERS, for_each
 from walop_jax.commands.gather import gather
-from walop_jax.commands.inputs import (
+from walop_jax.commands.inputs import TableFile
+from walop_jax.commands.products import (
     Effects,
     Posterior,
     Product,
-    TableFile,
     calibration_of,
     catalogue_of,
     table_of,

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Job, Option, Outcome, command
-from walop_jax.commands.inputs import IN_MEMORY, Effects, PathLike, Product, catalogue_of, fit_of, folder_of
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, command
+from walop_jax.commands.products import IN_MEMORY, Effects, Product, catalogue_of, fit_of, folder_of
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, errors_naming
 

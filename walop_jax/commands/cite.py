@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import Diagnosed, Effects, PathLike, calibration_of, catalogue_of
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command
+from walop_jax.commands.products import Diagnosed, Effects, calibration_of, catalogue_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import SETS, Diagnosed, Effects, PathLike, calibration_of, catalogue_of, set_of
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, Writers, command
+from walop_jax.commands.inputs import SETS, set_of
+from walop_jax.commands.products import Diagnosed, Effects, calibration_of, catalogue_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:

@@ -6,22 +6,20 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Job, Option, Outcome, command
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, command
 from walop_jax.commands.inputs import (
     GIGABYTE,
-    IN_MEMORY,
-    Effects,
     Folder,
     Goal,
     InstrumentLike,
     Memory,
     ModelLike,
-    PathLike,
     Sets,
     goal_of,
     paths_of,
     set_and_model,
 )
+from walop_jax.commands.products import IN_MEMORY, Effects
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command, figure_file
-from walop_jax.commands.inputs import Effects, PathLike, Product, calibration_of, table_of
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command, figure_file
+from walop_jax.commands.products import Effects, Product, calibration_of, table_of
 
 if TYPE_CHECKING:
     from walop_jax.science.watch import Watch

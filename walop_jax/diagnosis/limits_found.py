@@ -208,8 +208,9 @@ class DetectionLimits(Displayed):
             return ""
         worst = self.mistakes[0]
         return (
-            f"a systematic error below detection could still bias q or u by {two_digits(100 * worst.error[0])} % "
-            f"(median over the field, stars with p ≤ 5 %; {two_digits(100 * worst.error[1])} % at worst): "
+            "a systematic error too small to be detected could still bias q or u by "
+            f"{two_digits(100 * worst.error[0])} % (median over the field, stars with p ≤ 5 %; "
+            f"{two_digits(100 * worst.error[1])} % at worst): "
             f"{worst.in_words}"
         )
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.minimise import Minimum
-from walop_jax.fit.model_file import base_model
 from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum

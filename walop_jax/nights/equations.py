@@ -25,7 +25,8 @@ from jaxtyping import Bool, Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet, Exposures, Site
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.model_file import SKY_AND_STARS, gauges, header_of
+from walop_jax.fit.base_model import SKY_AND_STARS, gauges
+from walop_jax.fit.model_file import header_of
 from walop_jax.fit.search import nearer
 from walop_jax.io.errors import DataError, fail
 from walop_jax.likelihood import engine
@@ -136,6 +137,8 @@ def of_exposures(calset: CalibrationSet, keep: Bool[np.ndarray, " e"]) -> Calibr
     some = {
         name: getattr(whole, name)[rows] for name in ("point", "source", "counts", "sigma", "flag", "used")
     }
+    if whole.sky is not None:
+        some["sky"] = whole.sky[rows]
     table = TableIntensities(int(keep.sum()), whole.points, exposure=place[whole.exposure[rows]], **some)
     return dataclasses.replace(calset, exposures=calset.exposures[keep], intensities=table)
 

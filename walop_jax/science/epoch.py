@@ -37,7 +37,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
-from walop_jax.fit.model_file import SKY_AND_STARS, model_like
+from walop_jax.fit.base_model import SKY_AND_STARS, model_like
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
