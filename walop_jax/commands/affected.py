@@ -30,7 +30,7 @@ def affected(
     limit: Annotated[float, LIMIT] = 0.5,
     effects: Effects = None,
 ) -> Outcome[Affected]:
-    """Say which catalogues a new calibration changes, and by how much.
+    """List the catalogues that a new calibration changes, and by how much.
 
     The stars are reduced from their rows by both calibrations; the shift of q and u is told in standard errors of the
     old result, by catalogue and night. A night must be made again where more than 5 % of its stars shift by more than

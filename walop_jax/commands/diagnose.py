@@ -57,7 +57,7 @@ def diagnose(
     minutes: Annotated[float | None, MINUTES] = None,
     why: Annotated[str | None, WHY] = None,
 ) -> Outcome[Diagnosis]:
-    """Say what is missing from the model, add it, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
+    """Find the effects that the model lacks, add them, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
 
     The verdict is consistent, effect_found or unexplained. Effects that the data cannot tell apart are listed
     together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and RUN/summary.json

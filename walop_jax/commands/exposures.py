@@ -26,7 +26,7 @@ def exposures(
     words: Annotated[PathLike | None, WORDS] = None,
     output: TableFile = None,
 ) -> Outcome[Any]:
-    """Make the table EXPOSURES of a calibration set from what an observatory writes down.
+    """Make the table EXPOSURES of a calibration set from the records of an observatory.
 
     WORDS.toml says which header word (or key of a log, or column of a table) is which column, in which unit, and what
     is made of it (walop-jax docs files). Words that are missing, units that do not fit and values that cannot be meant

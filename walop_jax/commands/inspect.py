@@ -55,7 +55,7 @@ def inspect(
     job: Job,
     data: Annotated[Sets, Argument(SETS.help.partition(",")[0] + ".", SETS.metavar, SETS.kind)],
 ) -> Outcome[InspectedSets]:
-    """Say what is in calibration sets and what is wrong with them.
+    """List the contents and the faults of calibration sets.
 
     Each file by itself; then whether they can be fitted as one. Exit code 1 if any cannot be read or fitted.
 

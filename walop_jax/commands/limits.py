@@ -40,7 +40,7 @@ def limits(
     instrument: InstrumentLike = None,
     effects: Effects = None,
 ) -> Outcome[DetectionLimits]:
-    """Say at which size every effect of the catalogue would be detected and named in calibration sets.
+    """Compute the size at which every effect would be detected and named in calibration sets.
 
     And what those may be that are too small: the largest error of q and u that a single effect can make over
     the field without being detected. An observing plan (TOML, see walop-jax docs files) says the same before any

@@ -40,7 +40,7 @@ def matrix(
     teff: Annotated[Any, TEFF] = None,
     filter: Annotated[Any, FILTER] = None,
 ) -> Outcome[Any]:
-    """Say what the instrument matrix is at a field point, or at every point of a table.
+    """Give the instrument matrix at a field point, or at every point of a table.
 
     Added are M21, M22, M23, M31, M32, M33 and their errors (three for each arm), and P_ERR: the standard error of p of
     a star with p ≤ 5 %, from the calibration alone.

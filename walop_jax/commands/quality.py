@@ -33,7 +33,7 @@ def quality(
     figure: Annotated[PathLike | None, FIGURE] = None,
     effects: Effects = None,
 ) -> Outcome[Any]:
-    """Add a row of quality numbers for each night to a table, and say which lie outside their limits.
+    """Add a row of quality numbers for each night to a table, and list those outside their limits.
 
     Angle and p of polarised standards and q, u of unpolarised ones against their catalogue (each as all other data see
     it), χ², gains of the cameras, the accuracy of p and what could hide. A night that is there already is replaced, the

@@ -38,7 +38,7 @@ def stack(
     output: Annotated[Any, SURVEY] = None,
     effects: Effects = None,
 ) -> Outcome[Survey]:
-    """Fit many nights at once, each parameter under a law that says how it may change.
+    """Fit many nights at once, each parameter under a law of its change with time.
 
     Breaks of any parameter, or of an effect that the model lacks, are looked for, named and dated, and become laws.
     Laws stand in the [law] tables of a model file: a value for each night or file, a random walk, intervals, steps,

@@ -1,4 +1,4 @@
-"""`walop-jax watch`: when a calibration ceased to hold, as the stars of many nights tell it."""
+"""`walop-jax watch`: when a calibration became invalid, from the stars of many nights."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def watch(
     effects: Effects = None,
     force: Annotated[bool, FORCE] = False,
 ) -> Outcome[Watch]:
-    """Say when a calibration ceased to hold, from the stars of many nights: no calibration exposures are needed.
+    """Find when a calibration became invalid, from the stars of many nights: no calibration exposures are needed.
 
     Four cameras have three unknowns: one number of every row is left. Rows of one MJD are an exposure group; catalogues
     without MJD are a group each, in their order. Steps, drifts and single exposures of cameras and arms are looked for,
