@@ -75,26 +75,33 @@ class Survey(Displayed):
     def _counts(self) -> tuple[float, int]:
         """χ² of data and of what is known beforehand, and its degrees of freedom.
 
-        These are data less fluxes, plus what is known, less unknowns. Loose widths only keep the search inside: they
-        are no knowledge, and what they add to χ² is left out as in a fit.
+        These are data less fluxes, plus priors, less the unknowns that these determine. Loose widths only keep the
+        search inside: they are no knowledge, what they add to χ² is left out, and an unknown that nothing else
+        determines counts as none, as in a fit (`likelihood.inverses.determined`).
         """
         system, chi2 = self.solution.system, self.solution.chi2 + self.solution.penalty
         prior = np.array([p.prior is not None for p in self.data.parameters])
-        known, walks = 0, set()
-        for entry, value in zip(system.globals, self.solution.shared, strict=True):
+        known, walks, weak = 0, set(), 0.0
+        variances = np.diag(self.solution.covariance)
+        for entry, value, variance in zip(system.globals, self.solution.shared, variances, strict=True):
             if prior[entry.parameter]:
                 known += entry.precision > 0
             else:
                 chi2 -= entry.precision * (value - entry.mean) ** 2
-        for cell, local in zip(system.cells, self.solution.local, strict=True):
+                weak += entry.precision * variance
+        for cell, local, (spread, *_) in zip(
+            system.cells, self.solution.local, self.solution.smoothed, strict=True
+        ):
             states = cell.parameter[np.isfinite(cell.mjd)].tolist()
             stated = prior[cell.parameter] | np.isfinite(system.spread[cell.parameter])
             # A step of a walk is known beforehand to be about 0: one for every state but the first.
             known += int(((cell.precision > 0) & stated).sum()) + len(states) - len(set(states) - walks)
-            chi2 -= float(np.where(stated, 0.0, cell.precision) @ (local - cell.mean) ** 2)
+            loose = np.where(stated, 0.0, cell.precision)
+            chi2 -= float(loose @ (local - cell.mean) ** 2)
+            weak += float(loose @ np.diag(spread))
             walks |= set(states)
         unknown = len(system.globals) + sum(len(cell.parameter) for cell in system.cells)
-        return float(chi2), int(sum(night.dof for night in self.data.nights) + known - unknown)
+        return float(chi2), int(sum(night.dof for night in self.data.nights) + known - unknown + round(weak))
 
     @functools.cached_property
     def verdict(self) -> Verdict:
