@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.apply import calibration_for
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import Diagnosed, Effects, PathLike, table_of
+from walop_jax.commands.inputs import Effects, Product, table_of
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Run
     from walop_jax.science.affected import Affected
 
 OLD = Argument("Calibration that the catalogues were reduced with, or its run.", "OLD", Path)
@@ -23,8 +22,8 @@ LIMIT = Option("Shift (standard errors) from which a result is made again (defau
 @command(stages=("reading", "tabulating"))
 def affected(
     job: Job,
-    old: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike, OLD],
-    new: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike, NEW],
+    old: Annotated[Product, OLD],
+    new: Annotated[Product, NEW],
     catalogues: Annotated[Any, CATALOGUES],
     *,
     limit: Annotated[float, LIMIT] = 0.5,

@@ -126,9 +126,9 @@ def text_file(text: str) -> Callable[[Path], object]:
     return lambda path: path.write_text(text, encoding="utf-8")
 
 
-def figure_file(figure: Any) -> Callable[[Path], object]:
-    """Writer of a figure as a picture."""
-    return lambda path: figure.savefig(path, dpi=130)
+def figure_file(draw: Callable[..., Any], *data: Any) -> Callable[[Path], object]:
+    """Writer of the figure `draw(*data)` as a picture."""
+    return lambda path: draw(*data).savefig(path, dpi=130)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,7 +150,7 @@ class Outcome(Generic[T]):
     extra: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     display: Display | None = None
     below: str = ""
-    files: Callable[[], Writers] = dict
+    files: Writers = dataclasses.field(default_factory=dict)
     saved_as: str = ""
     warnings: Sequence[str] = ()
     failure: str = ""
@@ -187,12 +187,11 @@ class Outcome(Generic[T]):
         from walop_jax.io.folder import NotWrittenError
         from walop_jax.io.text import json_text
 
-        files = self.files()
-        absent = [name for name, write in files.items() if write is None]
+        absent = [name for name, write in self.files.items() if write is None]
         names = [name for name in folder.names if name not in absent]
         try:
             with folder.filled(names, (*drop, *absent)) as temporary:
-                for name, write in files.items():
+                for name, write in self.files.items():
                     if write is not None:
                         write(temporary / name)
                 if self.saved_as:

@@ -6,15 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import (
-    Job,
-    Option,
-    Outcome,
-    UsageError,
-    Writers,
-    command,
-    text_file,
-)
+from walop_jax.commands.command import Job, Option, Outcome, UsageError, command, text_file
 from walop_jax.commands.inputs import (
     Effects,
     InstrumentLike,
@@ -33,16 +25,12 @@ if TYPE_CHECKING:
     from walop_jax.io.display import Display
 
 OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA, MODEL)
-
-
 MINUTES = Option(
     "Minutes after which no further name is looked for (default: none; the search ends by itself).",
     "MINUTES",
     float,
     least=0.0,
 )
-
-
 WHY = Option(
     "Answer why an effect, or a description, was not named by a diagnosis that has been made; give its RUN.",
     "NAME",
@@ -104,24 +92,23 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
     product, after = found.calibration(), answered(found.after)
     usable = after.trusted and found.verdict != "unexplained"
 
-    def files() -> Writers:
+    def write_summary(path: Path) -> None:
         job.tell("mapping the field", "mapping")
-        drawn_from = figure_data(found)
         misfit = None if after.explains_data else describe(after)
         fitted = summary(after, seconds=found.seconds, misfit=misfit) | {"seed": job.seed}
-        return {
-            PRODUCT: lambda path: write_calibration(path, product),
-            SUMMARY: text_file(json_text(fitted | {"shown": after.display().document()})),
-            FIGURE_DATA: lambda path: write_figure_data(path, drawn_from),
-            MODEL: text_file(render(after.model)),
-        }
+        text_file(json_text(fitted | {"shown": after.display().document()}))(path)
 
     return Outcome(
         found,
         document(found),
         display=_with_answer(found, after),
         below=f"The calibration can{'' if usable else 'not'} be trusted; written to {output}.",
-        files=files,
+        files={
+            SUMMARY: write_summary,
+            PRODUCT: lambda path: write_calibration(path, product),
+            FIGURE_DATA: lambda path: write_figure_data(path, figure_data(found)),
+            MODEL: lambda path: text_file(render(after.model))(path),
+        },
         saved_as=DIAGNOSIS,
         warnings=after.warnings,
         trusted=usable,

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, Writers, command
-from walop_jax.commands.inputs import SETS, Diagnosed, Effects, PathLike, calibration_of, catalogue_of, set_of
+from walop_jax.commands.command import Argument, Job, Option, Outcome, command
+from walop_jax.commands.inputs import Effects, PathLike, Product, Sets, calibration_of, catalogue_of, set_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, CalibrationSet, FitResult, Run
     from walop_jax.science.epoch import Epoch
 
 OLD = Argument("Old calibration product, or folder of a run.", "OLD", Path)
@@ -23,8 +21,8 @@ OUTPUTS = ("calibration.fits", "epoch.json")
 @command(stages=("reading", "fitting", "lacking"), writes=OUTPUTS, random=True)
 def epoch(
     job: Job,
-    old: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike, OLD],
-    new: Annotated[CalibrationSet | PathLike | Sequence[PathLike], SETS],
+    old: Annotated[Product, OLD],
+    new: Sets,
     *,
     output: Annotated[PathLike | None, FOLDER] = None,
     effects: Effects = None,
@@ -56,9 +54,9 @@ def epoch(
     job.tell("fitting the new set", "fitting")
     with errors_naming(held.path):
         result = examined(fit_like(held, calset), job.seed)
-        found = compared(held, result)
+        comparison = compared(held, result)
     lacking = None
-    if found.fits is None:
+    if comparison.fits is None:
         job.tell("looking for what the new fit lacks", "lacking")
         # Other readings of the data have been tried when its fit was examined.
         lacking = diagnose(
@@ -71,31 +69,26 @@ def epoch(
         )
         if lacking is not None and lacking.after.trusted:
             result = lacking.after
-            found = compared(held, result)
-    shown = found.display()
+            comparison = compared(held, result)
+    shown = comparison.display()
     if lacking is not None:
         named = ", ".join(step.effect for step in lacking.steps) or "nothing that has a name"
         lacks = f"what the old model lacks: {named} ({lacking.verdict})"
         shown = dataclasses.replace(shown, notes=(*shown.notes, lacks))
-
-    def files() -> Writers:
-        product = Calibration.from_fit(result)
-        return {OUTPUTS[0]: lambda path: write_calibration(path, product)}
-
     return Outcome(
-        found,
+        comparison,
         {
             "old": held.content_hash(),
             "old_file": held.path,
             "old_date": held.date,
             "new": [entry.sha256 for entry in calset.inputs],
             "new_files": [str(entry.path) for entry in calset.inputs],
-            **found.document(),
+            **comparison.document(),
             "diagnosis": None if lacking is None else document(lacking),
         },
         display=shown,
-        files=files,
+        files={OUTPUTS[0]: lambda path: write_calibration(path, Calibration.from_fit(result))},
         saved_as=OUTPUTS[1],
-        warnings=[f"the new fit: {w}" if w in result.warnings else w for w in found.warnings],
-        trusted=found.holds,
+        warnings=[f"the new fit: {w}" if w in result.warnings else w for w in comparison.warnings],
+        trusted=comparison.holds,
     )

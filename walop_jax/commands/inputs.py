@@ -69,6 +69,8 @@ Product = Annotated[
     "Calibration | FitResult | Diagnosed | Run | PathLike",
     Argument("Calibration product, or the folder of a run.", "RUN/calibration.fits", Path),
 ]
+OptionalProduct = Annotated["Calibration | FitResult | Diagnosed | Run | PathLike | None", None]
+"""Where a command does without, under an option of its own."""
 DataOf = Annotated[
     "Sequence[PathLike] | None",
     Option("Calibration set of the fit, if it has moved; again for each.", "CALSET", list[Path]),

@@ -85,13 +85,13 @@ def limits(
     if not result.converged:
         raise ValueError(f"the fit did not converge ({result.minimum.message})")
     asked = None if effects is None else catalogue_of(effects)
-    found = detection_limits(result, catalogue=asked, seed=job.seed, progress=job.progress)
+    limits_of_data = detection_limits(result, catalogue=asked, seed=job.seed, progress=job.progress)
     suggested = output is not None and (
         f"walop-jax report {output}",
         *_plan(data, output, instrument, result),
     )
     return Outcome(
-        found,
+        limits_of_data,
         extra={
             "instrument": result.model.name,
             "effects_of_the_model": list(result.model.effect_names),
@@ -100,9 +100,9 @@ def limits(
             "trusted": result.trusted,
             "seed": job.seed,
         },
-        files=lambda: {
-            OUTPUTS[1]: figure_file(protection_figure(found)),
-            OUTPUTS[2]: figure_file(separation_figure(found)),
+        files={
+            OUTPUTS[1]: figure_file(protection_figure, limits_of_data),
+            OUTPUTS[2]: figure_file(separation_figure, limits_of_data),
         },
         saved_as=OUTPUTS[0],
         next=suggested or (),

@@ -133,7 +133,7 @@ def plan(
     )
     job.tell("information of exposures", "information")
     with job.repeated() as say:
-        found = plan_exposures(
+        planned = plan_exposures(
             Available.of(available),  # pyright: ignore[reportArgumentType]
             minutes,
             criterion=chosen,
@@ -145,14 +145,13 @@ def plan(
             seed=job.seed,
             progress=say,
         )
-
-    described = found.observing_plan.design.description
+    described = planned.observing_plan.design.description
     files: Writers = {
-        PLAN: text_file(plan_text(found.observing_plan, INSTRUMENT if described else None)),
+        PLAN: text_file(plan_text(planned.observing_plan, INSTRUMENT if described else None)),
         INSTRUMENT: text_file(described) if described else None,
     }
-    remarks = () if schedule is None else _scheduled(job, found.observing_plan, schedule, words)
-    return Outcome(found, extra={"seed": job.seed}, files=lambda: files, saved_as=PLANNED, warnings=remarks)
+    remarks = () if schedule is None else _scheduled(job, planned.observing_plan, schedule, words)
+    return Outcome(planned, extra={"seed": job.seed}, files=files, saved_as=PLANNED, warnings=remarks)
 
 
 def _scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike | None) -> Sequence[str]:

@@ -106,9 +106,7 @@ def refit(
             extra={"seed": job.seed},
             display=dataclasses.replace(result.display(), notes=result.notes),
             below=f"The calibration can{'' if result.trusted else 'not'} be trusted; written to {output}.",
-            files=lambda: {
-                PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result, residuals))
-            },
+            files={PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result, residuals))},
             saved_as=SUMMARY,
             next=next_steps(result.trusted, output, data, instrument=instrument, effects=effects),
             warnings=(*result.warnings, *(() if misfit is None else misfit.sentences())),

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import Diagnosed, Effects, PathLike, calibration_of, catalogue_of, fit_of
+from walop_jax.commands.inputs import Effects, OptionalProduct, calibration_of, catalogue_of, fit_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from walop_jax import Calibration, FitResult, Run
     from walop_jax.nights.survey import Survey
 
 NIGHTS = Argument("Calibration sets, folders of refit, or a SURVEY.", "NIGHT...", list[Path])
@@ -30,7 +29,7 @@ def stack(
     nights: Annotated[Any, NIGHTS],
     laws: Annotated[Any, LAWS] = None,
     *,
-    like: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike | None, LIKE] = None,
+    like: Annotated[OptionalProduct, LIKE] = None,
     events: Annotated[Any, EVENTS] = None,
     no_breaks: Annotated[bool, KNOWN] = False,
     workers: Annotated[int | None, WORKERS] = None,
@@ -85,7 +84,7 @@ def stack(
         stars = (f"walop-jax apply {output} STARS.fits -o OUT.fits",) if survey.trusted else ()
         found = Outcome(
             survey,
-            files=lambda: writers(survey),
+            files=writers(survey),
             saved_as=FILES[-1],
             next=(f"walop-jax report {output}", *stars),
             warnings=survey.verdict.warnings,

@@ -59,16 +59,15 @@ def watch(
     ]
     files = [name for name, entry in zip(names, given, strict=True) if isinstance(entry, str | os.PathLike)]
     with errors_naming(", ".join(files) or None):
-        found = watched(held, rows, names=names, force=force)
-
+        history = watched(held, rows, names=names, force=force)
     return Outcome(
-        found,
+        history,
         extra={"product": held.content_hash()},
-        files=lambda: {
-            OUTPUTS[1]: lambda path: found.to_table().write(path, format="fits"),
-            OUTPUTS[2]: figure_file(watch_figure(found)),
+        files={
+            OUTPUTS[1]: lambda path: history.to_table().write(path, format="fits"),
+            OUTPUTS[2]: figure_file(watch_figure, history),
         },
         saved_as=OUTPUTS[0],
         warnings=held.warnings,
-        trusted=found.holds,
+        trusted=history.holds,
     )

@@ -249,16 +249,12 @@ def solve(system: System) -> Solution:
     means = np.array([entry.mean for entry in system.globals])
     top[np.diag_indices(size)] += precision
     right += precision * means
-    constant = float(e.chi2.sum() + precision @ means**2)
-    logdet, rows_of = 0.0, []
+    rows_of: list[Any] = []
     before: Cell | None = None
     last: Eliminated | None = None
     for cell in system.cells:
         block, border, own = _block(system, cell)
-        constant += float(cell.precision @ cell.mean**2)
-        logdet -= float(np.log(cell.precision[cell.precision > 0]).sum())
-        coupling, logs = _walks(system, cell, before, block, rows_of)
-        logdet += logs
+        coupling = _walks(system, cell, before, block, rows_of)
         rows_of.append((block, border, own, coupling))
         before = cell
     # Forwards. A block knows what the walk to the next cell adds to it only when that cell was made.
@@ -276,12 +272,10 @@ def solve(system: System) -> Solution:
         last = Eliminated(block, border, coupling, factor, left, rest)
         done.append(last)
         if len(own):
-            logdet += 2.0 * float(np.log(np.diag(factor[0])).sum())
             gain = linalg.cho_solve(factor, np.column_stack([left, rest]), check_finite=False)
             top -= left.T @ gain[:, :-1]
             right -= left.T @ gain[:, -1]
     factor = _factored(0.5 * (top + top.T), at, None) if size else (top, True)
-    logdet += 2.0 * float(np.log(np.diag(factor[0])).sum()) if size else 0.0
     shared = linalg.cho_solve(factor, right) if size else right
     values: list[Vector] = [np.zeros(0)] * len(done)
     for c in range(len(done) - 1, -1, -1):
@@ -290,8 +284,7 @@ def solve(system: System) -> Solution:
             if c + 1 < len(done) and len(values[c + 1]):
                 rest = rest - done[c + 1].before.T @ values[c + 1]
             values[c] = linalg.cho_solve(done[c].factor, rest, check_finite=False)
-    solution = Solution(system, shared, tuple(values), tuple(done), factor, 0.0)
-    return dataclasses.replace(solution, evidence=-0.5 * (solution.chi2 + solution.penalty + logdet))
+    return Solution(system, shared, tuple(values), tuple(done), factor)
 
 
 def _block(system: System, cell: Cell) -> tuple[Matrix, Float[np.ndarray, "_ _"], Vector]:
@@ -310,9 +303,9 @@ def _block(system: System, cell: Cell) -> tuple[Matrix, Float[np.ndarray, "_ _"]
 
 def _walks(
     system: System, cell: Cell, before: Cell | None, block: Matrix, made: Sequence[Any]
-) -> tuple[Float[np.ndarray, "_ _"], float]:
-    """Add the steps of walks that end in a cell to its block and the one before; coupling, and log of variances."""
-    coupling, logs = np.zeros((len(cell.mjd), 0 if before is None else len(before.mjd))), 0.0
+) -> Float[np.ndarray, "_ _"]:
+    """Add the steps of walks that end in a cell to its block and the one before; the coupling of both."""
+    coupling = np.zeros((len(cell.mjd), 0 if before is None else len(before.mjd)))
     for k in np.flatnonzero(np.isfinite(cell.mjd)):
         i = cell.parameter[k]
         here = np.flatnonzero((cell.parameter == i) & (cell.mjd < cell.mjd[k]))
@@ -322,7 +315,6 @@ def _walks(
         times, own = (cell.mjd, True) if len(here) else (before.mjd, False)  # type: ignore[union-attr]
         last = (here if own else there)[np.argmax(times[here if own else there])]
         variance = system.rates[i] ** 2 * (cell.mjd[k] - times[last])
-        logs += float(np.log(variance))
         block[k, k] += 1.0 / variance
         if own:
             block[last, last] += 1.0 / variance
@@ -331,22 +323,18 @@ def _walks(
         else:
             made[-1][0][last, last] += 1.0 / variance
             coupling[k, last] = -1.0 / variance
-    return coupling, logs
+    return coupling
 
 
 @dataclasses.dataclass(frozen=True)
 class Solution:
-    """Unknowns that fit best, in units of `Equations.scale`, with their covariances; `evidence` is a logarithm.
-
-    The evidence compares rates and spreads of the same laws: constants of what has no prior are left out.
-    """
+    """Unknowns that fit best, in units of `Equations.scale`, with their covariances."""
 
     system: System
     shared: Vector
     local: tuple[Vector, ...]
     cells: tuple[Eliminated, ...]
     factor: tuple[Matrix, bool]
-    evidence: float
 
     @functools.cached_property
     def values(self) -> Float[np.ndarray, "u n"]:

@@ -170,11 +170,10 @@ def laws_of_all(data: Together, laws: Mapping[str, Law | Mapping[str, Any]]) -> 
 
 def writers(survey: Survey) -> dict[str, Callable[[Path], object]]:
     """Writers of the files of a survey, but for its document."""
-    last, reference = survey.at(survey.last), dataclasses.replace(survey.reference, path=None)
     return {
         NIGHTS: lambda path: write_nights(path, survey.data.aligned()),
-        REFERENCE: lambda path: write_calibration(path, reference),
-        PRODUCT: lambda path: write_calibration(path, last),
+        REFERENCE: lambda path: write_calibration(path, dataclasses.replace(survey.reference, path=None)),
+        PRODUCT: lambda path: write_calibration(path, survey.at(survey.last)),
         TRACKS: lambda path: survey.tracks.write(path, format="fits"),
     }
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import optimize
 
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import with_error
@@ -31,7 +32,6 @@ FEWEST = 50  # stars
 MOST = 20_000  # that are looked at
 FAR = 5.0  # standard deviations
 _ROUNDS = 4
-_HALVINGS = 25
 _SEEN = 2.33  # one-sided 99 %
 
 
@@ -139,13 +139,13 @@ def _fitted(
 
 def _scatter(left: Float[np.ndarray, " s"], variance: Float[np.ndarray, " s"]) -> float:
     """Variance beyond the stated one for which χ² of residuals is their number, less what was fitted."""
-    low, high, wanted = 0.0, float(np.mean(left**2)), len(left) - 3.0
-    if np.sum(left**2 / variance) <= wanted:
-        return 0.0
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if np.sum(left**2 / (variance + middle)) > wanted else (low, middle)
-    return 0.5 * (low + high)
+
+    def excess(scatter: float) -> float:
+        return float(np.sum(left**2 / (variance + scatter))) - (len(left) - 3.0)
+
+    # Where the scatter is the mean square of all residuals, χ² is below their number, but not less than three below.
+    highest = 2.0 * float(np.mean(left**2))
+    return float(optimize.brentq(excess, 0.0, highest)) if excess(0.0) > 0 else 0.0  # pyright: ignore[reportArgumentType]
 
 
 def with_sky(stars: Stars, catalogue: Catalogue) -> Stars:
