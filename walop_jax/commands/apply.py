@@ -18,6 +18,7 @@ from walop_jax.commands.inputs import (
     TableFile,
     calibration_of,
     catalogue_of,
+    several,
     table_of,
     table_outcome,
 )
@@ -110,12 +111,11 @@ def apply(
     if saturation is not None and not saturation > 0:
         raise UsageError(f"{saturation} must be above 0 electrons", "saturation")
     if each:
-        files = list(catalogue) if isinstance(catalogue, list | tuple) else [catalogue]
         options = {
             "calibration": calibration, "debias": debias, "saturation": saturation, "posterior": posterior,
             "effects": effects, "force": force, "common": common,
         }  # fmt: skip
-        return for_each(job, apply, files, output, options, workers, scheduler)
+        return for_each(job, apply, several(catalogue), output, options, workers, scheduler)
     if output is not None:
         check_output(output, overwrite=job.overwrite)
         table_format(output)
@@ -232,17 +232,10 @@ def _about_noise(counts: Any, sigma: Any) -> Iterator[str]:
 
 def _about_places(rows: Any, flag: Any) -> Iterator[str]:
     """A sentence where rows of one star disagree, and lie at different places of the field."""
-    import numpy as np
-
     from walop_jax.fit.verdict import Quality
+    from walop_jax.science.overlaps import extents
 
-    apart = np.zeros(len(flag))
-    for place in (rows.points.x, rows.points.y):
-        low, high = np.full(len(flag), np.inf), np.full(len(flag), -np.inf)
-        np.minimum.at(low, rows.star, place)
-        np.maximum.at(high, rows.star, place)
-        apart = np.maximum(apart, high - low)
-    if number := int(((apart > APART) & (flag & Quality.DISAGREES > 0)).sum()):
+    if number := int(((extents(rows) > APART) & (flag & Quality.DISAGREES > 0)).sum()):
         yield f"{number} of the stars that disagree have rows at different places: is their ID that of one star?"
 
 

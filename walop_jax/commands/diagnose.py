@@ -107,7 +107,7 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
             SUMMARY: write_summary,
             PRODUCT: lambda path: write_calibration(path, product),
             FIGURE_DATA: lambda path: write_figure_data(path, figure_data(found)),
-            MODEL: lambda path: text_file(render(after.model))(path),
+            MODEL: lambda path: path.write_text(render(after.model), encoding="utf-8"),
         },
         saved_as=DIAGNOSIS,
         warnings=after.warnings,

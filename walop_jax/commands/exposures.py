@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import PathLike, TableFile
+from walop_jax.commands.inputs import PathLike, TableFile, several
 
 FILES = Argument(
     "FITS files, a JSON export of a log, a table of words, or a schedule.", "FILE...", list[Path]
@@ -46,7 +45,7 @@ def exposures(
 
     if words is None:
         raise UsageError("give the file that says which word is which column", "words")
-    given = [files] if isinstance(files, str | os.PathLike) else list(files)
+    given = several(files)
     known = read_words(words)
     first = Path(given[0])
     content = None

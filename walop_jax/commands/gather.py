@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import InstrumentLike, PathLike, TableFile, design_of
+from walop_jax.commands.inputs import InstrumentLike, PathLike, TableFile, design_of, several
 
 if TYPE_CHECKING:
     from walop_jax.data.camera_catalogues import CameraCatalogue
@@ -60,8 +59,7 @@ def gather(
 
     if output is not None:
         table_format(output)
-    if isinstance(catalogues, str | os.PathLike):
-        catalogues = [catalogues]
+    catalogues = several(catalogues)
     design = design_of(instrument) or nominal_instrument()
     names = design.cameras.names
     if len(catalogues) != len(names):

@@ -340,6 +340,21 @@ def table_of(given: Any, columns: Mapping[str, Any]) -> InputTable:
     return made
 
 
+def several(given: Any) -> list[Any]:
+    """Items that were given one by one or in a list."""
+    return list(given) if isinstance(given, list | tuple) else [given]
+
+
+def named_tables(given: Any) -> list[tuple[str, InputTable]]:
+    """Tables, of files or in memory, with the names by which messages call them."""
+    if not several(given):
+        raise UsageError("give at least one table", "catalogues")
+    return [
+        (str(entry) if isinstance(entry, str | os.PathLike) else f"catalogue {number}", table_of(entry, {}))
+        for number, entry in enumerate(several(given), start=1)
+    ]
+
+
 def left_out_sentences(names: Sequence[str], source: PathLike | None = None) -> tuple[str, ...]:
     """A sentence for every effect that cannot be carried over; `source` is the file that the model comes from."""
     where = "" if source is None else f"{os.fspath(source)}: "

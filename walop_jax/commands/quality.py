@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import Diagnosed, Effects, PathLike, calibration_of
+from walop_jax.commands.inputs import Diagnosed, Effects, PathLike, calibration_of, several
 from walop_jax.io.display import Display
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def quality(
     allowed = read_limits(limits)
     if figure is not None:
         check_output(figure, overwrite=True)
-    given: list[Any] = list(runs) if isinstance(runs, list | tuple) else [runs]
+    given = several(runs)
     rows, remarks = [], []
     for number, one in enumerate(given, start=1):
         job.tell(f"run {number} of {len(given)}", "reading")

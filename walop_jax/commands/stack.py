@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import Effects, OptionalProduct, calibration_of, catalogue_of, fit_of
+from walop_jax.commands.inputs import Effects, OptionalProduct, calibration_of, catalogue_of, fit_of, several
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -66,8 +66,7 @@ def stack(
         raise UsageError(
             "workers and scheduler exclude each other: a cluster has its own workers", "scheduler"
         )
-    given: list[Any] = list(nights) if isinstance(nights, list | tuple) else [nights]
-    given = [fit_of(one) for one in given]
+    given = [fit_of(night) for night in several(nights)]
     with job.reserved(output, FILES) as job, executor_of(workers, scheduler) as executor:
         job.begin("reading")
         survey = stacked(

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command, figure_file
-from walop_jax.commands.inputs import Effects, PathLike, Product, calibration_of, table_of
+from walop_jax.commands.inputs import Effects, PathLike, Product, calibration_of, named_tables
 
 if TYPE_CHECKING:
     from walop_jax.science.watch import Watch
@@ -49,16 +48,11 @@ def watch(
 
     job.begin("reading")
     held = calibration_of(calibration, effects)
-    given = list(catalogues) if isinstance(catalogues, list | tuple) else [catalogues]
+    names, tables = zip(*named_tables(catalogues), strict=True)
     instrument, always_in = held.model.template.patched(), held.always_in
-    rows = [read_catalogue(table_of(entry, {}), instrument, always_in=always_in) for entry in given]
+    rows = [read_catalogue(table, instrument, always_in=always_in) for table in tables]
     job.tell("tabulating the analysis vectors", "tabulating")
-    names = [
-        str(entry) if isinstance(entry, str | os.PathLike) else f"catalogue {number}"
-        for number, entry in enumerate(given, start=1)
-    ]
-    files = [name for name, entry in zip(names, given, strict=True) if isinstance(entry, str | os.PathLike)]
-    with errors_naming(", ".join(files) or None):
+    with errors_naming(", ".join(names)):
         history = watched(held, rows, names=names, force=force)
     return Outcome(
         history,

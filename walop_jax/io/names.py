@@ -12,7 +12,7 @@ COMPARISON, EPOCH, LIMITS, COMMISSIONING = (
     "limits.json",
     "commissioning.json",
 )
-PLANNED, WATCHED, SURVEY = "plan.json", "watch.json", "survey.json"
+PLANNED, WATCHED, SURVEY, AFFECTED = "plan.json", "watch.json", "survey.json", "affected.json"
 NIGHTS, REFERENCE, TRACKS = "nights.fits", "reference.fits", "tracks.fits"
 
 DOCUMENTS = {
@@ -26,5 +26,6 @@ DOCUMENTS = {
     "plan": PLANNED,
     "survey": SURVEY,
     "watch": WATCHED,
+    "affected": AFFECTED,
 }
 """Files of the documents of commands, by the name of the document."""

@@ -23,6 +23,7 @@ from walop_jax.fit.verdict import Quality
 from walop_jax.io.display import Display, signed
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.names import (
+    AFFECTED,
     COMMISSIONING,
     COMPARISON,
     EPOCH,
@@ -464,6 +465,7 @@ OTHERS = {
     "limits": OtherPage(LIMITS, "What these data can show"),
     "survey": OtherPage(SURVEY, "Many nights of one instrument", "trusted"),
     "watch": OtherPage(WATCHED, "Does the calibration still hold?", "holds"),
+    "affected": OtherPage(AFFECTED, "Catalogues that a new calibration changes"),
     "commissioning": OtherPage(COMMISSIONING, "Go or no-go", "go"),
 }
 

@@ -30,6 +30,7 @@ from walop_jax.science.detectors import detector_slopes, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
 from walop_jax.science.left_over_sky import with_sky
 from walop_jax.science.star_residuals import StarResiduals
+from walop_jax.sky.moon import sky_to_instrument
 
 STAR_SAMPLE = 16384
 """Rows of a catalogue, spread over it, by which the whole of it is judged: they see a camera that has changed by a
@@ -176,17 +177,19 @@ class _Application:
         outside = self.outside(rows)
         x, y = (np.where(outside, 0.0, values[rows]) for values in (points.x, points.y))
         teff, sky = points.settings.teff[rows], np.isfinite(catalogue.rotator[rows])
-        turn = 2.0 * np.where(sky, np.deg2rad(catalogue.rotator[rows]) + self.offset, 0.0)
+        rotator = np.where(sky, catalogue.rotator[rows] + np.rad2deg(self.offset), 0.0)
 
         spectra = np.empty((len(rows), COLOURS + 1, vectors.cameras, 3))
         for k, here in _rows_by_setting(setting_of):
             spectra[here] = vectors.at(self.settings[k], x[here], y[here])
         there = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
         used = np.where(outside[:, None], np.nan, counts)
-        on_sky = _vectors_on_sky(there, turn)
+        # Of light with (q + iu) exp(−2iR) in the instrument frame: the vectors turn the other way.
+        axes = sky_to_instrument(there[..., 1], there[..., 2], -rotator[:, None])
+        on_sky = np.stack([there[..., 0], *axes], axis=-1)
         found = estimate(on_sky, used, sigma, star, vectors.instrument.cameras)
 
-        s = _instrument_stokes(found.qu[star], turn)
+        s = np.stack([np.ones(len(rows)), *sky_to_instrument(*found.qu[star].T, rotator)], axis=1)
         # Of the model per unit flux, to the plain parameters and to the throughputs.
         plain = np.empty((len(rows), vectors.cameras, vectors.plain))
         throughput = np.empty((len(rows), vectors.cameras, vectors.cameras))
@@ -411,6 +414,8 @@ class _Application:
         The largest, in q and in u, of the changes that cannot be told apart.
         """
         points, found = self.catalogue.points, block.found
+        cameras = self.vectors.instrument.cameras.names
+        parameters = [name for name, _ in self.vectors.named]
         counts = np.nan_to_num(self.counts[block.rows])
         lit = np.where(found.flux > 0, found.flux, np.inf)
         place = (points.x[block.rows], points.y[block.rows], self.catalogue.time[block.rows])
@@ -418,13 +423,12 @@ class _Application:
         for change in check.changes:
             largest = np.zeros_like(block.stars.qu)
             for entry in change.alike:
-                question = entry.question
-                if question.of_camera:
-                    grown, k = np.zeros_like(counts), question.camera
-                    grown[:, k] = check.growth.electrons(question.kind, *place, counts[:, k]) / lit
+                if entry.camera:
+                    grown, k = np.zeros_like(counts), cameras.index(entry.name)
+                    grown[:, k] = check.growth.electrons(entry.kind, *place, counts[:, k]) / lit
                     shift = calibration_shift(found.gain, grown[..., None], block.star)[..., 0]
                 else:
-                    shift = block.derivative[:, :, question.parameter]
+                    shift = block.derivative[:, :, parameters.index(entry.name)]
                 largest = np.maximum(largest, np.abs(entry.size * np.nan_to_num(shift)))
             total += largest[:, :, None] ** 2 * np.eye(2)
         near = np.zeros(len(total), bool)
@@ -458,27 +462,6 @@ def _slices_of_stars(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]
 def _rows_by_setting(setting_of: Int[np.ndarray, " r"]) -> Iterator[tuple[int, Int[np.ndarray, " w"]]]:
     for k in np.unique(setting_of):
         yield int(k), np.flatnonzero(setting_of == k)
-
-
-def _vectors_on_sky(
-    vectors: Float[np.ndarray, "r k 3"], turn: Float[np.ndarray, " r"]
-) -> Float[np.ndarray, "r k 3"]:
-    """Analysis vectors for Stokes parameters on the sky; `turn` is twice the position angle of +X (rad).
-
-    (q + iu) of the instrument = (q + iu) of the sky × exp(−i turn).
-    """
-    cos, sin = np.cos(turn)[:, None], np.sin(turn)[:, None]
-    one, q, u = (vectors[..., k] for k in range(3))
-    return np.stack([one, cos * q - sin * u, sin * q + cos * u], axis=-1)
-
-
-def _instrument_stokes(
-    qu: Float[np.ndarray, "r 2"], turn: Float[np.ndarray, " r"]
-) -> Float[np.ndarray, "r 3"]:
-    """(1, q, u) in the instrument frame from (q, u) on the sky."""
-    cos, sin = np.cos(turn), np.sin(turn)
-    q, u = qu.T
-    return np.stack([np.ones_like(q), cos * q + sin * u, cos * u - sin * q], axis=-1)
 
 
 def _ignored_colour(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:

@@ -24,6 +24,7 @@ from walop_jax.data.user_tables import InputTable, numeric_column, read_input_ta
 from walop_jax.io.errors import fail
 from walop_jax.io.plain_tables import astropy_table, faults_of_ucds
 from walop_jax.sky.directions import designations, galactic
+from walop_jax.sky.moon import sky_to_instrument
 
 REFERENCE = "Panopoulou et al. 2025, ApJS 276, 15"
 MJD_ZERO = 2400000.5
@@ -91,8 +92,7 @@ def to_galactic(
     qu: Float[np.ndarray, "n 2"], covariance: Float[np.ndarray, "n 2 2"], north: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
     """(q, u) and covariance from Galactic north, which has the position angle `north` (deg) at each star."""
-    cos, sin = np.cos(2.0 * np.deg2rad(north)), np.sin(2.0 * np.deg2rad(north))
-    turn = np.moveaxis(np.array([[cos, sin], [-sin, cos]]), 2, 0)
+    turn = np.stack(sky_to_instrument(*np.eye(2), north[:, None]), axis=1)
     return np.einsum("nij,nj->ni", turn, qu), turn @ covariance @ turn.swapaxes(1, 2)
 
 

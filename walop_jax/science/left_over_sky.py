@@ -22,6 +22,7 @@ from scipy import optimize
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import with_error
 from walop_jax.science.catalogue import Catalogue
+from walop_jax.science.instrument_changes import MOST_LIKELY
 
 if TYPE_CHECKING:
     from walop_jax.science.apply import Stars
@@ -32,7 +33,6 @@ FEWEST = 50  # stars
 MOST = 20_000  # that are looked at
 FAR = 5.0  # standard deviations
 _ROUNDS = 4
-_SEEN = 2.33  # one-sided 99 %
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,7 @@ class LeftOverSky:
     @property
     def bound(self) -> float:
         """The share that is not exceeded with a probability of 99 %."""
-        return float(np.hypot(*self.share) + _SEEN * self.errors.max())
+        return float(np.hypot(*self.share) + MOST_LIKELY * self.errors.max())
 
     def covariance(self, ratio: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2 2"]:
         """Covariance of its shift of stars with a `ratio` of sky to light, 0 where none was found."""

@@ -17,9 +17,9 @@ from scipy import special
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.science.apply import STAR_SAMPLE, apply
 from walop_jax.science.catalogue import Catalogue
+from walop_jax.science.instrument_changes import ALARM
 
 APART = 0.02  # deg: rows of a star that lie farther apart than that are at two places
-ALARM = 1e-4  # probability of a χ² as large
 COMMON = float(special.chdtri(1, ALARM))
 """Square of a normal deviate that is exceeded with that probability."""
 _OUTLIER = 1e-6  # of a row: left out
@@ -50,15 +50,20 @@ class Overlap:
         ]
 
 
-def at_several_places(catalogue: Catalogue) -> Bool[np.ndarray, " n"]:
-    """Rows of stars that are seen at several places of the field."""
-    apart = np.zeros(catalogue.star.max() + 1)
+def extents(catalogue: Catalogue) -> Float[np.ndarray, " s"]:
+    """The largest distance in X or Y (deg) between the rows of every star."""
+    extent = np.zeros(catalogue.star.max() + 1)
     for place in (catalogue.points.x, catalogue.points.y):
-        low, high = np.full(len(apart), np.inf), np.full(len(apart), -np.inf)
+        low, high = np.full(len(extent), np.inf), np.full(len(extent), -np.inf)
         np.minimum.at(low, catalogue.star, place)
         np.maximum.at(high, catalogue.star, place)
-        apart = np.maximum(apart, high - low)
-    return (apart > APART)[catalogue.star]
+        extent = np.maximum(extent, high - low)
+    return extent
+
+
+def at_several_places(catalogue: Catalogue) -> Bool[np.ndarray, " n"]:
+    """Rows of stars that are seen at several places of the field."""
+    return (extents(catalogue) > APART)[catalogue.star]
 
 
 def overlap(calibration: Calibration, catalogue: Catalogue, *, force: bool = False) -> Overlap | None:

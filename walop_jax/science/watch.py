@@ -40,7 +40,16 @@ from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.science.apply import residuals_of
 from walop_jax.science.catalogue import Catalogue
-from walop_jax.science.catalogue_check import ALARM, RIVAL, threshold
+from walop_jax.science.instrument_changes import (
+    ALARM,
+    MOST_LIKELY,
+    RIVAL,
+    UNNAMED,
+    Change,
+    History,
+    WatchedChange,
+    threshold,
+)
 from walop_jax.science.star_residuals import (
     ABOUT_GAINS,
     CROWDED,
@@ -58,13 +67,11 @@ from walop_jax.science.star_residuals import (
     of_few,
     own_variance,
 )
-from walop_jax.science.watch_found import UNNAMED, History, Suspect, Watch, WatchedChange
+from walop_jax.science.watch_found import Watch
 from walop_jax.science.watch_readings import Answers, Readings
 from walop_jax.science.watch_spots import SpotFound, Spots, of_stars, profile
 
 WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen to 10⁻⁵
-SEEN = 2.33
-"""Standard deviations above the alarm from which 99 % are found."""
 MOST_GROUPS = 150
 """Exposure groups that are told apart; neighbours of more are joined."""
 RIVALS = (
@@ -347,10 +354,10 @@ class Watching:
     def _errors(self, part: StarResiduals) -> Float[np.ndarray, "r k n"]:
         return np.concatenate([part.parameters() @ self.root, part.colour], axis=-1)
 
-    def suspects(self, found: Answers) -> list[Suspect]:
+    def suspects(self, found: Answers) -> list[Change]:
         """Every reading with the histories compared, the most significant first; those too large for theirs last."""
         listed = [
-            Suspect(
+            Change(
                 reading.name, reading.kind != "optics", self.histories[n], float(found.size[n, k]),
                 float(found.error[n, k]), reading.unit, reading.kind,
                 () if reading.across is None else (float(found.angle[n, k]),),
@@ -362,7 +369,7 @@ class Watching:
         return sorted(listed, key=lambda entry: (not self.readings.possible(entry), -abs(entry.sigma)))
 
     def without(
-        self, residual: Float[np.ndarray, "r k"], change: Suspect, size: float
+        self, residual: Float[np.ndarray, "r k"], change: Change, size: float
     ) -> Float[np.ndarray, "r k"]:
         """Residuals behind a change."""
         grown = change.history.over(self.time)[self.group, None] * size
@@ -435,7 +442,7 @@ class Watching:
         Histories compared are the best of each kind and camera and their neighbours. The fit is repeated with the
         stars that it keeps.
         """
-        best: Suspect | None = None
+        best: Change | None = None
         total, remaining, alike = 0.0, residual, []
         for _ in range(_ROUNDS):
             if best is not None:
@@ -453,7 +460,8 @@ class Watching:
             moved = abs(best.size - total) / best.error
             total = best.size
             remaining = self.without(residual, best, total)
-            if before is not None and before.thing == best.thing and moved < _SETTLED:
+            same = before is not None and (*before.thing, before.history) == (*best.thing, best.history)
+            if same and moved < _SETTLED:
                 break
         assert best is not None
         if not self.readings.possible(best):
@@ -461,7 +469,7 @@ class Watching:
             alike = [best]
         return self._dated(best, alike), remaining
 
-    def _dated(self, best: Suspect, alike: list[Suspect]) -> WatchedChange:
+    def _dated(self, best: Change, alike: list[Change]) -> WatchedChange:
         began = self.time[[entry.history.start for entry in alike]]
         when = float(self.time[best.history.start]), (float(began.min()), float(began.max()))
         return WatchedChange(best, tuple(alike), *when)
@@ -491,7 +499,7 @@ class Watching:
             return None
         spot, start, z, root = strongest
         place, described = self.spots.refined(spot, z, root)
-        best = Suspect(
+        best = Change(
             self.readings.of_cameras[spot.unit].name,
             True,
             History("step", start),
@@ -517,10 +525,10 @@ class Watching:
     def _sized(
         self,
         residual: Float[np.ndarray, "r k"],
-        asked: list[Suspect],
+        asked: list[Change],
         weight: Float[np.ndarray, " s"],
         share: Float[np.ndarray, " s"],
-    ) -> list[Suspect]:
+    ) -> list[Change]:
         """Changes with size and error, each alone, the most significant first; without those that no star sees."""
 
         def columns(part: StarResiduals, rows: slice) -> Float[np.ndarray, "r k c"]:
@@ -575,7 +583,9 @@ class Watching:
                 gain[:, k] += 0.0 if mine is None else mine.size * mine.history.over(self.time)
             error[:, k] = np.where(variances > 0, variances, np.nan) ** -0.5
             information = np.einsum("gh,gf,fh->h", steps, blocks[:, k, :, k], steps, optimize=True)
-            smallest[:, k] = (self.alarm + SEEN) * np.where(information > 0, information, np.nan) ** -0.5
+            smallest[:, k] = (self.alarm + MOST_LIKELY) * np.where(
+                information > 0, information, np.nan
+            ) ** -0.5
         chi2 = self.stars.chi2(self.stars.residual)
         dof = self.stars.dof
         pairs = np.unique(self.stars.star * groups + self.group)
