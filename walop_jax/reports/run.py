@@ -14,7 +14,6 @@ from walop_jax.calibration.calibration import Calibration, Product
 from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.records import CalibrationSet
-from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, figure_data, read_figure_data
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.limits_found import DetectionLimits
@@ -25,7 +24,6 @@ from walop_jax.io.names import (
     CORNER,
     DIAGNOSIS,
     FIGURE_DATA,
-    INTERVALS,
     LIMITS,
     POSTERIOR,
     PRODUCT,
@@ -187,8 +185,8 @@ class RunContents:
     """The contents of a run; None for what is not there. `missing` says what that means for a page.
 
     `source` is what figures are drawn from. `summary`, `diagnosis` and `sample` are the contents of the JSON files;
-    `intervals` are rows of the table of posterior intervals; `corner` are the bytes of a PNG; `limits` is what
-    `limits` has found for the same data, `commissioning` is a go or no-go with its reasons.
+    `corner` are the bytes of a PNG; `limits` are detection limits of the same data, `commissioning` is a go or no-go with
+    its reasons.
     """
 
     source: FigureSource
@@ -197,7 +195,6 @@ class RunContents:
     diagnosis: dict[str, Any] | None
     figure_data: DiagnosisFigureData | None
     sample: dict[str, Any] | None
-    intervals: tuple[dict[str, Any], ...]
     corner: bytes | None
     limits: DetectionLimits | None
     commissioning: dict[str, Any] | None
@@ -247,7 +244,6 @@ def read_run(run: Run | Path) -> RunContents:
     sampled = POSTERIOR in run
     rest = {
         "sample": optional(SAMPLE, lambda: run.document(SAMPLE), "no verdict on the sampling", sampled),
-        "intervals": optional(INTERVALS, lambda: _intervals(run), "no table of the posterior", sampled) or (),
         "corner": optional(CORNER, (run.folder / CORNER).read_bytes, "no corner plot", sampled),
         "limits": optional(LIMITS, lambda: _limits(run, summary), "no protection level", False),
         "commissioning": optional(
@@ -290,19 +286,3 @@ def _another_fit(summary: dict[str, Any], diagnosis: dict[str, Any]) -> bool:
     said = diagnosis.get("chi2_per_dof_after")
     ratio = summary["chi2"] / max(summary["dof"], 1)
     return said is not None and abs(said - ratio) > SAME_CHI2 * ratio
-
-
-def _intervals(run: Run) -> tuple[dict[str, Any], ...]:
-    """Rows of the sampled coefficients: those that have an effective sample size."""
-    path = run.folder / INTERVALS
-    table = read_input_table(path).table
-    names = ("NAME", "UNIT", "MEDIAN", "LOW68", "HIGH68", "LOW95", "HIGH95", "ESS")
-    lacking = [name for name in names if name not in table.colnames]
-    if lacking:
-        raise fail("the column is missing", file=path, column=lacking[0])
-    # An empty text comes back masked.
-    columns = {
-        name: np.ma.filled(np.ma.asarray(table[name]), "" if name in names[:2] else np.nan) for name in names
-    }
-    rows = [{name: column[i] for name, column in columns.items()} for i in range(len(table))]
-    return tuple(row for row in rows if np.isfinite(float(row["ESS"])))
