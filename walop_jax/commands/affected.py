@@ -67,9 +67,9 @@ def affected(
             warnings.append(f"{name}: was made with a calibration that is neither the old nor the new one")
         job.tell(f"{len(rows)} rows of {name}", "tabulating")
         with errors_naming(table.path):
-            here = list(nights_of(before, after, rows, name, limit))
-        nights += here
-        if beyond := sum(night.beyond for night in here):
+            shifts_here = list(nights_of(before, after, rows, name, limit))
+        nights += shifts_here
+        if beyond := sum(night.beyond for night in shifts_here):
             warnings.append(
                 f"{name}: {beyond} stars have a filter or temperature that the new one does not cover"
             )

@@ -120,7 +120,7 @@ def apply(
         check_output(output, overwrite=job.overwrite)
         table_format(output)
     job.begin("reading")
-    table, said = _table_of(catalogue)
+    table, gathering_remarks = _table_of(catalogue)
     held = calibration_for(calibration, table, effects, force=force)
     instrument, limit = held.model.template.patched(), math.inf if saturation is None else saturation
     rows = read_catalogue(table, instrument, limit, always_in=held.always_in, never_in=held.never_in)
@@ -149,7 +149,7 @@ def apply(
         output,
         counted=_counted(alone),
         warnings=[
-            *said,
+            *gathering_remarks,
             *doubts,
             *_about_noise(rows.counts, rows.sigma),
             *_about_places(rows, stars.flag),
@@ -244,11 +244,11 @@ def _errors(columns: Mapping[str, tuple[Any, ...]]) -> str:
     import numpy as np
 
     error, q, u, *photons = (columns[name][0] for name in ("P_ERR", "Q_ERR", "U_ERR", "Q_PHOTON", "U_PHOTON"))
-    known = error > 0
-    if not known.any():
+    measured = error > 0
+    if not measured.any():
         return ""
-    share = sum(values[known] ** 2 for values in photons) / (q[known] ** 2 + u[known] ** 2)
+    share = sum(values[measured] ** 2 for values in photons) / (q[measured] ** 2 + u[measured] ** 2)
     return (
-        f"; error of p {100 * float(np.median(error[known])):.2g} % (median), photons make "
+        f"; error of p {100 * float(np.median(error[measured])):.2g} % (median), photons make "
         f"{100 * float(np.median(share)):.0f} % of its variance"
     )

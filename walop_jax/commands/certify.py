@@ -63,7 +63,7 @@ class Certificate(Displayed):
         return {
             "product": str(self.path),
             "go": self.go,
-            "requirements": [dataclasses.asdict(one) for one in self.requirements],
+            "requirements": [dataclasses.asdict(requirement) for requirement in self.requirements],
             "valid": not self.failed,
             "schema": PRODVERS,
             "content": self.content,
@@ -112,25 +112,31 @@ def certify(
     from walop_jax.calibration.product import product_path, read_product
 
     job.tell("checking")
-    given: Any = fit_of(calibration)
-    if isinstance(given, Calibration | FitResult):
-        there = Calibration.from_fit(given) if isinstance(given, FitResult) else given
-        path, product, catalogue = Path(IN_MEMORY), there.product, there.model.catalogue
+    source: Any = fit_of(calibration)
+    if isinstance(source, Calibration | FitResult):
+        calibration_in_memory = Calibration.from_fit(source) if isinstance(source, FitResult) else source
+        path, product, catalogue = (
+            Path(IN_MEMORY),
+            calibration_in_memory.product,
+            calibration_in_memory.model.catalogue,
+        )
     else:
-        path = product_path(folder_of(given))
+        path = product_path(folder_of(source))
         product, catalogue = read_product(path), catalogue_of(effects)
     with errors_naming(path):
         checks = tuple(checks_of(product, catalogue))
     rebuilt = any(check.name == "model" and check.passed for check in checks)
-    asked = _requirements(job, given, path, catalogue) if rebuilt else ()
+    requirements_met = _requirements(job, source, path, catalogue) if rebuilt else ()
     parents = tuple(entry.sha256 for entry in product.inputs)
-    made = Certificate(path, checks, asked, validity(product), product.content_hash(), parents)
-    why = "; ".join(f"{check.name} ({check.found})" for check in made.failed)
+    certificate = Certificate(
+        path, checks, requirements_met, validity(product), product.content_hash(), parents
+    )
+    why = "; ".join(f"{check.name} ({check.found})" for check in certificate.failed)
     return Outcome(
-        made,
+        certificate,
         saved_as=DOCUMENT,
-        failure=f"{path}: not valid: {why}" if made.failed else "",
-        trusted=made.go,
+        failure=f"{path}: not valid: {why}" if certificate.failed else "",
+        trusted=certificate.go,
     )
 
 

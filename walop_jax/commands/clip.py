@@ -66,8 +66,8 @@ def clip(
         say(Stage("fitting", "fitting"))
         flagged = clipped(calset, chosen, sigma)
         # Of too many rows the model lacks something: no need to ask what.
-        left = flagged.result
-        result = left.judged() if flagged.too_many else examined(left, job.seed, as_written=True)
+        remaining = flagged.result
+        result = remaining.judged() if flagged.too_many else examined(remaining, job.seed, as_written=True)
     job.begin("writing")
     if output is not None:
         write_calibration_set(output, flagged.calset, overwrite=job.overwrite)

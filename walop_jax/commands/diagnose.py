@@ -75,8 +75,8 @@ def diagnose(
     job.begin("reading")
     calset, chosen = set_and_model(data, model, instrument, effects, output=output)
     with job.repeated() as say:
-        found = diagnosis_of(calset, chosen, seed=job.seed, minutes=minutes, progress=say)
-    return outcome_of(job, found, output)
+        diagnosis = diagnosis_of(calset, chosen, seed=job.seed, minutes=minutes, progress=say)
+    return outcome_of(job, diagnosis, output)
 
 
 def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[Diagnosis]:
@@ -140,6 +140,9 @@ def write(found: Diagnosis, folder: PathLike, *, overwrite: bool = False) -> Non
 
 def _with_answer(found: Diagnosis, after: FitResult) -> Display:
     """The findings, and how well stars are known with the extended model."""
-    shown, known = found.display(), after.answer() if after.answer is not None and after.converged else None
-    more = () if known is None else known.facts(complete=found.verdict != "unexplained")
-    return dataclasses.replace(shown, facts=(*shown.facts, *more))
+    shown, accuracy = (
+        found.display(),
+        after.answer() if after.answer is not None and after.converged else None,
+    )
+    answer = () if accuracy is None else accuracy.facts(complete=found.verdict != "unexplained")
+    return dataclasses.replace(shown, facts=(*shown.facts, *answer))

@@ -54,32 +54,36 @@ def for_each(
     if any(place.resolve() == Path(file).resolve() for place, file in zip(places, files, strict=True)):
         raise UsageError("the tables would replace the catalogues: give another folder", "output")
     Path(output).mkdir(parents=True, exist_ok=True)
-    asked = [
+    calls = [
         {**arguments, "catalogue": file, "output": place}
         for file, place in zip(files, places, strict=True)
         if job.overwrite or not place.exists()
     ]
     ended = []
     with executor_of(workers, scheduler) as executor:
-        tasks = [(command.__name__, job.overwrite, one) for one in asked]
-        for number, one in enumerate(mapped(_run, tasks, executor), start=1):
-            job.tell(f"{number} of {len(asked)} catalogues")
-            ended.append(one)
-    failed = [one.error for one in ended if one.error]
-    there = len(files) - len(asked)
-    remark = f"{there} of {len(files)} tables were there already, and are left; --overwrite makes them again"
+        tasks = [(command.__name__, job.overwrite, outcome) for outcome in calls]
+        for number, outcome in enumerate(mapped(_run, tasks, executor), start=1):
+            job.tell(f"{number} of {len(calls)} catalogues")
+            ended.append(outcome)
+    failed = [outcome.error for outcome in ended if outcome.error]
+    existing = len(files) - len(calls)
+    remark = (
+        f"{existing} of {len(files)} tables were there already, and are left; --overwrite makes them again"
+    )
     return Outcome(
         places,
         {
             "outputs": [str(place) for place in places],
             "made": len(ended) - len(failed),
-            "left": there,
+            "left": existing,
             "failed": failed,
-            "catalogues": [one.document for one in ended if not one.error],
+            "catalogues": [outcome.document for outcome in ended if not outcome.error],
         },
-        "\n".join(one.text for one in ended if one.text) or f"{output}: nothing was left to do",
+        "\n".join(outcome.text for outcome in ended if outcome.text) or f"{output}: nothing was left to do",
         warnings=list(
-            dict.fromkeys([*(w for one in ended for w in one.warnings), *([remark] if there else [])])
+            dict.fromkeys(
+                [*(w for outcome in ended for w in outcome.warnings), *([remark] if existing else [])]
+            )
         ),
         failure="; ".join(failed),
     )

@@ -66,31 +66,31 @@ def gather(
         what = f"{len(catalogues)} catalogues for the {len(names)} cameras of {design.name}"
         raise UsageError(f"{what}: give those of {', '.join(names)}, in this order", "catalogues")
     job.begin("reading")
-    each = [read_camera_catalogue(path, columns, gain) for path in catalogues]
-    pointing, said = _pointing(each, {"RA": ra, "DEC": dec, "ROTATOR": rotator})
+    cameras = [read_camera_catalogue(path, columns, gain) for path in catalogues]
+    pointing, pointing_remarks = _pointing(cameras, {"RA": ra, "DEC": dec, "ROTATOR": rotator})
     job.begin("matching")
-    made = gathered(each, names, pointing, tolerance)
+    gathered_stars = gathered(cameras, names, pointing, tolerance)
     if gaia is not None:
-        made = identified(made, gaia, tolerance)
-    remarks = [*said, *made.remarks]
+        gathered_stars = identified(gathered_stars, gaia, tolerance)
+    remarks = [*pointing_remarks, *gathered_stars.remarks]
     job.begin("writing")
     cards = {"INSTRUME": design.name, "RA": pointing.ra, "DEC": pointing.dec, "ROTATOR": pointing.rotator}
-    table = astropy_table(made.columns, {**cards, "RADESYS": "ICRS"})
+    table = astropy_table(gathered_stars.columns, {**cards, "RADESYS": "ICRS"})
     if output is not None:
         write_table(output, table, overwrite=job.overwrite)
-    seen = [int((made.matched == count).sum()) for count in range(len(names) + 1)]
+    by_cameras = [int((gathered_stars.matched == count).sum()) for count in range(len(names) + 1)]
     document = {
         "output": output,
         "stars": len(table),
-        "in_all_cameras": seen[-1],
+        "in_all_cameras": by_cameras[-1],
         "pointing": cards,
         "registrations": [
             {"camera": name, "shift_arcsec": move.shift.tolist(), "rotation_deg": move.rotation}
-            for name, move in zip(names, made.registrations, strict=True)
+            for name, move in zip(names, gathered_stars.registrations, strict=True)
         ],
         "remarks": remarks,
     }
-    text = f"{output}: {len(table)} stars, {seen[-1]} of them in all {len(names)} cameras"
+    text = f"{output}: {len(table)} stars, {by_cameras[-1]} of them in all {len(names)} cameras"
     return Outcome(
         table, document, text, warnings=remarks, next=(f"walop-jax apply RUN {output} -o OUT.fits",)
     )
@@ -109,9 +109,9 @@ def _pointing(
         name: _number(first.header.get(name)) if value is None else value for name, value in given.items()
     }
     missing = [name for name, value in numbers.items() if value is None]
-    if missing and (seen := centre_of(first.header)) is not None:
-        numbers |= {name: seen[name] for name in missing}
-        stated = ", ".join(f"{name} {seen[name]:.6g}" for name in missing)
+    if missing and (from_wcs := centre_of(first.header)) is not None:
+        numbers |= {name: from_wcs[name] for name in missing}
+        stated = ", ".join(f"{name} {from_wcs[name]:.6g}" for name in missing)
         remarks.append(f"{first.path}: {stated} deg from the WCS: centre of the image, and its axis x as +X")
         missing = []
     if missing:

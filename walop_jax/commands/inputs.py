@@ -180,11 +180,11 @@ def paths_of(data: Sets) -> tuple[PathLike, ...]:
         if not paths:
             raise ValueError("a run is made from files: write the set first, walop_jax.write_calibration_set")
         return paths
-    given: Any = data if isinstance(data, list | tuple) else (data,)
+    candidates: Any = data if isinstance(data, list | tuple) else (data,)
     advice = "a set, the path of one (FITS), or several paths in a list"
-    for one in given:
-        path_of(one, "a calibration set", advice)
-    return tuple(given)
+    for candidate in candidates:
+        path_of(candidate, "a calibration set", advice)
+    return tuple(candidates)
 
 
 def set_of(data: Sets, instrument: Instrument | None = None) -> CalibrationSet:
@@ -261,8 +261,12 @@ def calibration_of(given: Product, effects: Effects = None) -> Calibration:
 
     held: Any = fit_of(given)
     if isinstance(held, Calibration | FitResult):
-        there = held if isinstance(held, Calibration) else Calibration.from_fit(held)
-        return there if there.path is not None else dataclasses.replace(there, path=Path(IN_MEMORY))
+        calibration = held if isinstance(held, Calibration) else Calibration.from_fit(held)
+        return (
+            calibration
+            if calibration.path is not None
+            else dataclasses.replace(calibration, path=Path(IN_MEMORY))
+        )
     return read_calibration(folder_of(held), catalogue_of(effects))
 
 
@@ -286,11 +290,11 @@ def save(
         raise fail("holds no calibration", file=getattr(result, "folder", ""), advice="give a fit")
     product = Calibration.from_fit(held) if isinstance(held, FitResult) else held
     names = (PRODUCT, SUMMARY) if isinstance(held, FitResult) else (PRODUCT,)
-    with output_folder(folder, names, overwrite=overwrite) as out, out.filled() as there:
-        write_calibration(there / PRODUCT, product)
+    with output_folder(folder, names, overwrite=overwrite) as out, out.filled() as temporary:
+        write_calibration(temporary / PRODUCT, product)
         if isinstance(held, FitResult):
             content = summary(held, seconds=held.seconds) | {"shown": held.display().document()}
-            (there / SUMMARY).write_text(json_text(content), encoding="utf-8")
+            (temporary / SUMMARY).write_text(json_text(content), encoding="utf-8")
 
 
 def folder_of(run: Run | PathLike) -> Path:
@@ -306,14 +310,14 @@ def angles_of(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float
     """Angles (deg) by column prefix, also of texts such as CHWP=45."""
     if isinstance(at, Mapping):
         return {name.upper(): value for name, value in at.items()}
-    found = {}
+    angles = {}
     for text in at or ():
         prefix, _, angle = text.partition("=")
         try:
-            found[prefix.strip().upper()] = float(angle)
+            angles[prefix.strip().upper()] = float(angle)
         except ValueError:
             raise UsageError(f"{text!r} is no P=ANGLE, such as CHWP=45", "at") from None
-    return found
+    return angles
 
 
 def goal_of(percent: float | None) -> float | None:
@@ -333,11 +337,11 @@ def table_of(given: Any, columns: Mapping[str, Any]) -> InputTable:
     read = read_input_table(given) if isinstance(given, str | os.PathLike) else in_memory(given)
     if not named:
         return read
-    kept = {key: read.table[key] for key in read.table.colnames if str(key).upper() not in named}
-    made = in_memory(kept | named, str(read.path))
-    made.table.meta.update(read.table.meta)
-    made.remarks.extend(read.remarks)
-    return made
+    remaining = {key: read.table[key] for key in read.table.colnames if str(key).upper() not in named}
+    table = in_memory(remaining | named, str(read.path))
+    table.table.meta.update(read.table.meta)
+    table.remarks.extend(read.remarks)
+    return table
 
 
 def several(given: Any) -> list[Any]:
@@ -391,10 +395,10 @@ def table_outcome(
     from walop_jax.io.plain_tables import write_table
 
     lost = held.left_behind
-    made = extended(table, columns, {**cards, **left_out_cards(lost)})
-    made, others = (made, ()) if remade is None else remade(made)
+    result = extended(table, columns, {**cards, **left_out_cards(lost)})
+    result, result_remarks = (result, ()) if remade is None else remade(result)
     if output is not None:
-        write_table(output, made, overwrite=job.overwrite)
+        write_table(output, result, overwrite=job.overwrite)
     counts = {bit: int((columns["FLAG"][0] & bit > 0).sum()) for bit in sorted(counted)}
     remarks = table.about(columns)
     document = {
@@ -409,11 +413,11 @@ def table_outcome(
     }
     about = (f"{counts[bit]} {sentence}" for bit, sentence in counted.items() if sentence and counts[bit])
     return Outcome(
-        made,
+        result,
         document,
         warnings=(
             *held.warnings,
             *left_out_sentences(lost, held.path),
-            *(f"{table.path}: {sentence}" for sentence in (*remarks, *others, *warnings, *about)),
+            *(f"{table.path}: {sentence}" for sentence in (*remarks, *result_remarks, *warnings, *about)),
         ),
     )

@@ -49,5 +49,5 @@ def instrument(
     from walop_jax.calibration.checked_instrument import checked
 
     with errors_naming(source):
-        found = checked(source)
-    return Outcome(found)
+        checked_instrument = checked(source)
+    return Outcome(checked_instrument)

@@ -84,8 +84,8 @@ def limits(
         result = examined(refit(calset, chosen, progress=job.progress), job.seed)
     if not result.converged:
         raise ValueError(f"the fit did not converge ({result.minimum.message})")
-    asked = None if effects is None else catalogue_of(effects)
-    limits_of_data = detection_limits(result, catalogue=asked, seed=job.seed, progress=job.progress)
+    effect_kinds = None if effects is None else catalogue_of(effects)
+    limits_of_data = detection_limits(result, catalogue=effect_kinds, seed=job.seed, progress=job.progress)
     suggested = output is not None and (
         f"walop-jax report {output}",
         *_plan(data, output, instrument, result),

@@ -108,23 +108,25 @@ def plan(
         available != "" and Path(str(available)).is_dir()
     ):
         after, available = available, ""
-    known = None if after is None else calibration_of(after, effects)
-    catalogue = catalogue_of(effects) if effects is not None or known is None else known.model.catalogue
+    calibration = None if after is None else calibration_of(after, effects)
+    catalogue = (
+        catalogue_of(effects) if effects is not None or calibration is None else calibration.model.catalogue
+    )
     alike = (apart,) if isinstance(apart, str) else tuple(apart or ())
     if criterion == "apart" and not alike:
-        if known is None:
+        if calibration is None:
             raise UsageError("give the effects that are to be told apart, or a RUN of diagnose", "apart")
-        alike = _alike(after, known)
+        alike = _alike(after, calibration)
     if candidates is not None:
         available = candidates
-    elif available == "" and known is not None:
+    elif available == "" and calibration is not None:
         moving = {
-            prefix: _stood_at(known.exposures, prefix)
-            for prefix in known.design.moving()
+            prefix: _stood_at(calibration.exposures, prefix)
+            for prefix in calibration.design.moving()
             if prefix != CALIBRATION_PLATE
         }
         available = ObservingPlan(
-            known.design if known.design.description else known.instrument, moving=moving
+            calibration.design if calibration.design.description else calibration.instrument, moving=moving
         )
     chosen = (
         read_input_table(criterion)
@@ -137,7 +139,7 @@ def plan(
             Available.of(available),  # pyright: ignore[reportArgumentType]
             minutes,
             criterion=chosen,
-            known=known,
+            known=calibration,
             goal=goal,
             draws=draws,
             apart=alike,
@@ -161,8 +163,8 @@ def _scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike
     from walop_jax.io.atomic import atomic_path
     from walop_jax.io.text import json_text
 
-    said = Words({}) if words is None else read_words(words)
-    numbers = said.filters or {name: k for k, name in enumerate(planned.filter_names, start=1)}
+    rules = Words({}) if words is None else read_words(words)
+    numbers = rules.filters or {name: k for k, name in enumerate(planned.filter_names, start=1)}
     exposures = planned.exposures()
     _, star = planned.layout()
     stars = star.max(axis=0)
@@ -174,10 +176,10 @@ def _scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike
         else "calibration"
         for s, kind, ra, dec in zip(stars, exposures.kind, exposures.ra, exposures.dec, strict=True)
     ]
-    made, remarks = schedule_of(exposures, planned.site, numbers, facts=said.schedule, names=names)
+    document, remarks = schedule_of(exposures, planned.site, numbers, facts=rules.schedule, names=names)
     with atomic_path(path, overwrite=job.overwrite) as temporary:
-        temporary.write_text(json_text(made), encoding="utf-8")
-    if not said.filters:
+        temporary.write_text(json_text(document), encoding="utf-8")
+    if not rules.filters:
         listed = ", ".join(f"{name} {number}" for name, number in numbers.items())
         remarks.append(f"{path}: filters are numbered in their order ({listed}); --words gives other numbers")
     return remarks
@@ -203,17 +205,17 @@ def _alike(after: Any, known: Calibration) -> tuple[Any, ...]:
     from walop_jax.io.names import DIAGNOSIS
     from walop_jax.io.run_folder import RunFolder
 
-    there, path = document(after) if isinstance(after, Diagnosis) else None, None
+    diagnosis, path = document(after) if isinstance(after, Diagnosis) else None, None
     if isinstance(after, RunFolder | str | os.PathLike):
         folder = after if isinstance(after, RunFolder) else RunFolder(Path(after))
-        there, path = folder.documents.get("diagnosis"), folder.folder / DIAGNOSIS
-    if there is None:
+        diagnosis, path = folder.documents.get("diagnosis"), folder.folder / DIAGNOSIS
+    if diagnosis is None:
         advice = "run diagnose first, or name the effects with --apart (apart= in Python)"
         raise fail("no diagnosis", file=path, advice=advice)
-    found = {effect.name: effect for effect in known.model.instrument(known.values).effects}
-    for step in there["steps"]:
-        if step["equivalent"] and step["effect"] in found:
-            return (found[step["effect"]], *step["equivalent"])
+    effects_of_model = {effect.name: effect for effect in known.model.instrument(known.values).effects}
+    for step in diagnosis["steps"]:
+        if step["equivalent"] and step["effect"] in effects_of_model:
+            return (effects_of_model[step["effect"]], *step["equivalent"])
     raise fail(
         "the diagnosis left no effects that look alike",
         file=path,

@@ -76,8 +76,8 @@ def plot(
             advice="give the RUN of walop-jax refit or diagnose",
         )
     if held is None or name is None:
-        found = FIGURES if held is None else possible(FigureSource.of(held))
-        listed = {key: entry.about for key, entry in found.items()}
+        figures = FIGURES if held is None else possible(FigureSource.of(held))
+        listed = {key: entry.about for key, entry in figures.items()}
         width = max(map(len, listed), default=0)
         lines = [f"{key:<{width}}  {about}" for key, about in listed.items()]
         return Outcome(listed, listed, "\n".join(lines))
@@ -88,7 +88,7 @@ def plot(
             raise fail("is no picture that can be written", file=path, advice=f"use {', '.join(FORMATS)}")
         check_output(path, overwrite=job.overwrite)
     if isinstance(parameters, str):
-        parameters = [part.strip() for part in parameters.split(",") if part.strip()]
+        parameters = [word.strip() for word in parameters.split(",") if word.strip()]
     job.tell(f"drawing {name}")
     source = FigureSource.of(
         held,

@@ -121,8 +121,8 @@ def _program(
 def _paragraphs(function: Callable[..., Any]) -> str:
     """The docstring of a command without its line ends: the terminal wraps paragraphs, not the source."""
     text = inspect.cleandoc(function.__doc__ or "").partition("\n\nIn Python:")[0]
-    parts = (part for part in text.split("\n\n") if not part.startswith(">>>"))
-    return "\n\n".join(" ".join(part.split()) for part in parts)
+    paragraphs = (paragraph for paragraph in text.split("\n\n") if not paragraph.startswith(">>>"))
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 
 
 def _parameter(name: str, option: Option, default: Any, hidden: bool = False) -> inspect.Parameter:
@@ -223,8 +223,8 @@ def _run(command: Command[Any], given: dict[str, Any]) -> None:
 
         switch_on()
     with progress(quiet or json, command.stages) as tell:
-        found = command.run(Job(progress=tell, typed=True, **common), given)
-    _show(dataclasses.replace(found, next=found.next or _next_steps(command, given)), quiet, json)
+        outcome = command.run(Job(progress=tell, typed=True, **common), given)
+    _show(dataclasses.replace(outcome, next=outcome.next or _next_steps(command, given)), quiet, json)
 
 
 def _next_steps(command: Command[Any], given: dict[str, Any]) -> tuple[str, ...]:
@@ -321,13 +321,13 @@ def progress(quiet: bool, stages: Sequence[str] = ()) -> Iterator[Callable[[str]
     console = Console(stderr=True)
     numbered = step_counter(stages)
     if not console.is_terminal:
-        told = time.monotonic()
+        last_line = time.monotonic()
 
         def line(message: str) -> None:
-            nonlocal told
-            now, text = time.monotonic(), numbered(message)
-            if now - told >= LINE_EVERY:
-                told = now
+            nonlocal last_line
+            moment, text = time.monotonic(), numbered(message)
+            if moment - last_line >= LINE_EVERY:
+                last_line = moment
                 typer.echo(f"{seconds_since_start():.0f} s: {text}", err=True)
 
         yield line

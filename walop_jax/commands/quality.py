@@ -63,13 +63,17 @@ def quality(
     allowed = read_limits(limits)
     if figure is not None:
         check_output(figure, overwrite=True)
-    given = several(runs)
+    sources = several(runs)
     rows, remarks = [], []
-    for number, one in enumerate(given, start=1):
-        job.tell(f"run {number} of {len(given)}", "reading")
-        held = calibration_of(one, effects)
+    for number, source in enumerate(sources, start=1):
+        job.tell(f"run {number} of {len(sources)}", "reading")
+        held = calibration_of(source, effects)
         folder = (
-            one.folder if isinstance(one, Run) else Path(one) if isinstance(one, str | os.PathLike) else None
+            source.folder
+            if isinstance(source, Run)
+            else Path(source)
+            if isinstance(source, str | os.PathLike)
+            else None
         )
         documents = RunFolder(folder).documents if folder is not None and folder.is_dir() else {}
         rows.append(
@@ -82,10 +86,10 @@ def quality(
     job.begin("writing")
     new = table_of_nights(rows)
     if output is None:
-        table, more = joined(new[:0], new)
+        table, table_remarks = joined(new[:0], new)
         table = judge(table, allowed)
     else:
-        table, more = append(output, new, allowed)
+        table, table_remarks = append(output, new, allowed)
     if figure is not None:
         save_figure(figure, quality_figure(table, allowed), overwrite=True)
     hashes = {row["CALHASH"] for row in rows}
@@ -102,9 +106,9 @@ def quality(
             "nights": [{name: row[name] for name in table.colnames} for row in mine],
             "limits": {name: list(pair) for name, pair in allowed.items()},
             "outside": out,
-            "remarks": [*remarks, *more],
+            "remarks": [*remarks, *table_remarks],
         },
         display=Display(title, head=("night", *(f">{name}" for name in SHOWN), "outside"), rows=shown),
-        warnings=(*remarks, *more, *out),
+        warnings=(*remarks, *table_remarks, *out),
         trusted=not out,
     )

@@ -96,10 +96,10 @@ def refit(
             result = answered(examined(fitted, job.seed), goal=goal_of(goal) or GOAL)
         if compress is not None:
             write_calibration_set(compress, _compressed(result), overwrite=job.overwrite)
-        wanted = output is not None
-        mapped = wanted and result.likelihood.layout.large and result.converged
+        is_written = output is not None
+        mapped = is_written and result.likelihood.layout.large and result.converged
         residuals = residual_map(result) if mapped else None
-        misfit = describe(result) if wanted and not result.explains_data else None
+        misfit = describe(result) if is_written and not result.explains_data else None
         outcome = Outcome(
             result,
             summary(result, seconds=job.seconds, misfit=misfit, residuals=residuals),
@@ -150,5 +150,7 @@ def next_steps(trusted: bool, output: PathLike | None, data: Sets, **options: ob
     if trusted:
         return (f"walop-jax report {output}", f"walop-jax apply {output} STARS.fits -o OUT.fits")
     sets = " ".join(str(path) for path in paths_of(data)) if output is not None else "CALSET"
-    more = "".join(f" --{name} {value}" for name, value in options.items() if isinstance(value, str | Path))
-    return (f"walop-jax report {output}", f"walop-jax diagnose {sets}{more} -o {output}_diagnosis")
+    given_options = "".join(
+        f" --{name} {value}" for name, value in options.items() if isinstance(value, str | Path)
+    )
+    return (f"walop-jax report {output}", f"walop-jax diagnose {sets}{given_options} -o {output}_diagnosis")

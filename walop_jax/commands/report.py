@@ -92,11 +92,11 @@ def report(
     target = folder / PAGE if output is None else Path(output)
     job.begin("reading")
     kind = kind_of_run(folder)
-    found = read_run(Run(folder, catalogue_of(effects), tuple(data or ()))) if kind == "fit" else None
+    contents = read_run(Run(folder, catalogue_of(effects), tuple(data or ()))) if kind == "fit" else None
     overwrite = job.overwrite or _is_page(target)
     check_output(target, overwrite=overwrite)
     job.tell("drawing", "drawing")
-    text, missing = render_other(folder, kind) if found is None else render(found, goal_of(goal))
+    text, missing = render_other(folder, kind) if contents is None else render(contents, goal_of(goal))
     text = encodable(text)
     with atomic_path(target, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")

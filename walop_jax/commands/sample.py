@@ -127,9 +127,11 @@ def _sampled_run(
     if isinstance(model, Model):
         raise ValueError("with a run, give the model as a file, so that the run can be made again")
     text = None if model is None else read_text(model)
-    found = [name for name in OUTPUTS if (folder / name).exists()]
-    if found and not (job.overwrite or resume):
-        raise fail(f"holds {found[0]} already", file=folder, advice="go on with --resume, or --overwrite it")
+    existing = [name for name in OUTPUTS if (folder / name).exists()]
+    if existing and not (job.overwrite or resume):
+        raise fail(
+            f"holds {existing[0]} already", file=folder, advice="go on with --resume, or --overwrite it"
+        )
     with output_folder(folder, OUTPUTS, overwrite=True) as out:
         product = read_calibration(folder / PRODUCT, run.catalogue)
         result = run.fit(text)

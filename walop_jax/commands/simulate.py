@@ -121,24 +121,28 @@ def simulate(
     drawn: dict[str, Any] = {"instrument": true, "effects": hidden, "catalogue_seed": catalogue_seed}
     drawn["catalogue"] = None if template is None else template.catalogue
     about: dict[str, Any] = {"output": output, "instrument": plan.name, "seed": job.seed, "truth": truth}
-    about["effects"] = [one.name for one in hidden]
+    about["effects"] = [hidden_effect.name for hidden_effect in hidden]
     job.tell("following the light", "following")
-    made: Any
+    simulation: Any
     if stars is not None:
         if "standard" not in plan.design.kinds:
             raise UsageError(f"{plan.name} sees no stars", "stars")
         sources, true = true_instrument(plan, job.seed, **drawn)
-        seen = simulated_stars(plan, true, stars, job.seed, night=night or 0, noiseless=noiseless)
-        made = astropy_table(seen.columns, {"INSTRUME": plan.name})
-        known = truth_document(plan, job.seed, sources, true) | {"stars": seen.document()}
+        catalogue_of_stars = simulated_stars(
+            plan, true, stars, job.seed, night=night or 0, noiseless=noiseless
+        )
+        simulation = astropy_table(catalogue_of_stars.columns, {"INSTRUME": plan.name})
+        truth_content = truth_document(plan, job.seed, sources, true) | {
+            "stars": catalogue_of_stars.document()
+        }
         about["stars"] = stars
         which = f"seed {job.seed}" if like is None or isinstance(like, tuple) else str(like)
         text = f"{output}: {plan.name}, {stars} stars of the instrument of {which}"
-        suggested, times = (f"walop-jax apply RUN {output} -o OUT.fits",), made["MJD"]
+        suggested, times = (f"walop-jax apply RUN {output} -o OUT.fits",), simulation["MJD"]
     else:
-        made = simulated(plan, job.seed, noiseless=noiseless, night=night, **drawn)
-        calset, true = made
-        known = truth_document(plan, job.seed, calset.sources, true)
+        simulation = simulated(plan, job.seed, noiseless=noiseless, night=night, **drawn)
+        calset, true = simulation
+        truth_content = truth_document(plan, job.seed, calset.sources, true)
         about |= {"exposures": len(calset.exposures), "points": len(calset.points)}
         about["rows"] = calset.intensities.rows
         text = f"{output}: {plan.name}, {about['exposures']} exposures of {about['points']} points"
@@ -149,18 +153,18 @@ def simulate(
     with contextlib.ExitStack() as stack:
         if truth is not None:
             temporary = stack.enter_context(atomic_path(truth, overwrite=job.overwrite))
-            temporary.write_text(json_text(known), encoding="utf-8")
-        if output is not None and isinstance(made, Simulated):
-            write_calibration_set(output, made.calset, overwrite=job.overwrite)
+            temporary.write_text(json_text(truth_content), encoding="utf-8")
+        if output is not None and isinstance(simulation, Simulated):
+            write_calibration_set(output, simulation.calset, overwrite=job.overwrite)
         elif output is not None:
-            write_table(output, made, overwrite=job.overwrite)
+            write_table(output, simulation, overwrite=job.overwrite)
     text += f"; {'; '.join(map(_sized, true.effects)) or 'nothing'} beyond the base model"
     if template is not None:
         mjd = float(np.nanmin(times))
         text += f"; the night of {date_of(mjd)}"
         about |= {"like": None if isinstance(like, tuple) else str(like), "night": night, "mjd": mjd}
     return Outcome(
-        made,
+        simulation,
         about,
         text,
         warnings=left_out_sentences(lost, like if isinstance(like, str | os.PathLike) else None),
@@ -187,8 +191,8 @@ def _hidden(given: Any, plan: ObservingPlan, catalogue: Sequence[EffectKind]) ->
     from walop_jax.simulation.simulate import effect_from_text
 
     context, hidden = plan.context(), []
-    for one in _texts(given):
-        hidden.append(effect_from_text(one, context, catalogue) if isinstance(one, str) else one)
+    for entry in _texts(given):
+        hidden.append(effect_from_text(entry, context, catalogue) if isinstance(entry, str) else entry)
         try:
             hidden[-1].patch(plan.design)
         except NoSuchPlaceError as error:
@@ -201,10 +205,10 @@ def _texts(effect: str | Sequence[str | Effect] | Mapping[str, Any] | None) -> S
     if not isinstance(effect, Mapping):
         return (effect,) if isinstance(effect, str) else effect or ()
     return [
-        f"{name}={','.join(f'{key}:{value}' for key, value in given.items())}"
-        if isinstance(given, Mapping)
-        else f"{name}={given}"
-        for name, given in effect.items()
+        f"{name}={','.join(f'{key}:{value}' for key, value in sizes.items())}"
+        if isinstance(sizes, Mapping)
+        else f"{name}={sizes}"
+        for name, sizes in effect.items()
     ]
 
 

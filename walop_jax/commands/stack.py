@@ -66,11 +66,11 @@ def stack(
         raise UsageError(
             "workers and scheduler exclude each other: a cluster has its own workers", "scheduler"
         )
-    given = [fit_of(night) for night in several(nights)]
+    sources = [fit_of(night) for night in several(nights)]
     with job.reserved(output, FILES) as job, executor_of(workers, scheduler) as executor:
         job.begin("reading")
         survey = stacked(
-            given,
+            sources,
             laws,
             like=None if like is None else calibration_of(like, effects),
             find=not no_breaks,
@@ -81,7 +81,7 @@ def stack(
             catalogue=catalogue_of(effects),
         )
         stars = (f"walop-jax apply {output} STARS.fits -o OUT.fits",) if survey.trusted else ()
-        found = Outcome(
+        outcome = Outcome(
             survey,
             files=writers(survey),
             saved_as=FILES[-1],
@@ -89,4 +89,4 @@ def stack(
             warnings=survey.verdict.warnings,
             trusted=survey.trusted,
         )
-        return found if job.folder is None else found.save(job.folder, drop=(PARTIAL,))
+        return outcome if job.folder is None else outcome.save(job.folder, drop=(PARTIAL,))

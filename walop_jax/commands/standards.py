@@ -42,8 +42,8 @@ def standards(
         away = distances(table, *_direction(near))
         table = in_degrees(table, "DISTANCE", away)[np.argsort(away, kind="stable")]
     if up is not None:
-        given: Any = default_name() if instrument is None else instrument
-        place: Any = given.site if hasattr(given, "site") else read_description(given).place
+        described: Any = default_name() if instrument is None else instrument
+        place: Any = described.site if hasattr(described, "site") else read_description(described).place
         ra, dec = (np.asarray(table[name].to_value("deg"), float) for name in ("RA", "DEC"))
         height = altitude(np.full(len(ra), up), ra, dec, Site(*place[:4]))
         order = np.arange(len(ra)) if near is not None else np.argsort(-height, kind="stable")
@@ -54,7 +54,7 @@ def standards(
 
 def _direction(near: str | tuple[float, float]) -> tuple[float, float]:
     try:
-        ra, dec = (float(part) for part in (near.split(",") if isinstance(near, str) else near))
+        ra, dec = (float(coordinate) for coordinate in (near.split(",") if isinstance(near, str) else near))
     except ValueError:
         raise UsageError(
             f"near = {near!r} must be right ascension and declination in degrees: 308.2,41.2"

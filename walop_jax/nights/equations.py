@@ -129,14 +129,17 @@ def of_exposures(calset: CalibrationSet, keep: Bool[np.ndarray, " e"]) -> Calibr
     """The set with some of its exposures. Raises `DataError` for frames, and for a set that stands for frames."""
     if keep.all():
         return calset
-    whole = calset.intensities
-    if not isinstance(whole, TableIntensities) or calset.compression is not None:
+    intensities = calset.intensities
+    if not isinstance(intensities, TableIntensities) or calset.compression is not None:
         raise DataError("frames of several nights are in one set; give each night as a file of its own")
-    rows, place = keep[whole.exposure], np.cumsum(keep) - 1
-    some = {
-        name: getattr(whole, name)[rows] for name in ("point", "source", "counts", "sigma", "flag", "used")
+    rows, place = keep[intensities.exposure], np.cumsum(keep) - 1
+    columns = {
+        name: getattr(intensities, name)[rows]
+        for name in ("point", "source", "counts", "sigma", "flag", "used")
     }
-    table = TableIntensities(int(keep.sum()), whole.points, exposure=place[whole.exposure[rows]], **some)
+    table = TableIntensities(
+        int(keep.sum()), intensities.points, exposure=place[intensities.exposure[rows]], **columns
+    )
     return dataclasses.replace(calset, exposures=calset.exposures[keep], intensities=table)
 
 
@@ -159,7 +162,7 @@ def candidates_of(
     model: Model, exposures: Exposures, catalogue: Sequence[EffectKind] = EFFECTS
 ) -> Candidates:
     """Amplitudes of the effects that a model lacks, and its gauges, with the change that each is to first order."""
-    context, found = effect_context(model.template, exposures), {}
+    context, candidates = effect_context(model.template, exposures), {}
     for kind in catalogue:
         if kind.is_structural() or kind.name in (*OF_ONE_SET, *model.effect_names):
             continue
@@ -168,17 +171,17 @@ def candidates_of(
             continue
         for g, group in enumerate(groups):
             for m, member in enumerate(group):
-                each = member.first_order(model.template)
+                first_order = member.first_order(model.template)
                 of = [leaf for leaf in leaves(member) if leaf.name.split(".")[0] in kind.amplitudes()]
-                if not each or not all(each) or len(each) != len(of):
+                if not first_order or not all(first_order) or len(first_order) != len(of):
                     continue
-                for leaf, change in zip(of, each, strict=True):
+                for leaf, change in zip(of, first_order, strict=True):
                     name = f"{kind.name}{f'#{g}' if len(groups) > 1 else ''}.{leaf.name}" + (
                         f"#{m}" if m else ""
                     )
-                    found[name] = dataclasses.replace(leaf, name=name, part=kind.name, start=0.0), change
+                    candidates[name] = dataclasses.replace(leaf, name=name, part=kind.name, start=0.0), change
     held = [model[name] for name in gauges(model, flux_known=False) if not model[name].free]
-    return found | {p.name: (p, ()) for p in held}
+    return candidates | {p.name: (p, ()) for p in held}
 
 
 def with_candidates(
@@ -201,9 +204,9 @@ def with_candidates(
     if changes:
         cut = len(model.free)
         columns = Columns(likelihood, values)
-        there = [k for k, change in enumerate(changes) if change and columns.has(change)]
+        computable = [k for k, change in enumerate(changes) if change and columns.has(change)]
         added = np.zeros((len(r), len(changes)))
-        added[:, there] = columns.of([changes[k] for k in there])
+        added[:, computable] = columns.of([changes[k] for k in computable])
         added[:, held] = jacobian[:, cut:]
         jacobian = np.hstack([jacobian[:, :cut], added])
     return float(r @ r), jacobian.T @ r, jacobian.T @ jacobian
@@ -244,29 +247,31 @@ def night_equations(
     if isinstance(values, Mapping):
         values = np.array([values.get(p.name, p.start) for p in model.parameters])
     source = source_of(calset)
-    found = []
-    for evening, some in split(calset):
+    nights = []
+    for evening, subset in split(calset):
         if number not in (None, evening):
             continue
-        likelihood, there = Likelihood.of(some, model, sets=sets), values
+        likelihood, point = Likelihood.of(subset, model, sets=sets), values
         if own:
-            there = nearer(likelihood, values, np.sqrt(OWN * len(model.free)))
+            point = nearer(likelihood, values, np.sqrt(OWN * len(model.free)))
         if likelihood.layout.large:
-            terms, _ = likelihood.data_terms(there)
+            terms, _ = likelihood.data_terms(point)
             select = model.selection()
             chi2, gradient, matrix = terms.data, select.T @ terms.gradient, select.T @ terms.matrix @ select
-            known, census = {}, terms.census
+            amplitudes, census = {}, terms.census
         else:
-            known = candidates_of(model, some.exposures, model.catalogue) if changes is None else changes
-            chi2, gradient, matrix = with_candidates(likelihood, there, known)
+            amplitudes = (
+                candidates_of(model, subset.exposures, model.catalogue) if changes is None else changes
+            )
+            chi2, gradient, matrix = with_candidates(likelihood, point, amplitudes)
             census = likelihood.census
         if not (np.isfinite(chi2) and np.isfinite(gradient).all() and np.isfinite(matrix).all()):
             raise DataError(
                 f"{source}, night of MJD {evening}: the model has no finite counts or derivatives where the nights "
                 "meet; some night is far from it: fit each by itself (walop-jax refit), leave out what is not trusted"
             )
-        e = some.exposures
-        found.append(
+        e = subset.exposures
+        nights.append(
             Night(
                 instrument=model.name,
                 model=model_hash(model),
@@ -280,19 +285,22 @@ def night_equations(
                 n_data=census.n_data,
                 dof=round(float(census.rows @ likelihood.data_per_row)),
                 chi2=chi2,
-                parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in known.values())),
-                candidates=len(known),
+                parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in amplitudes.values())),
+                candidates=len(amplitudes),
                 reference=np.concatenate(
                     [
-                        there[model.free],
-                        [0.0 if change else there[model.index(name)] for name, (_, change) in known.items()],
+                        point[model.free],
+                        [
+                            0.0 if change else point[model.index(name)]
+                            for name, (_, change) in amplitudes.items()
+                        ],
                     ]
                 ),
                 gradient=gradient,
                 matrix=matrix,
             )
         )
-    return found
+    return nights
 
 
 def with_candidates_of(night: Night, before: Night) -> Night:
@@ -304,9 +312,13 @@ def with_candidates_of(night: Night, before: Night) -> Night:
     cut = len(before.parameters) - before.candidates
     if not before.candidates or night.candidates or night.names != before.names[:cut]:
         return night
-    known, cross, own = before.matrix[:cut, :cut], before.matrix[cut:, :cut], before.matrix[cut:, cut:]
-    along = cross @ pseudo_inverse(known, 1e-13)
-    beyond, pull = own - along @ cross.T, before.gradient[cut:] - along @ before.gradient[:cut]
+    free, cross, candidate_block = (
+        before.matrix[:cut, :cut],
+        before.matrix[cut:, :cut],
+        before.matrix[cut:, cut:],
+    )
+    along = cross @ pseudo_inverse(free, 1e-13)
+    beyond, pull = candidate_block - along @ cross.T, before.gradient[cut:] - along @ before.gradient[:cut]
     slope = along @ night.matrix
     return dataclasses.replace(
         night,
@@ -381,10 +393,10 @@ class Together:
     @property
     def reference(self) -> Float[np.ndarray, "u n"]:
         """The values that every night was linearised at; the origin for what a night does not know."""
-        found, place = np.tile(self.origin, (len(self.nights), 1)), {n: k for k, n in enumerate(self.names)}
+        values, place = np.tile(self.origin, (len(self.nights), 1)), {n: k for k, n in enumerate(self.names)}
         for u, night in enumerate(self.nights):
-            found[u, [place[name] for name in night.names]] = night.reference
-        return found
+            values[u, [place[name] for name in night.names]] = night.reference
+        return values
 
     @property
     def has_value(self) -> Bool[np.ndarray, " n"]:
@@ -403,16 +415,16 @@ def together(nights: Sequence[Night]) -> Together:
         raise fail("no night was given", advice="give fits, sets or files of nights")
     ordered = tuple(sorted(nights, key=lambda night: (night.mjd, night.sha256)))
     check_together(ordered)
-    known: dict[str, Parameter] = {}
+    all_parameters: dict[str, Parameter] = {}
     for candidate in (False, True):
         for night in ordered:
             cut = len(night.parameters) - night.candidates
             for p in night.parameters[cut:] if candidate else night.parameters[:cut]:
-                known.setdefault(p.name, p)
+                all_parameters.setdefault(p.name, p)
     of_model = {
         p.name for night in ordered for p in night.parameters[: len(night.parameters) - night.candidates]
     }
-    names, n = list(known), len(known)
+    names, n = list(all_parameters), len(all_parameters)
     place, origin = {name: k for k, name in enumerate(names)}, np.full(n, np.nan)
     gradient, matrix = np.zeros((len(ordered), n)), np.zeros((len(ordered), n, n))
     chi2 = np.zeros(len(ordered))
@@ -427,7 +439,7 @@ def together(nights: Sequence[Night]) -> Together:
         gradient[u, at] = night.gradient + slope
         matrix[u][np.ix_(at, at)] = night.matrix
     mean, width = np.zeros(n), np.full(n, np.inf)
-    for k, p in enumerate(known.values()):
+    for k, p in enumerate(all_parameters.values()):
         if p.name in of_model and (p.prior is not None or p.loose is not None):
             centre, width[k] = p.prior if p.prior is not None else (p.start, p.loose)
             mean[k] = centre - origin[k]
@@ -446,7 +458,9 @@ def together(nights: Sequence[Night]) -> Together:
         matrix,
         scale,
     )
-    return Together(ordered, tuple(known.values()), n - len(of_model), origin, mean, width, equations)
+    return Together(
+        ordered, tuple(all_parameters.values()), n - len(of_model), origin, mean, width, equations
+    )
 
 
 def _numbers(nights: Sequence[Night]) -> Int[np.ndarray, " u"]:
@@ -467,23 +481,25 @@ def check_together(nights: Sequence[Night]) -> None:
     for name, remedy in advice.items():
         for night in nights:
             if getattr(night, name) != getattr(first, name):
-                one, other = (f"{getattr(entry, name)[:12]} ({entry.source})" for entry in (first, night))
-                raise fail(f"the nights are of two {name}s, {one} and {other}", advice=remedy)
+                first_entry, second_entry = (
+                    f"{getattr(entry, name)[:12]} ({entry.source})" for entry in (first, night)
+                )
+                raise fail(f"the nights are of two {name}s, {first_entry} and {second_entry}", advice=remedy)
     stars: dict[str, tuple[Parameter, Night]] = {}
     for night in nights:
         for p in night.parameters:
-            one, other = stars.setdefault(p.name, (p, night))
-            if p.name.startswith("standard.") and p.prior != one.prior:
+            first_entry, second_entry = stars.setdefault(p.name, (p, night))
+            if p.name.startswith("standard.") and p.prior != first_entry.prior:
                 star = p.name.split(".")[1]
-                what = f"the catalogue has other values of {star} in {night.source} than in {other.source}"
+                what = f"the catalogue has other values of {star} in {night.source} than in {second_entry.source}"
                 raise fail(what, extension="SOURCES", advice=_ONE_STAR)
-    seen: dict[Any, Night] = {}
+    earlier: dict[Any, Night] = {}
     for night in nights:
         for key in ((night.sha256, night.number), (night.begin, night.end)):
-            if key in seen:
+            if key in earlier:
                 what = (
                     "the same data" if key == (night.sha256, night.number) else "exposures of the same times"
                 )
-                where = f"{what} are in {seen[key].source} and {night.source}"
+                where = f"{what} are in {earlier[key].source} and {night.source}"
                 raise fail(f"the night of MJD {night.number} is there twice: {where}", advice="leave one out")
-            seen[key] = night
+            earlier[key] = night

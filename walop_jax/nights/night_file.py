@@ -147,12 +147,12 @@ def _nights(opened: OpenFile) -> list[Night]:
         )
         for k in range(n)
     )
-    lower, found = np.tril_indices(n), []
+    lower, nights = np.tril_indices(n), []
     for k in range(len(rows["NIGHT"])):
         matrix = np.zeros((n, n))
         matrix[lower] = rows["MATRIX"][k]
         matrix = matrix + np.tril(matrix, -1).T
-        found.append(
+        nights.append(
             Night(
                 instrument=str(header.get("INSTRUME", "")),
                 model=str(header.get("MODEL", "")),
@@ -163,7 +163,7 @@ def _nights(opened: OpenFile) -> list[Night]:
                 **{field: kind(rows[name][k]) for name, (field, kind) in _PLAIN.items()},
             )
         )
-    return found
+    return nights
 
 
 def nights_in(place: str | os.PathLike[str]) -> list[Night]:

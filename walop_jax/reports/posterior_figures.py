@@ -98,8 +98,8 @@ def correlated(
         nearest = size[chosen].max(axis=0)
         nearest[chosen] = -1.0
         chosen.append(int(np.argmax(nearest)))
-    kept = {pool[i] for i in chosen}
-    return tuple(name for name in names if name in kept)
+    shown_names = {pool[i] for i in chosen}
+    return tuple(name for name in names if name in shown_names)
 
 
 @styled
@@ -179,8 +179,8 @@ def trace_figure(
         if np.isfinite(tau[i]):
             bottom = axes.get_ylim()[0]
             axes.plot([0, tau[i]], [bottom, bottom], color="k", linewidth=3, solid_capstyle="butt")
-            said = f"autocorrelation time (bar) {tau[i]:.1f} steps"
-            axes.text(1.0, 1.0, said, transform=axes.transAxes, fontsize=SMALL, ha="right", va="bottom")
+            caption = f"autocorrelation time (bar) {tau[i]:.1f} steps"
+            axes.text(1.0, 1.0, caption, transform=axes.transAxes, fontsize=SMALL, ha="right", va="bottom")
         axes.set_ylabel(label(names[i], units[i]), fontsize=SMALL, rotation=0, ha="right", va="center")
         axes.tick_params(labelsize=SMALL - 1)
         axes.yaxis.set_major_locator(MaxNLocator(3))

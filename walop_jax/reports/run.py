@@ -173,9 +173,9 @@ class FigureSource:
         """Number of the comparison of a diagnosis that is asked for."""
         count = len(self.figure_data.comparisons) - 1
         if self.step > count:
-            found = f"the diagnosis added {count or 'no'} effect{'s' if count != 1 else ''}"
+            result = f"the diagnosis added {count or 'no'} effect{'s' if count != 1 else ''}"
             raise fail(
-                f"step {self.step}: {found}", advice="step 0 compares the starting with the final model"
+                f"step {self.step}: {result}", advice="step 0 compares the starting with the final model"
             )
         return self.step
 
@@ -185,8 +185,8 @@ class RunContents:
     """The contents of a run; None for what is not there. `missing` says what that means for a page.
 
     `source` is what figures are drawn from. `summary`, `diagnosis` and `sample` are the contents of the JSON files;
-    `corner` are the bytes of a PNG; `limits` are detection limits of the same data, `commissioning` is a go or no-go with
-    its reasons.
+    `corner` are the bytes of a PNG; `limits` are detection limits of the same data, `commissioning` is a go or no-go
+    and its reasons.
     """
 
     source: FigureSource
@@ -231,7 +231,7 @@ def read_run(run: Run | Path) -> RunContents:
         lost = "no maps of the residuals, no curves, no ladder of χ²"
         pictures = optional(FIGURE_DATA, lambda: source.figure_data, lost)
         names = [step["effect"] for step in diagnosis["steps"]]
-        drawn = [] if pictures is None else [one.effect for one in pictures.comparisons[1:]]
+        drawn = [] if pictures is None else [comparison.effect for comparison in pictures.comparisons[1:]]
         if pictures is not None and drawn not in (names, [*names, FreeForm.name]):
             missing.append(
                 f"{FIGURE_DATA} is of another diagnosis than {DIAGNOSIS}: its pictures are left out."
@@ -242,7 +242,7 @@ def read_run(run: Run | Path) -> RunContents:
                 f"{DIAGNOSIS} is of another fit than {SUMMARY}: this folder was written to again since."
             )
     sampled = POSTERIOR in run
-    rest = {
+    optional_contents = {
         "sample": optional(SAMPLE, lambda: run.document(SAMPLE), "no verdict on the sampling", sampled),
         "corner": optional(CORNER, (run.folder / CORNER).read_bytes, "no corner plot", sampled),
         "limits": optional(LIMITS, lambda: _limits(run, summary), "no protection level", False),
@@ -258,14 +258,16 @@ def read_run(run: Run | Path) -> RunContents:
             run.calset  # noqa: B018
         except (ValueError, OSError) as error:
             missing.append(f"Residuals are not drawn: {error}.")
-    return RunContents(source, summary, product, diagnosis, pictures, missing=tuple(missing), **rest)
+    return RunContents(
+        source, summary, product, diagnosis, pictures, missing=tuple(missing), **optional_contents
+    )
 
 
 def read_limits(path: Path) -> DetectionLimits:
     """The content of a `limits.json`. Raises `DataError` if it is none."""
     try:
-        found = RunFolder(path.parent).document(path.name, ("limits", "effects", "protection"))
-        return DetectionLimits.from_document(found)
+        content = RunFolder(path.parent).document(path.name, ("limits", "effects", "protection"))
+        return DetectionLimits.from_document(content)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise fail(
             f"is not what walop-jax limits writes: {error}", file=path, advice="run it again"
@@ -275,14 +277,14 @@ def read_limits(path: Path) -> DetectionLimits:
 def _limits(run: Run, summary: dict[str, Any]) -> DetectionLimits:
     """The limits of the data behind a summary; those of other data are refused."""
     documents = run.document(LIMITS, ("inputs",)), summary
-    of, wanted = ({entry["sha256"] for entry in document["inputs"]} for document in documents)
+    of, expected = ({entry["sha256"] for entry in document["inputs"]} for document in documents)
     path = run.folder / LIMITS
-    if of != wanted:
+    if of != expected:
         raise fail("is of other data", file=path, advice="run walop-jax limits on the sets of this run")
     return read_limits(path)
 
 
 def _another_fit(summary: dict[str, Any], diagnosis: dict[str, Any]) -> bool:
-    said = diagnosis.get("chi2_per_dof_after")
+    stated = diagnosis.get("chi2_per_dof_after")
     ratio = summary["chi2"] / max(summary["dof"], 1)
-    return said is not None and abs(said - ratio) > SAME_CHI2 * ratio
+    return stated is not None and abs(stated - ratio) > SAME_CHI2 * ratio

@@ -129,12 +129,14 @@ class Canvas:
         group = columns
         if turned:
             rows, columns, group = columns, rows, rows
-            other = {"row": "col", "col": "row"}
-            options |= {key: other.get(str(value), value) for key, value in options.items() if key in SHARED}
+            opposite = {"row": "col", "col": "row"}
+            options |= {
+                key: opposite.get(str(value), value) for key, value in options.items() if key in SHARED
+            }
         elif self._narrow(columns, least) and "width_ratios" not in options:
             fitting = [n for n in range(1, columns) if not self._narrow(n, least)]
-            whole = [n for n in fitting if columns % n == 0] if rows > 1 else fitting
-            group = whole[-1]
+            divisors = [n for n in fitting if columns % n == 0] if rows > 1 else fitting
+            group = divisors[-1]
             if "height_ratios" in options:
                 options["height_ratios"] = [*options["height_ratios"]] * (columns // group)
         groups = -(-columns // group)
@@ -180,12 +182,15 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def draw(*args: P.args, **options: P.kwargs) -> T:
-        given = (one.ax for one in (*args, *options.values()) if isinstance(one, Canvas))
-        if any(ax is not None for ax in given):
+        axes = (argument.ax for argument in (*args, *options.values()) if isinstance(argument, Canvas))
+        if any(ax is not None for ax in axes):
             return function(*args, **options)
         with own_style():
             figure = function(*args, **options)
-            if any(isinstance(one, Canvas) and one.width is not None for one in (*args, *options.values())):
+            if any(
+                isinstance(argument, Canvas) and argument.width is not None
+                for argument in (*args, *options.values())
+            ):
                 _in_print(figure)
             return figure
 
@@ -259,17 +264,19 @@ def point_map(
     """
     shown = np.ones(len(x), bool) if shown is None else shown
     size = _spacing(x[shown], y[shown])
-    known = shown & np.isfinite(values)
-    corners = zip(x[known] - 0.5 * size, y[known] - 0.5 * size, strict=True)
+    visible = shown & np.isfinite(values)
+    corners = zip(x[visible] - 0.5 * size, y[visible] - 0.5 * size, strict=True)
     # Edges in the colour of the tile close the seams that viewers leave between neighbours.
     tiles = PatchCollection(
         [Rectangle(corner, size, size) for corner in corners],
         cmap=colours, norm=norm, edgecolor="face", linewidth=0.3,
     )  # fmt: skip
-    tiles.set_array(values[known])
-    tiles.set_rasterized(bool(known.sum() > MOST_VECTOR))
+    tiles.set_array(values[visible])
+    tiles.set_rasterized(bool(visible.sum() > MOST_VECTOR))
     axis.add_collection(tiles)
-    _set_limits(axis, *((float(one[shown].min()), float(one[shown].max())) for one in (x, y)))
+    _set_limits(
+        axis, *((float(coordinate[shown].min()), float(coordinate[shown].max())) for coordinate in (x, y))
+    )
     return tiles
 
 
@@ -351,7 +358,7 @@ def plain(value: float, digits: int = 2) -> str:
 def largest_size(*maps: Any) -> float:
     """The largest size of any finite value: the end of a symmetric scale that all of the maps share."""
     sizes = [np.abs(values[np.isfinite(values)]) for values in map(np.asarray, maps)]
-    return max((float(one.max()) for one in sizes if one.size), default=0.0) or 1.0
+    return max((float(size.max()) for size in sizes if size.size), default=0.0) or 1.0
 
 
 def rounded_up(value: float) -> float:

@@ -334,16 +334,16 @@ class CatalogueSearch:
 
         if stated:
             return look(noise._replace(value=1.0))
-        found = look(noise)
+        weighted = look(noise)
         # What all stars have in common is no noise: weights come from the scatter about the gains that fit them best.
         for _ in range(ABOUT_GAINS if is_off(noise, self._alarm) else 0):
-            gains, fitted = self._gains(found)
+            gains, fitted = self._gains(weighted)
             about = beside_fitted(scale_of(self._left(sizes + gains)), dof, fitted)
             if about.worth < FEW:
                 break
             off = is_off(about, self._alarm)
-            found = look(about, of_few(about, threshold(self._alarm)) if off else 1.0)
-        return found
+            weighted = look(about, of_few(about, threshold(self._alarm)) if off else 1.0)
+        return weighted
 
     def _gains(self, look: _Look) -> tuple[Float[np.ndarray, " c"], int]:
         """The gains of the cameras that fit the stars best, among all sizes, and how many numbers these are."""

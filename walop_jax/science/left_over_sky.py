@@ -60,8 +60,8 @@ class LeftOverSky:
 
     def covariance(self, ratio: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2 2"]:
         """Covariance of its shift of stars with a `ratio` of sky to light, 0 where none was found."""
-        whole = np.outer(self.share, self.share) + np.diag(self.errors**2)
-        return np.where(self.found, ratio**2, 0.0)[:, None, None] * whole
+        of_share = np.outer(self.share, self.share) + np.diag(self.errors**2)
+        return np.where(self.found, ratio**2, 0.0)[:, None, None] * of_share
 
     def words(self) -> str:
         """The finding in a sentence."""
@@ -102,10 +102,10 @@ def left_over_sky(
         return None
     columns = np.stack([np.ones(len(chosen)), np.log10(light[chosen]), ratio[chosen]], axis=1)
     columns[:, 1] -= columns[:, 1].mean()
-    found = [_slope(columns, qu[chosen, k], photon[chosen, k, k]) for k in range(2)]
-    share, errors = np.array(found).T
+    slopes = [_slope(columns, qu[chosen, k], photon[chosen, k, k]) for k in range(2)]
+    share, errors = np.array(slopes).T
     return (
-        LeftOverSky(share, errors, len(chosen)) if np.isfinite(found).all() and (errors > 0).all() else None
+        LeftOverSky(share, errors, len(chosen)) if np.isfinite(slopes).all() and (errors > 0).all() else None
     )
 
 
@@ -115,11 +115,11 @@ def _slope(
     """Coefficient of the last column, and its error."""
     scatter, used = 0.0, np.ones(len(values), bool)
     for _ in range(_ROUNDS):
-        beta, _, left = _fitted(columns, values, variance + scatter, used)
-        scatter = _scatter(left[used], variance[used])
-        used = np.abs(left) < FAR * np.sqrt(variance + scatter)
-    beta, inverse, left = _fitted(columns, values, variance + scatter, used)
-    pull = np.where(used, left / (variance + scatter), 0.0)[:, None] * columns
+        beta, _, residual = _fitted(columns, values, variance + scatter, used)
+        scatter = _scatter(residual[used], variance[used])
+        used = np.abs(residual) < FAR * np.sqrt(variance + scatter)
+    beta, inverse, residual = _fitted(columns, values, variance + scatter, used)
+    pull = np.where(used, residual / (variance + scatter), 0.0)[:, None] * columns
     robust = inverse @ (pull.T @ pull) @ inverse
     return float(beta[2]), float(np.sqrt(max(inverse[2, 2], robust[2, 2])))
 
@@ -152,14 +152,14 @@ def with_sky(stars: Stars, catalogue: Catalogue) -> Stars:
     """The stars with what the sky left in them may do, where the catalogue states its level."""
     if catalogue.sky is None:
         return stars
-    both = np.isfinite(catalogue.counts) & np.isfinite(catalogue.sky)
-    sums = (np.where(both, one, 0.0).sum(axis=1) for one in (catalogue.counts, catalogue.sky))
-    light, level = (np.bincount(catalogue.star, one) for one in sums)
+    stated = np.isfinite(catalogue.counts) & np.isfinite(catalogue.sky)
+    sums = (np.where(stated, values, 0.0).sum(axis=1) for values in (catalogue.counts, catalogue.sky))
+    light, level = (np.bincount(catalogue.star, values) for values in sums)
     ratio = np.where(light > 0, level / np.where(light > 0, light, 1.0), np.nan)
-    found = left_over_sky(stars.qu, stars.photon, light, ratio)
-    if found is None:
+    leftover = left_over_sky(stars.qu, stars.photon, light, ratio)
+    if leftover is None:
         return stars
-    changed = stars.changed + np.nan_to_num(found.covariance(ratio))
-    flag = stars.flag | (Quality.CATALOGUE if found.found else 0)
-    check, bound = dataclasses.replace(stars.check, sky=found), found.bound * ratio
+    changed = stars.changed + np.nan_to_num(leftover.covariance(ratio))
+    flag = stars.flag | (Quality.CATALOGUE if leftover.found else 0)
+    check, bound = dataclasses.replace(stars.check, sky=leftover), leftover.bound * ratio
     return dataclasses.replace(stars, changed=changed, flag=flag, check=check, sky_bound=bound)

@@ -75,11 +75,11 @@ def overlap(calibration: Calibration, catalogue: Catalogue, *, force: bool = Fal
     chosen &= catalogue.star < np.sort(catalogue.star[chosen])[:STAR_SAMPLE].max(initial=-1) + 1
     if not chosen.any() or not np.isfinite(catalogue.rotator[chosen]).any():
         return None
-    some = catalogue.of_rows(chosen)
-    each = apply(calibration, dataclasses.replace(some, star=np.arange(len(some))), force=force)
-    covariance = each.photon + COMMON * each.calibration
-    good = np.isfinite(each.qu).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
-    number, qu, covariance = some.star[good], each.qu[good], covariance[good]
+    subset = catalogue.of_rows(chosen)
+    by_row = apply(calibration, dataclasses.replace(subset, star=np.arange(len(subset))), force=force)
+    covariance = by_row.photon + COMMON * by_row.calibration
+    good = np.isfinite(by_row.qu).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    number, qu, covariance = subset.star[good], by_row.qu[good], covariance[good]
     weight = np.linalg.inv(covariance)
 
     def away(keep: Bool[np.ndarray, " r"]) -> Float[np.ndarray, "r 2"]:
@@ -91,8 +91,8 @@ def overlap(calibration: Calibration, catalogue: Catalogue, *, force: bool = Fal
         total[empty] = np.eye(2)
         return qu - np.linalg.solve(total, moment[..., None])[number, :, 0]
 
-    every = np.ones(len(qu), bool)
-    keep = special.chdtrc(2, np.einsum("ri,rij,rj->r", away(every), weight, away(every))) > _OUTLIER
+    all_rows = np.ones(len(qu), bool)
+    keep = special.chdtrc(2, np.einsum("ri,rij,rj->r", away(all_rows), weight, away(all_rows))) > _OUTLIER
     difference = away(keep)[keep]
     count = np.bincount(number[keep])
     dof, stars = 2 * int(np.sum(count[count > 1] - 1)), int(np.sum(count > 1))

@@ -60,14 +60,14 @@ def polarisation(
     with np.errstate(divide="ignore", invalid="ignore"):
         if estimator == "MAS":
             # −expm1 keeps the difference of nearly equal numbers exact where p ≪ b.
-            taken = across * -np.expm1(-(p**2) / across) / (2.0 * p)
-            debiased = np.where(lit, p - np.where(across > 0, taken, 0.0), p)
+            bias = across * -np.expm1(-(p**2) / across) / (2.0 * p)
+            debiased = np.where(lit, p - np.where(across > 0, bias, 0.0), p)
         else:
             debiased = np.sqrt(np.maximum(p**2 - across, 0.0))
         error = np.minimum(np.rad2deg(np.sqrt(across) / (2.0 * p)), NO_ANGLE)
     weak = np.flatnonzero((p**2 < (1.0 - 1e-9) * _CERTAIN**2 * along) & (qq * uu > qu_**2))
-    for some in np.array_split(weak, len(weak) // _TOGETHER + 1):
-        error[some] = _spread_of_angles(qu[some], covariance[some])
+    for chunk in np.array_split(weak, len(weak) // _TOGETHER + 1):
+        error[chunk] = _spread_of_angles(qu[chunk], covariance[chunk])
     return Polarisation(
         degree=p,
         debiased=debiased,
