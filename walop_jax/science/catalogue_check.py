@@ -47,6 +47,7 @@ from walop_jax.science.star_residuals import (
     SINGULAR,
     Scale,
     StarResiduals,
+    Weights,
     beside_fitted,
     chance_of_scale,
     eliminated,
@@ -327,7 +328,10 @@ class CatalogueSearch:
                 several = max(single, rows.value)
             variances = self.variance * np.where(stars.rows > 1, several, single)
             matrix, score = normal_matrix(
-                stars, residual, lambda part, _: self._columns(part), scale.kept / variances, scale.share
+                stars,
+                residual,
+                lambda part, _: self._columns(part),
+                Weights(scale.kept / variances, scale.share),
             )
             matrix = self.mixing.T @ matrix @ self.mixing + np.diag(self.prior)
             return _Look(noise, rows, matrix, self.mixing.T @ score - self.prior * sizes)

@@ -181,6 +181,13 @@ def own_variance(stars: StarResiduals) -> Float[np.ndarray, " s"]:
     return 1.0 + spread / np.clip(stars.dof, 1, stars.model.shape[1] - 1)
 
 
+class Weights(NamedTuple):
+    """Weights of stars: `inverse` is 1/variance of the residuals, 0 for those left out, `share` is κ."""
+
+    inverse: Float[np.ndarray, " s"]
+    share: Float[np.ndarray, " s"]
+
+
 Columns = Callable[[StarResiduals, slice], Float[np.ndarray, "r k c"]]
 """Columns of some stars and their rows."""
 
@@ -189,13 +196,9 @@ def normal_matrix(
     stars: StarResiduals,
     residual: Float[np.ndarray, "r k"],
     columns: Columns,
-    weight: Float[np.ndarray, " s"],
-    share: Float[np.ndarray, " s"],
+    weights: Weights,
 ) -> tuple[Matrix, Float[np.ndarray, " c"]]:
-    """Q and g (head of this file) of columns; `weight` is 1/variance of a star's residuals, 0 for those left out.
-
-    `residual` is that of `stars` or what is left of it behind changes; `share` is κ.
-    """
+    """Q and g (head of this file) of columns; `residual` is that of `stars`, with or without changes."""
     matrix, score, diagonal = np.zeros((0, 0)), np.zeros(0), np.zeros(0)
     for numbers, rows, subset in stars.blocks():
         values = columns(subset, rows)
@@ -203,7 +206,7 @@ def normal_matrix(
         count = len(free)
         if not score.size:
             matrix, score, diagonal = np.zeros((count, count)), np.zeros(count), np.zeros(count)
-        w, k = weight[numbers], share[numbers]
+        w, k = weights.inverse[numbers], weights.share[numbers]
         scaled = np.sqrt(w * k)
         flat = (free * scaled[subset.star, None]).reshape(count, -1)
         half = np.linalg.cholesky(subset.photon).swapaxes(1, 2) @ along * scaled[:, None, None]

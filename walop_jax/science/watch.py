@@ -59,6 +59,7 @@ from walop_jax.science.star_residuals import (
     TRIMMED,
     Scale,
     StarResiduals,
+    Weights,
     beside_fitted,
     eliminated,
     is_off,
@@ -205,29 +206,27 @@ class Watching:
 
     # --------------------------------------------------------------------------------------------- noise
 
-    def weights(
-        self, residual: Float[np.ndarray, "r k"]
-    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Scale]:
-        """1/variance of every star (0: left out), κ, and the scale of all of them.
+    def weights(self, residual: Float[np.ndarray, "r k"]) -> tuple[Weights, Scale]:
+        """Weights of the stars, and the scale of all of them.
 
         A change that stars of a night have in common is no noise: where χ² is not what N_ERR says, weights come from
         the scatter about the gains that fit each group best, if there are stars enough to know it.
         """
-        weight, share, scale, off = self._scaled(residual, np.zeros(len(self.time)))
+        weights, scale, off = self._scaled(residual, np.zeros(len(self.time)))
         # The gains, then their gradients as well if the scatter about the gains is not that of noise.
         for kinds in (1, 3):
             for _ in range(ABOUT_GAINS if off else 0):
-                remaining, fitted = self._behind_gains(residual, weight, share, kinds * len(self.cameras))
+                remaining, fitted = self._behind_gains(residual, weights, kinds * len(self.cameras))
                 rescaled = self._scaled(remaining, fitted)
-                if rescaled[2].worth < FEW:
-                    return weight, share, scale
-                weight, share, _, off = rescaled
-        return weight, share, scale
+                if rescaled[1].worth < FEW:
+                    return weights, scale
+                weights, _, off = rescaled
+        return weights, scale
 
     def _scaled(
         self, residual: Float[np.ndarray, "r k"], fitted: Float[np.ndarray, " g"]
-    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Scale, bool]:
-        """Weights behind numbers fitted in every group, κ, the scale; True if any scale is not that of N_ERR."""
+    ) -> tuple[Weights, Scale, bool]:
+        """Weights behind numbers fitted in every group, the scale; True if any scale is not that of N_ERR."""
         chi2 = self.stars.chi2(residual) / self.variance
         dof, alarm = self.stars.dof.astype(float), ALARM / (len(self.time) + 1)
         least = 1.0 if np.median(self.variance) > CROWDED else 0.0
@@ -247,18 +246,14 @@ class Watching:
             larger = of_few(local, self.alarm) if fitted.any() else 1.0
             variance = max(local.value, least) * larger if mine else common
             weight[members], share[members] = np.where(local.kept, 1.0 / variance, 0.0), local.share
-        return weight / self.variance, share, overall, several
+        return Weights(weight / self.variance, share), overall, several
 
     def _behind_gains(
-        self,
-        residual: Float[np.ndarray, "r k"],
-        weight: Float[np.ndarray, " s"],
-        share: Float[np.ndarray, " s"],
-        count: int,
+        self, residual: Float[np.ndarray, "r k"], weights: Weights, count: int
     ) -> tuple[Float[np.ndarray, "r k"], Float[np.ndarray, " g"]]:
         """Residuals behind the first `count` columns as they fit each group best, and how many numbers these are."""
         groups = len(self.time)
-        blocks, slopes = self._by_group(*self.scan(residual, weight, share))
+        blocks, slopes = self._by_group(*self.scan(residual, weights))
         size, fitted = np.zeros((groups, count)), np.zeros(groups)
         for g in range(groups):
             root = whitening(blocks[g, :count, g, :count], SINGULAR)
@@ -273,10 +268,7 @@ class Watching:
     # -------------------------------------------------------------------------------------------- columns
 
     def scan(
-        self,
-        residual: Float[np.ndarray, "r k"],
-        weight: Float[np.ndarray, " s"],
-        share: Float[np.ndarray, " s"],
+        self, residual: Float[np.ndarray, "r k"], weights: Weights
     ) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
         """Q and g of `columns` in all groups (group, column), errors of the calibration eliminated."""
         stars, count, groups = self.stars, self.readings.columns_count, len(self.time)
@@ -286,7 +278,7 @@ class Watching:
         score, pull = np.zeros(groups * count), np.zeros(nuisances)
         diagonal = np.zeros((groups, count))
         for numbers, rows, subset in stars.blocks():
-            group, w, k = self.group[rows], weight[numbers], share[numbers]
+            group, w, k = self.group[rows], weights.inverse[numbers], weights.share[numbers]
             values = np.concatenate([self.readings.columns(subset), self._errors(subset)], axis=-1)
             np.add.at(diagonal, group, np.sum(values[..., :count] ** 2, axis=1) * (w * k)[subset.star, None])
             free, along = subset.projected(values)
@@ -382,11 +374,11 @@ class Watching:
     def watch(self) -> Watch:
         """Changes, the strongest first, until nothing is left."""
         residual, changes = self.stars.residual, []
-        weight, share, scale = self.weights(residual)
-        matrix, score = self.scan(residual, weight, share)
+        weights, scale = self.weights(residual)
+        matrix, score = self.scan(residual, weights)
         while len(changes) < _MOST_CHANGES:
             answers = self.answers(matrix, score)
-            ways = [self.spotted(residual, weight, share)]
+            ways = [self.spotted(residual, weights)]
             if np.abs(answers.size / answers.error).max() > self.alarm:
                 ways.append(self.settled(residual, answers))
             if (chosen := self._likeliest([way for way in ways if way is not None])) is None:
@@ -396,18 +388,16 @@ class Watching:
             if change.best.kind == "spot":
                 x, y, radius, edge = change.best.place
                 self.spoilt |= profile(self.spots.x, self.spots.y, (x, y, 1.5 * radius, edge)) > 0
-            weight, share, scale = self.weights(residual)
-            matrix, score = self.scan(residual, weight, share)
-        remarks = self.alone(residual, weight, scale)
+            weights, scale = self.weights(residual)
+            matrix, score = self.scan(residual, weights)
+        remarks = self.alone(residual, weights, scale)
         return dataclasses.replace(self.told(changes, matrix, score, scale), remarks=remarks)
 
-    def alone(
-        self, residual: Float[np.ndarray, "r k"], weight: Float[np.ndarray, " s"], whole: Scale
-    ) -> tuple[str, ...]:
+    def alone(self, residual: Float[np.ndarray, "r k"], weights: Weights, whole: Scale) -> tuple[str, ...]:
         """A remark on stars that were left out as they disagree by more than noise ever does."""
         dof = np.maximum(self.stars.dof.astype(float), 1e-12)
         chi2 = self.stars.chi2(residual) / (self.variance * max(whole.value, 1.0))
-        odd = (weight == 0) & (self.stars.dof > 0) & (chi2 > special.chdtri(dof, ALARM / len(dof)))
+        odd = (weights.inverse == 0) & (self.stars.dof > 0) & (chi2 > special.chdtri(dof, ALARM / len(dof)))
         if not odd.any():
             return ()
         worst = self.stars.first[np.argmax(np.where(odd, chi2, 0.0))]
@@ -446,8 +436,8 @@ class Watching:
         total, remaining, alike = 0.0, residual, []
         for _ in range(_ROUNDS):
             if best is not None:
-                weight, share, _ = self.weights(remaining)
-                answers = self.answers(*self.scan(self.without(remaining, best, -total), weight, share))
+                weights, _ = self.weights(remaining)
+                answers = self.answers(*self.scan(self.without(remaining, best, -total), weights))
             ranked = self.suspects(answers)
             if abs(ranked[0].sigma) < self.alarm or not self.readings.possible(ranked[0]):
                 ranked.sort(key=lambda entry: -abs(entry.sigma))
@@ -474,21 +464,14 @@ class Watching:
         when = float(self.time[best.history.start]), (float(began.min()), float(began.max()))
         return WatchedChange(best, tuple(alike), *when)
 
-    def spotted(
-        self,
-        residual: Float[np.ndarray, "r k"],
-        weight: Float[np.ndarray, " s"],
-        share: Float[np.ndarray, " s"],
-    ) -> Settled | None:
+    def spotted(self, residual: Float[np.ndarray, "r k"], weights: Weights) -> Settled | None:
         """A step in a spot of the field, and what is left behind it; None where noise makes as much."""
         # Stars that lie off may be those of the spot.
         common = np.zeros(len(self.time) + 1)
-        np.maximum.at(common, self.pool, weight * self.variance)
-        variances, members = common[self.pool] / self.variance, self.readings.members
+        np.maximum.at(common, self.pool, weights.inverse * self.variance)
+        of_all, members = weights._replace(inverse=common[self.pool] / self.variance), self.readings.members
         strongest: tuple[SpotFound, int, Any, Any] | None = None
-        for start, (z, root) in enumerate(
-            of_stars(self.stars, self.group, members, residual, variances, share)
-        ):
+        for start, (z, root) in enumerate(of_stars(self.stars, self.group, members, residual, of_all)):
             z[self.spoilt] = 0.0
             spot = self.spots.strongest(z)
             if spot is not None and spot.strength > max(
@@ -499,22 +482,14 @@ class Watching:
             return None
         spot, start, z, root = strongest
         place, described = self.spots.refined(spot, z, root)
-        best = Change(
-            self.readings.of_cameras[spot.unit].name,
-            True,
-            History("step", start),
-            0.0,
-            np.inf,
-            "",
-            "spot",
-            place,
-        )
-        ranked, weight = [best], np.where(described, variances, weight)
+        name, since = self.readings.of_cameras[spot.unit].name, History("step", start)
+        ranked = [Change(name, True, since, kind="spot", place=place)]
+        weights = weights._replace(inverse=np.where(described, of_all.inverse, weights.inverse))
         for _ in range(2):  # which cameras, and from when on
             best = ranked[0]
             questions = [best._replace(name=reading.name) for reading in self.readings.of_cameras]
             questions += [best._replace(history=History("step", g)) for g in range(len(self.time))]
-            if not (ranked := self._sized(residual, questions, weight, share)):
+            if not (ranked := self._sized(residual, questions, weights)):
                 return None
         best = ranked[0]
         if abs(best.sigma) < self.alarm_of_spots or not self.readings.possible(best):
@@ -523,11 +498,7 @@ class Watching:
         return self._dated(best, alike), self.without(residual, best, best.size)
 
     def _sized(
-        self,
-        residual: Float[np.ndarray, "r k"],
-        asked: list[Change],
-        weight: Float[np.ndarray, " s"],
-        share: Float[np.ndarray, " s"],
+        self, residual: Float[np.ndarray, "r k"], asked: list[Change], weights: Weights
     ) -> list[Change]:
         """Changes with size and error, each alone, the most significant first; without those that no star sees."""
 
@@ -538,7 +509,7 @@ class Watching:
             ]
             return np.concatenate([np.stack(steps, axis=-1), self._errors(part)], axis=-1)
 
-        matrix, score = normal_matrix(self.stars, residual, columns, weight, share)
+        matrix, score = normal_matrix(self.stars, residual, columns, weights)
         count, diagonal = len(asked), np.diag(matrix)
         matrix = matrix + np.diag((np.arange(len(matrix)) >= count).astype(float))
         remaining, pull = eliminated(matrix, score, count)
