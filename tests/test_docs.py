@@ -180,7 +180,8 @@ def test_columns_of_a_calibration_set():
 
 
 def test_kinds_and_flags():
-    from walop_jax.data.records import KINDS, DataFlag
+    from walop_jax.data.kinds import KINDS
+    from walop_jax.data.records import DataFlag
 
     kinds = [row[0].strip("`") for row in rows(section("files", "Kinds of exposure"))]
     assert set(KINDS) <= set(kinds)

@@ -15,7 +15,7 @@ from small_run import SMALL
 
 import walop_jax as walop
 from walop_jax.model.compiled import array, compiled, float64
-from walop_jax.model.elements import WavePlate
+from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import values_of
 

@@ -132,7 +132,7 @@ def test_no_room_calls_upward_through_a_string():
 
 
 MOST_REACHED = {
-    "model.light": 6390,
+    "model.light": 4050,
     "likelihood.flux": 100,
     "diagnosis.score": 800,
     "commands.matrix": 22950,
@@ -193,7 +193,7 @@ MOST_LINES = {
     "calibration": 2850,
     "posterior": 2400,
     "science": 6400,
-    "diagnosis": 7910,
+    "diagnosis": 7920,
     "nights": 2800,
     "plans": 2350,
     "paper": 860,

@@ -7,7 +7,7 @@ import pytest
 
 from walop_jax.diagnosis.score import ScoreSpace, separations
 from walop_jax.model.effects import EFFECTS
-from walop_jax.model.elements import ELEMENTS
+from walop_jax.model.elements.registry import ELEMENTS
 from walop_jax.model.gallery import numbers
 
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 import walop_jax as walop
-from walop_jax.data.records import CALIBRATION_PLATE, Exposures, Position
+from walop_jax.data.kinds import CALIBRATION_PLATE
+from walop_jax.data.records import Exposures, Position
 from walop_jax.data.schedule import read_schedule, schedule_of
 from walop_jax.io.errors import DataError
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_turn

@@ -179,6 +179,16 @@ def test_the_other_sign_of_u_is_told():
     assert found[0].explained < 1.5
 
 
+def test_the_other_sign_of_u_of_a_single_star_is_told():
+    """A catalogue of several sources may have the other convention for one of its stars."""
+    calset = simulate(PLAN, seed=8).calset
+    star = int(np.argmax(np.abs(calset.sources.u)))
+    bad = with_standards(calset, u=np.where(np.arange(len(calset.sources)) == star, -1, 1) * calset.sources.u)
+    best = mixups(bad, base_model(bad), left=1e5)[0]
+    assert best.what == f"U of {calset.sources.name[star]} in SOURCES had the other sign"
+    assert best.explained < 1.5
+
+
 def test_a_camera_with_one_number_everywhere_is_refused(without_plate):
     """Its errors as large as those of light, a fit takes it for a camera of low throughput: χ²/dof 1."""
     block = without_plate.intensities.block(0, len(without_plate.points))

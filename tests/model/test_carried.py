@@ -20,7 +20,7 @@ from walop_jax.model import dependence, light, mueller
 from walop_jax.model.cameras import DetectorPart
 from walop_jax.model.effects import EFFECTS, FreeForm, effect_by_name
 from walop_jax.model.effects.base import Context, Effect, Scalar
-from walop_jax.model.elements import Element
+from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import number, param, values_of
 from walop_jax.model.plan import with_median

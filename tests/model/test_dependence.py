@@ -16,7 +16,8 @@ from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import needs, optical_indices
 from walop_jax.model.effects import EFFECTS, EffectKind, FreeForm, effect_by_name
 from walop_jax.model.effects.base import Effect, Scalar
-from walop_jax.model.elements import Element, Retarder
+from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.simple import Retarder
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import leaves, number, param, values_of, with_values
 from walop_jax.model.ray import NotPlannedError, Ray

@@ -11,7 +11,8 @@ from own_instrument import OWN
 
 from walop_jax.instruments.description import described, merged, parsed, shipped
 from walop_jax.io.errors import DataError
-from walop_jax.model.elements import Diattenuator, Element
+from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.simple import Diattenuator
 from walop_jax.model.instrument import Instrument, build, nominal_instrument
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.ray import Ray

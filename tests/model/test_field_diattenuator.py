@@ -8,7 +8,9 @@ import pytest
 
 from walop_jax.instruments.description import parsed
 from walop_jax.io.errors import DataError
-from walop_jax.model.elements import Analyser, FieldDiattenuator, Wedge
+from walop_jax.model.elements.geometry import Wedge
+from walop_jax.model.elements.simple import Analyser
+from walop_jax.model.elements.spectral import FieldDiattenuator
 from walop_jax.model.instrument import build
 from walop_jax.model.ray import Conditions, Ray
 from walop_jax.model.specification import make_model

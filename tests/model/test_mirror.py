@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from walop_jax.model.elements import Mirror
+from walop_jax.model.elements.spectral import Mirror
 from walop_jax.model.ray import Conditions, Ray
 
 

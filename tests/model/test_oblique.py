@@ -12,7 +12,9 @@ import pytest
 from walop_jax.instruments.description import described
 from walop_jax.io.errors import DataError
 from walop_jax.model import materials
-from walop_jax.model.elements import Layer, PupilMapping, RadialRetarder, Rotator, WavePlate, Wedge
+from walop_jax.model.elements.geometry import PupilMapping, Wedge
+from walop_jax.model.elements.simple import RadialRetarder, Rotator
+from walop_jax.model.elements.wave_plate import Layer, WavePlate
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.ray import Conditions, Ray
 

@@ -14,8 +14,8 @@ from scipy.interpolate import CubicSpline
 from walop_jax.data.records import FilterCurve, Position
 from walop_jax.io.errors import DataError
 from walop_jax.model import mueller
-from walop_jax.model.elements import Analyser, SpectralElement
-from walop_jax.model.elements.spectral import spline
+from walop_jax.model.elements.simple import Analyser
+from walop_jax.model.elements.spectral import SpectralElement, spline
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import leaves
 from walop_jax.model.planning import plan_for

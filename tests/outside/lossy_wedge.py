@@ -3,7 +3,7 @@
 from typing import ClassVar
 
 from walop_jax.model.effects.base import Effect, Scalar
-from walop_jax.model.elements import Depolariser
+from walop_jax.model.elements.simple import Depolariser
 from walop_jax.model.parameters import param
 
 

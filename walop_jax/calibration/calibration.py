@@ -29,7 +29,8 @@ from walop_jax.calibration.matrix import (
     slopes_over_field,
 )
 from walop_jax.data.frames import Grid
-from walop_jax.data.records import CALIBRATION_PLATE, Exposures, FilterCurve, InputFile, Site, Sources
+from walop_jax.data.kinds import CALIBRATION_PLATE
+from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
 from walop_jax.data.schema import in_unit
 from walop_jax.data.settings import (
     BUILTIN_FILTERS,
@@ -48,7 +49,7 @@ from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.text import in_ascii
 from walop_jax.model.dependence import left_behind, needs
 from walop_jax.model.effects import EFFECTS, EffectKind
-from walop_jax.model.elements import defined_elements
+from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.planning import plan_for_settings

@@ -15,7 +15,10 @@ from walop_jax.fit.model_file import model_without_data
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError
 from walop_jax.model.dependence import needs, optical_indices
-from walop_jax.model.elements import Retarder, SpectralElement, WavePlate, defined_elements
+from walop_jax.model.elements.registry import defined_elements
+from walop_jax.model.elements.simple import Retarder
+from walop_jax.model.elements.spectral import SpectralElement
+from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan, blank_plan
 from walop_jax.model.ray import Ray

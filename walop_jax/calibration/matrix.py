@@ -31,7 +31,8 @@ from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import array, compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
-from walop_jax.model.instrument import Instrument, Scalar
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.light_path import Scalar
 from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan, with_numbers
 from walop_jax.model.planning import plan_for_settings

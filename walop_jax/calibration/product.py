@@ -24,7 +24,8 @@ from walop_jax.data import schema
 from walop_jax.data.calset import empty_sources
 from walop_jax.data.checks import instrument_name, make_exposures, make_filters, make_sources
 from walop_jax.data.frames import Grid, read_grid
-from walop_jax.data.records import CALIBRATION_PLATE, PREFIX, InputFile, Site
+from walop_jax.data.kinds import CALIBRATION_PLATE, PREFIX
+from walop_jax.data.records import InputFile, Site
 from walop_jax.data.schema import Column, column_names, read_table, table_rules
 from walop_jax.data.units import Place
 from walop_jax.data.write import filter_columns, grid_cards, set_table_hdu, sign_and_write, table_hdu

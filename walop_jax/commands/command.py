@@ -335,7 +335,7 @@ class Command(Generic[T]):
     def run(self, job: Job, arguments: dict[str, Any]) -> Outcome[T]:
         """Do the work, with results written as they are asked for."""
         if (elements := arguments.pop("elements", None)) is not None:
-            from walop_jax.model.elements import load_elements
+            from walop_jax.model.elements.registry import load_elements
 
             load_elements(elements)
         output = arguments.get("output")

@@ -125,7 +125,7 @@ def read(
     from walop_jax.data.calset import read_calibration_set
     from walop_jax.io.fits_reading import primary_keywords
     from walop_jax.io.names import DOCUMENTS, FAILED, PRODUCT
-    from walop_jax.model.elements import load_elements
+    from walop_jax.model.elements.registry import load_elements
 
     if elements is not None:
         load_elements(elements)
@@ -161,7 +161,7 @@ def path_of(given: Any, what: str, advice: str) -> Path:
 def design_of(instrument: InstrumentLike) -> Instrument | None:
     """The instrument as designed: as given, or read, also from a run or a product; None if nothing was given."""
     from walop_jax import Instrument
-    from walop_jax.model.elements import defined_elements
+    from walop_jax.model.elements.registry import defined_elements
 
     if instrument is None or isinstance(instrument, Instrument):
         return instrument
@@ -191,7 +191,7 @@ def set_of(data: Sets, instrument: Instrument | None = None) -> CalibrationSet:
     """A checked set: files are checked as they are read, tables in memory here."""
     from walop_jax import CalibrationSet
     from walop_jax.data.calset import checked, read_calibration_set
-    from walop_jax.data.records import KINDS
+    from walop_jax.data.kinds import KINDS
     from walop_jax.data.table_intensities import TableIntensities
 
     if not isinstance(data, CalibrationSet):

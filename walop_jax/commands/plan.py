@@ -95,7 +95,7 @@ def plan(
     >>> walop.plan(walop.ObservingPlan(grid=3), minutes=20.0)  # doctest: +SKIP
     """
     from walop_jax import ObservingPlan
-    from walop_jax.data.records import CALIBRATION_PLATE
+    from walop_jax.data.kinds import CALIBRATION_PLATE
     from walop_jax.data.user_tables import read_input_table
     from walop_jax.io.names import PLANNED
     from walop_jax.plans.available import Available

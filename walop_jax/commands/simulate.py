@@ -187,7 +187,7 @@ def _template(like: Any, catalogue: Sequence[EffectKind]) -> Template:
 
 def _hidden(given: Any, plan: ObservingPlan, catalogue: Sequence[EffectKind]) -> list[Effect]:
     """The effects that a set holds. Raises ValueError for one that the instrument has no place for."""
-    from walop_jax.model.instrument import NoSuchPlaceError
+    from walop_jax.model.light_path import NoSuchPlaceError
     from walop_jax.simulation.simulate import effect_from_text
 
     context, hidden = plan.context(), []

@@ -22,11 +22,9 @@ from walop_jax.data.checks import (
     make_sources,
 )
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
+from walop_jax.data.kinds import CALIBRATION_PLATE, KINDS, POLARISER
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import (
-    CALIBRATION_PLATE,
-    KINDS,
-    POLARISER,
     CalibrationSet,
     Compression,
     Exposures,

@@ -9,16 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import (
-    KINDS,
-    POLARISER,
-    WAVELENGTHS,
-    Exposures,
-    FilterCurve,
-    Points,
-    Site,
-    Sources,
-)
+from walop_jax.data.kinds import KINDS, POLARISER, WAVELENGTHS
+from walop_jax.data.records import Exposures, FilterCurve, Points, Site, Sources
 from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, TURN, check
 from walop_jax.data.settings import BUILTIN_FILTERS, PHOTOMETRIC_BANDS, single_wavelength
 from walop_jax.data.units import Place

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.data.records import KINDS
+from walop_jax.data.kinds import KINDS
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, table_of, table_rules
 from walop_jax.data.table_files import read_table_file
 from walop_jax.data.units import Place, convert_unit

@@ -4,48 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from walop_jax.data.kinds import CALIBRATION_PLATE, KINDS, POLARISER, PREFIX
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import nearest
 from walop_jax.io.plain_tables import astropy_table
-
-
-class ExposureKind(NamedTuple):
-    """Facts about a KIND of exposures.
-
-    `flux_known`: its flux is one, `flux_shared`: an unknown one is the same in all exposures of a filter, `from_sky`:
-    the light comes through the telescope. `seconds` is the usual exposure time, None where no plan observes it.
-    """
-
-    flux_known: bool = False
-    flux_shared: bool = False
-    from_sky: bool = True
-    seconds: float | None = None
-
-
-KINDS: Mapping[str, ExposureKind] = {
-    "clp": ExposureKind(seconds=30.0),
-    "lamp": ExposureKind(from_sky=False, seconds=30.0),
-    "moon": ExposureKind(seconds=60.0),
-    "standard": ExposureKind(seconds=60.0),
-    "flux": ExposureKind(flux_known=True, from_sky=False),
-    "steady": ExposureKind(flux_shared=True, from_sky=False),
-}
-"""Kinds of exposures: through the polariser, lamp, full-Moon sky, standard star, known throughput, lamp of one flux."""
-
-POLARISER, CALIBRATION_PLATE = "CLP", "CHWP"
-"""Column prefixes of the moving elements that every calibration set knows."""
-
-PREFIX = re.compile(r"[A-Z][A-Z0-9_]*")
-"""Form of the column prefix of a moving element."""
 
 
 class DataFlag(enum.IntFlag):
@@ -79,10 +49,6 @@ class Site:
     def known(self) -> bool:
         """True if all three numbers are finite."""
         return bool(np.isfinite([self.latitude, self.longitude, self.elevation]).all())
-
-
-WAVELENGTHS = (0.2, 20.0)
-"""Light of a camera (µm), from the ultraviolet to the thermal infrared."""
 
 
 @dataclasses.dataclass(frozen=True)

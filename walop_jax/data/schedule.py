@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, Exposures, Position, Site, Sources
+from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
+from walop_jax.data.records import Exposures, Position, Site, Sources
 from walop_jax.io.errors import fail
 from walop_jax.io.text import read_text
 

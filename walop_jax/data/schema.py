@@ -16,7 +16,7 @@ import numpy as np
 from astropy import units
 from jaxtyping import Bool, Float
 
-from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, PREFIX
+from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER, PREFIX
 from walop_jax.data.units import Place, check_partners, convert_unit, unit_of
 from walop_jax.io.errors import nearest, rows_text
 

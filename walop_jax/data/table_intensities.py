@@ -10,16 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.records import (
-    KINDS,
-    Block,
-    Compression,
-    DataFlag,
-    Exposures,
-    Intensities,
-    Points,
-    Sources,
-)
+from walop_jax.data.kinds import KINDS
+from walop_jax.data.records import Block, Compression, DataFlag, Exposures, Intensities, Points, Sources
 from walop_jax.data.units import Place
 from walop_jax.io.errors import rows_text
 from walop_jax.io.text import some

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.data.records import Exposures
-from walop_jax.model.plan import hours_of
+from walop_jax.model.planning import hours_of
 from walop_jax.sky.nights import first_of_nights
 
 FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median

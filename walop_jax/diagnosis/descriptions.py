@@ -26,7 +26,7 @@ from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import JOINED, alternatives, other_curves
 from walop_jax.model.effects import Context, OtherDescription
-from walop_jax.model.instrument import NoSuchPlaceError
+from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.specification import Model, model_without, with_effects
 
 CHOICE_ROWS = 6000

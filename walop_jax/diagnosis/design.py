@@ -42,7 +42,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.polynomial.legendre import legvander
 
-from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, CalibrationSet, Exposures
+from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
+from walop_jax.data.records import CalibrationSet, Exposures
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram
 from walop_jax.fit.refit import FitResult

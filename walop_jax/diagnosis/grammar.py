@@ -37,8 +37,10 @@ from walop_jax.model.effects.change import BAND, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.etalon import probed_gaps
 from walop_jax.model.effects.numbers import OF_SOURCES
-from walop_jax.model.effects.optics import DISPLACEMENTS
-from walop_jax.model.elements import Element, PupilMapping, WavePlate
+from walop_jax.model.effects.optics import DISPLACEMENTS, GENERATORS
+from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.geometry import PupilMapping
+from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.slots import acts
 from walop_jax.model.specification import effect_context
@@ -151,6 +153,12 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
     asked = Asked.of(exposures, points)
     yield from _of_polariser(instrument, asked)
     for where, place, fixed in places(instrument, exposures):
+        for factor in (None, *(asked.slow() if fixed else ())):
+            base = _anything(where, place) if factor is None else _times(_anything(where, place), factor)
+            yield base
+            if asked.over_field:
+                yield _times(base, "x", "y")
+                yield _times(base, "r2")
         for base in _families(where, place):
             yield from _over_field(base, asked)
             if not fixed:
@@ -190,6 +198,11 @@ def _families(where: str, place: str) -> Iterator[tuple[Sentence, ...]]:
         yield tuple(Sentence(f"{kind} {axis}", where, place) for axis in "qu")
     for kind in ALONE:
         yield (Sentence(kind, where, place),)
+
+
+def _anything(where: str, place: str) -> tuple[Sentence, ...]:
+    """All that an element can do to polarisation to first order, where it is coated, tilted and stressed at once."""
+    return tuple(Sentence(kind, where, place) for kind in GENERATORS)
 
 
 def _over_field(base: tuple[Sentence, ...], asked: Asked) -> Iterator[tuple[Sentence, ...]]:

@@ -24,7 +24,8 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from walop_jax.data.records import POLARISER, CalibrationSet, Exposures, Points, Position
+from walop_jax.data.kinds import POLARISER
+from walop_jax.data.records import CalibrationSet, Exposures, Points, Position
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
 from walop_jax.fit.model_file import base_model, model_like
@@ -200,6 +201,7 @@ def _of_some_exposures(likelihood: Likelihood, worst: Sequence[int]) -> Iterator
     for what, remedy, asked, change in _TABLE:
         if asked(calset, calset.exposures[np.array(worst)]):
             yield Alternative(what, remedy, change)
+    yield from _signs_of_stars(calset, worst)
     number = calset.exposures.exposure
     for pair in itertools.combinations(sorted(worst), 2):
         one, other = (number[i] for i in pair)
@@ -208,6 +210,26 @@ def _of_some_exposures(likelihood: Likelihood, worst: Sequence[int]) -> Iterator
             "exchange their EXPOSURE numbers in the table of intensities",
             lambda calset, pair=pair: _exchanged(calset, pair),
         )
+
+
+def _signs_of_stars(calset: CalibrationSet, worst: Sequence[int]) -> Iterator[Alternative]:
+    """Signs of q and u of single standards among the worst exposures, where several stars are polarised."""
+    polarised = np.hypot(calset.sources.q, calset.sources.u) > 0.0
+    if len(np.unique(calset.sources.source[polarised])) < 2:
+        return
+    observed = np.unique(calset.intensities.block(0, len(calset.points)).source[:, list(worst)])
+    for star in observed[observed >= 0].tolist():
+        q, u = calset.sources.q[star], calset.sources.u[star]
+        for column, signs in (("Q", (-1, 1)), ("U", (1, -1)), ("Q and U", (-1, -1))):
+            if all(value != 0.0 for value, sign in zip((q, u), signs, strict=True) if sign < 0):
+                factors = [
+                    np.where(calset.sources.source == calset.sources.source[star], s, 1) for s in signs
+                ]
+                yield Alternative(
+                    f"{column} of {calset.sources.name[star]} in SOURCES had the other sign",
+                    "correct its row (docs: conventions)",
+                    _with_sources(lambda q, u, factors=factors: (factors[0] * q, factors[1] * u)),
+                )
 
 
 def refuse_dead_cameras(result: FitResult) -> None:

@@ -14,7 +14,8 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import CALIBRATION_PLATE, POLARISER, Position
+from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
+from walop_jax.data.records import Position
 from walop_jax.fit.outliers import BEYOND, MOST, outlying
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.layout import thinned

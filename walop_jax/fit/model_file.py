@@ -15,8 +15,9 @@ from typing import Any
 
 import tomlkit
 
+from walop_jax.data.kinds import POLARISER
 from walop_jax.data.merge import parts_of
-from walop_jax.data.records import POLARISER, CalibrationSet
+from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError

@@ -36,9 +36,9 @@ from walop_jax.model.effects.cameras import ADDED, Ghost
 from walop_jax.model.effects.change import KINDS, InExposures, NoSlotError, SlotTerm, product
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.optics import LARGEST_GAP
-from walop_jax.model.elements import WavePlate
-from walop_jax.model.elements.wave_plate import AirGap
-from walop_jax.model.instrument import Instrument, NoSuchPlaceError
+from walop_jax.model.elements.wave_plate import AirGap, WavePlate
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for
 from walop_jax.model.slots import LightSlopes, Slot, VectorSlopes

@@ -15,7 +15,10 @@ from typing import Any
 import jax.numpy as jnp
 
 from walop_jax.model import materials
-from walop_jax.model.elements import Analyser, Element, Polariser, WavePlate, Wedge
+from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.geometry import Wedge
+from walop_jax.model.elements.simple import Analyser, Polariser
+from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import check_names
 

@@ -11,13 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.data.records import POLARISER, PREFIX, WAVELENGTHS
+from walop_jax.data.kinds import POLARISER, PREFIX, WAVELENGTHS
 from walop_jax.instruments.description import Description, Reader, Table, is_named
 from walop_jax.io.errors import nearest
 from walop_jax.model import legendre
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.compiled import array
-from walop_jax.model.elements import ELEMENTS, Analyser, Element, Layer, Polariser, PupilMapping, WavePlate
+from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.geometry import PupilMapping
+from walop_jax.model.elements.registry import ELEMENTS
+from walop_jax.model.elements.simple import Analyser, Polariser
+from walop_jax.model.elements.wave_plate import Layer, WavePlate
 from walop_jax.model.parameters import Component, Parameter, is_row, numbers_of, unknown_name
 
 OWN = ("name", "moves", "declared", "model")  # what a file says otherwise, or not at all

@@ -22,7 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from walop_jax.model.elements import Analyser, Element
+from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.simple import Analyser
 from walop_jax.model.mueller import product
 from walop_jax.model.ray import Ray
 

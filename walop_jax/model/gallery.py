@@ -11,8 +11,8 @@ from importlib.resources import files
 from typing import Any
 
 from walop_jax.model.effects import EFFECTS, EffectKind
-from walop_jax.model.elements import ELEMENTS
 from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.registry import ELEMENTS
 from walop_jax.model.parameters import numbers_of, unknown_name
 
 NUMBERS = "gallery.json"

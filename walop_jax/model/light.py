@@ -25,8 +25,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.model import fold, mueller
-from walop_jax.model.elements import Analyser, Element
-from walop_jax.model.instrument import Instrument, Scalar
+from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.simple import Analyser
+from walop_jax.model.light_path import LightPath, Scalar
 from walop_jax.model.parameters import Shapes, of_shapes, shapes_of
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import NotPlannedError, Ray
@@ -34,7 +35,7 @@ from walop_jax.model.sources import ExposureArrays, Sight, Source, turned
 
 FEW_BANDS = 3
 FEW_SETTINGS = 4  # up to which band integrals are done one by one
-BROAD = 0.05  # µm: equivalent width from which a filter is displaced by `Instrument.filter_shift`
+BROAD = 0.05  # µm: equivalent width from which a filter is displaced by `LightPath.filter_shift`
 
 
 # ------------------------------------------------------------------------------------------- the train
@@ -48,7 +49,7 @@ class Train(NamedTuple):
     banded: tuple[Element, ...]
 
 
-def divided(instrument: Instrument) -> Train:
+def divided(instrument: LightPath) -> Train:
     """The parts of the common train.
 
     Leading are the elements behind the polariser up to the first that moves, or that asks for the wavelength or for
@@ -88,12 +89,12 @@ def _achromatic(elements: tuple[Element, ...], x: Scalar, y: Scalar) -> Float[Ar
     return jnp.eye(4) if matrix is None else matrix
 
 
-def telescope(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
+def telescope(instrument: LightPath, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
     """Mueller matrix of what light from the sky, and no other, meets ahead of the polariser."""
     return _achromatic(instrument.patched().telescope(), x, y)
 
 
-def upstream(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
+def upstream(instrument: LightPath, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
     """Mueller matrix of the leading elements at a field point (see `divided`)."""
     return _achromatic(divided(instrument.patched()).leading, x, y)
 
@@ -101,7 +102,7 @@ def upstream(instrument: Instrument, x: Scalar, y: Scalar) -> Float[Array, "4 4"
 # ------------------------------------------------------------------------------------ bands and cameras
 
 
-def node_wavelengths(instrument: Instrument, plan: Plan) -> Float[Array, " n"]:
+def node_wavelengths(instrument: LightPath, plan: Plan) -> Float[Array, " n"]:
     """Wavelengths (µm) of the nodes."""
     shift = instrument.patched().filter_shift
     if shift is None:
@@ -109,7 +110,7 @@ def node_wavelengths(instrument: Instrument, plan: Plan) -> Float[Array, " n"]:
     return plan.wavelength + jnp.where(plan.conditions.band_width > BROAD, shift, 0.0)
 
 
-def band_weights(instrument: Instrument, plan: Plan) -> Float[Array, "b n"]:
+def band_weights(instrument: LightPath, plan: Plan) -> Float[Array, "b n"]:
     """Weights of the nodes in every band: filter × photon spectrum, each band summing to 1, its slope to 0.
 
     Photon spectrum λ⁻⁴ / (exp(14387.77/λT) − 1) (Planck; λ in µm, T in K), flat where T = 0 stands for
@@ -132,13 +133,13 @@ def weights_at(plan: Plan, wavelength: Float[Array, " n"], teff: Float[Array, " 
     return weight / weight.sum(axis=1, keepdims=True)
 
 
-def mean_wavelengths(instrument: Instrument, plan: Plan) -> Float[Array, " b"]:
+def mean_wavelengths(instrument: LightPath, plan: Plan) -> Float[Array, " b"]:
     """Mean wavelengths (µm) of the bands."""
     wavelength = node_wavelengths(instrument, plan)
     return weights_at(plan, wavelength, plan.teff) @ wavelength
 
 
-def band_rows(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b r 4"]:
+def band_rows(instrument: LightPath, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b r 4"]:
     """Band-integrated Mueller rows (band, row, Stokes): all the optics there is at a field point.
 
     Rows are what the analysers see, arm by arm: S0, then what is analysed; where the beams of an analyser differ in
@@ -172,7 +173,7 @@ def integrated(
 
 
 def in_bands(
-    instrument: Instrument, bands: Float[Array, "b r 4"], mean: Float[Array, " b"]
+    instrument: LightPath, bands: Float[Array, "b r 4"], mean: Float[Array, " b"]
 ) -> Float[Array, "b r 4"]:
     """Band-integrated rows with what the analysers do from band to band, at mean wavelengths (µm)."""
     analysers = [arm.analyser for arm in instrument.arms]
@@ -184,7 +185,7 @@ def in_bands(
     )
 
 
-def with_dispersion(instrument: Instrument, rows: Callable[[Array], Any], wavelength: Array) -> Any:
+def with_dispersion(instrument: LightPath, rows: Callable[[Array], Any], wavelength: Array) -> Any:
     """Rows at wavelengths, or trees of them, with λ ∂/∂λ behind where the beams of an analyser differ in wavelength."""
     if not is_dispersed(instrument):
         return rows(wavelength)
@@ -192,12 +193,12 @@ def with_dispersion(instrument: Instrument, rows: Callable[[Array], Any], wavele
     return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-2), *both)
 
 
-def is_dispersed(instrument: Instrument) -> bool:
+def is_dispersed(instrument: LightPath) -> bool:
     """True if the beams of an analyser differ in wavelength."""
     return any(arm.analyser.dispersion is not None for arm in instrument.arms)
 
 
-def _node_rows(instrument: Instrument, plan: Plan, ray: Ray) -> Float[Array, "c n r 4"]:
+def _node_rows(instrument: LightPath, plan: Plan, ray: Ray) -> Float[Array, "c n r 4"]:
     """Rows that the analysers see at every node, in every state."""
     train = divided(instrument)
     for element in train.leading:
@@ -211,7 +212,7 @@ def _node_rows(instrument: Instrument, plan: Plan, ray: Ray) -> Float[Array, "c 
 
 
 def camera_vectors(
-    instrument: Instrument, rows: Float[Array, "b r 4"], throughput: Float[Array, " k"], x: Scalar, y: Scalar
+    instrument: LightPath, rows: Float[Array, "b r 4"], throughput: Float[Array, " k"], x: Scalar, y: Scalar
 ) -> Float[Array, "b k 4"]:
     """Analysis vectors (band, camera, Stokes): counts = vector · Stokes for light of unit flux."""
     instrument = instrument.patched()
@@ -219,7 +220,7 @@ def camera_vectors(
     return behind_throughput(instrument, seen, throughput, x, y)
 
 
-def beams(instrument: Instrument, rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
+def beams(instrument: LightPath, rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
     """Rows of the cameras: what each beam takes of the rows of its analyser."""
     index, shares = _beams(instrument)
     taken = (shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
@@ -227,7 +228,7 @@ def beams(instrument: Instrument, rows: Float[Array, "b r 4"]) -> Float[Array, "
 
 
 def behind_throughput(
-    instrument: Instrument, beams: Float[Array, "b k 4"], throughput: Float[Array, " k"], x: Scalar, y: Scalar
+    instrument: LightPath, beams: Float[Array, "b k 4"], throughput: Float[Array, " k"], x: Scalar, y: Scalar
 ) -> Float[Array, "b k 4"]:
     """Analysis vectors from the beams of an instrument without effects (`patched`): throughput, and what mixes them."""
     for part in instrument.cameras.transmission:
@@ -238,7 +239,7 @@ def behind_throughput(
     return vectors
 
 
-def _beams(instrument: Instrument) -> tuple[Int[np.ndarray, "k j"], Float[Array, "k j"]]:
+def _beams(instrument: LightPath) -> tuple[Int[np.ndarray, "k j"], Float[Array, "k j"]]:
     """For each camera the rows that its beam is made of, and what it takes of each."""
     analysers = [arm.analyser for arm in instrument.arms]
     names = [name for analyser in analysers for name in analyser.cameras]
@@ -260,7 +261,7 @@ def _beams(instrument: Instrument) -> tuple[Int[np.ndarray, "k j"], Float[Array,
 # ----------------------------------------------------------------------------------------- light and counts
 
 
-def stokes(instrument: Instrument, sight: Sight) -> Float[Array, "e 4"]:
+def stokes(instrument: LightPath, sight: Sight) -> Float[Array, "e 4"]:
     """Stokes vectors behind the place of the polariser, one per exposure, at a field point.
 
     Light through the polariser forgets its past; what does not come from the sky does not meet the telescope.
@@ -281,7 +282,7 @@ def stokes(instrument: Instrument, sight: Sight) -> Float[Array, "e 4"]:
     return jnp.where(exposures.clp_in[:, None], polariser.light(exposures, x, y), light)
 
 
-def stokes_slopes(instrument: Instrument, sight: Sight) -> Float[Array, "e 4"]:
+def stokes_slopes(instrument: LightPath, sight: Sight) -> Float[Array, "e 4"]:
     """Change of the Stokes vectors with wavelength (per µm) inside a band: standards are of no single colour."""
     instrument = instrument.patched()
     exposures, sight = sight.exposures, _turned(instrument, sight)
@@ -291,7 +292,7 @@ def stokes_slopes(instrument: Instrument, sight: Sight) -> Float[Array, "e 4"]:
 
 
 def _at_polariser(
-    instrument: Instrument, sight: Sight, intensity: Float[Array, " e"], qu: Float[Array, "e 2"]
+    instrument: LightPath, sight: Sight, intensity: Float[Array, " e"], qu: Float[Array, "e 2"]
 ) -> Float[Array, "e 4"]:
     """Light of an intensity and polarisation behind what light from the sky meets ahead of the polariser."""
     exposures, x, y = sight.exposures, sight.x, sight.y
@@ -303,13 +304,13 @@ def _at_polariser(
     return light
 
 
-def indoors(instrument: Instrument, sight: Sight) -> Bool[Array, " e"]:
+def indoors(instrument: LightPath, sight: Sight) -> Bool[Array, " e"]:
     """True for light that enters behind the telescope."""
     sources = (source.shines(sight) for source in instrument.sources if not source.facts.from_sky)
     return functools.reduce(jnp.logical_or, sources, jnp.zeros(sight.source.shape, bool))
 
 
-def _turned(instrument: Instrument, sight: Sight) -> Sight:
+def _turned(instrument: LightPath, sight: Sight) -> Sight:
     """Sight with the true position angle of the instrument."""
     if instrument.rotator_zero is None:
         return sight
@@ -320,7 +321,7 @@ def _turned(instrument: Instrument, sight: Sight) -> Sight:
 
 
 def counts(
-    instrument: Instrument,
+    instrument: LightPath,
     rows: Float[Array, "b r 4"],
     throughput: Float[Array, " k"],
     sight: Sight,
@@ -347,13 +348,13 @@ def counts(
     return result
 
 
-def has_ghosts(instrument: Instrument) -> bool:
+def has_ghosts(instrument: LightPath) -> bool:
     """True if counts depend on the light of the opposite field point."""
     return bool(instrument.patched().cameras.ghosts)
 
 
 def with_ghosts(
-    instrument: Instrument,
+    instrument: LightPath,
     counts: Float[Array, "e k"],
     opposite: Float[Array, "e k"],
     source: Int[Array, " e"],
@@ -364,13 +365,13 @@ def with_ghosts(
     return counts
 
 
-def is_linear(instrument: Instrument) -> bool:
+def is_linear(instrument: LightPath) -> bool:
     """True if the detectors report the electrons as they are."""
     return not instrument.patched().cameras.detectors
 
 
 def detected(
-    instrument: Instrument, exposures: ExposureArrays, counts: Float[Array, "e k"]
+    instrument: LightPath, exposures: ExposureArrays, counts: Float[Array, "e k"]
 ) -> Float[Array, "e k"]:
     """Counts that the detectors report for counts in electrons: the one stage that is not linear in the light."""
     for part in instrument.patched().cameras.detectors:

@@ -15,10 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from walop_jax.data.records import POLARISER, Exposures
 from walop_jax.model.compiled import array
 from walop_jax.model.fold import State
-from walop_jax.model.instrument import Instrument
+from walop_jax.model.light_path import LightPath
 from walop_jax.model.ray import Conditions
 from walop_jax.model.sources import ExposureArrays
 
@@ -46,43 +45,7 @@ class Plan(eqx.Module):
     slope: Float[Array, " b"] | None = None
 
 
-def hours_of(exposures: Exposures) -> Float[np.ndarray, " e"]:
-    """Time since the first exposure (h), 0 where MJD is missing."""
-    start = np.nanmin(exposures.mjd) if len(exposures) and np.isfinite(exposures.mjd).any() else 0.0
-    return np.nan_to_num((exposures.mjd - start) * 24.0)
-
-
-def exposure_arrays(
-    exposures: Exposures, kinds: Collection[str], flux_known: Collection[str]
-) -> ExposureArrays:
-    """The exposures as the light path sees them (angles in radians); `flux_known` are the KINDs of unit flux.
-
-    Raises ValueError for a KIND that is none of `kinds`.
-    """
-    known = tuple(kinds)
-    unknown = sorted(set(exposures.kind.tolist()) - set(known))
-    if unknown:
-        raise ValueError(f"KIND {unknown[0]!r}: the instrument has no such source; it has {', '.join(known)}")
-    return ExposureArrays(
-        kind=array([known.index(kind) for kind in exposures.kind], int),
-        clp_in=array(exposures.clp_in),
-        clp_angle=array(np.deg2rad(np.where(exposures.clp_in, exposures.clp_angle, 0.0))),
-        flux_known=array(np.isin(exposures.kind, list(flux_known))),
-        rotator=array(np.deg2rad(np.nan_to_num(exposures.rotator))),
-        hours=array(hours_of(exposures)),
-        temperature=array(exposures.temp),
-        hour_angle=array(np.nan_to_num(exposures.ha)),
-        exptime=array(exposures.exptime),
-        moving={  # NaN where they are out
-            prefix: array(np.deg2rad(np.where(at.inside, at.angle, np.nan)))
-            for prefix, at in exposures.positions.items()
-            if prefix != POLARISER and at.inside.any()
-        },
-        kinds=known,
-    )
-
-
-def blank_exposures(instrument: Instrument, count: int) -> ExposureArrays:
+def blank_exposures(instrument: LightPath, count: int) -> ExposureArrays:
     """Exposures of which nothing is said but that they are there."""
     zero, off = array(np.zeros(count)), array(np.zeros(count, bool))
     return ExposureArrays(
@@ -92,7 +55,7 @@ def blank_exposures(instrument: Instrument, count: int) -> ExposureArrays:
     )  # fmt: skip
 
 
-def blank_plan(instrument: Instrument, asked: Collection[str] = (), median: bool = False) -> Plan:
+def blank_plan(instrument: LightPath, asked: Collection[str] = (), median: bool = False) -> Plan:
     """A plan with every moving element in the beam, one node, one band: for shapes and derivatives."""
     patched, one = instrument.patched(), jnp.ones(1)
     count = max((part.exposures_known or 1 for part in patched.cameras.exposures), default=1)

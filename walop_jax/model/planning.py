@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from walop_jax.data.kinds import POLARISER
 from walop_jax.data.records import Exposures, FilterCurve, Sources
 from walop_jax.data.settings import Settings
 from walop_jax.io.errors import fail
@@ -18,13 +19,49 @@ from walop_jax.model.dependence import needs
 from walop_jax.model.fold import Turning
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import EXTRAPOLATED, MATERIALS
-from walop_jax.model.plan import Plan, blank_exposures, exposure_arrays, hours_of
+from walop_jax.model.plan import Plan, blank_exposures
 from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, moments, rounded_up, waves_over
 from walop_jax.model.ray import CONDITIONS, Conditions
 from walop_jax.model.sources import ExposureArrays
 
 SAMPLES = 9  # wavelengths of a band between which a retardance goes one way
 ROOM = 1.03  # by which a thickness may grow in a fit, and a path when the ray is oblique, before nodes are too few
+
+
+def hours_of(exposures: Exposures) -> Float[np.ndarray, " e"]:
+    """Time since the first exposure (h), 0 where MJD is missing."""
+    start = np.nanmin(exposures.mjd) if len(exposures) and np.isfinite(exposures.mjd).any() else 0.0
+    return np.nan_to_num((exposures.mjd - start) * 24.0)
+
+
+def exposure_arrays(
+    exposures: Exposures, kinds: Collection[str], flux_known: Collection[str]
+) -> ExposureArrays:
+    """The exposures as the light path sees them (angles in radians); `flux_known` are the KINDs of unit flux.
+
+    Raises ValueError for a KIND that is none of `kinds`.
+    """
+    known = tuple(kinds)
+    unknown = sorted(set(exposures.kind.tolist()) - set(known))
+    if unknown:
+        raise ValueError(f"KIND {unknown[0]!r}: the instrument has no such source; it has {', '.join(known)}")
+    return ExposureArrays(
+        kind=array([known.index(kind) for kind in exposures.kind], int),
+        clp_in=array(exposures.clp_in),
+        clp_angle=array(np.deg2rad(np.where(exposures.clp_in, exposures.clp_angle, 0.0))),
+        flux_known=array(np.isin(exposures.kind, list(flux_known))),
+        rotator=array(np.deg2rad(np.nan_to_num(exposures.rotator))),
+        hours=array(hours_of(exposures)),
+        temperature=array(exposures.temp),
+        hour_angle=array(np.nan_to_num(exposures.ha)),
+        exptime=array(exposures.exptime),
+        moving={  # NaN where they are out
+            prefix: array(np.deg2rad(np.where(at.inside, at.angle, np.nan)))
+            for prefix, at in exposures.positions.items()
+            if prefix != POLARISER and at.inside.any()
+        },
+        kinds=known,
+    )
 
 
 def plan_for(

@@ -11,7 +11,8 @@ from importlib.resources import files
 
 from walop_jax.data.settings import DEFAULT_FILTER
 from walop_jax.model import legendre, quadrature
-from walop_jax.model.elements import WavePlate, Wedge
+from walop_jax.model.elements.geometry import Wedge
+from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import CRYSTALS, GLASSES
 from walop_jax.model.sources import COLOUR_OF_STANDARDS

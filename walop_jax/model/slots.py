@@ -35,9 +35,11 @@ from walop_jax.model.effects.cameras import CrossTalk
 from walop_jax.model.effects.change import BAND, SKY, Change, patched
 from walop_jax.model.effects.numbers import OF_POLARISER, OF_QU, OF_SOURCES
 from walop_jax.model.effects.optics import ADDED, DISPLACEMENTS, GENERATORS, matrix_of, with_air_gap
-from walop_jax.model.elements import Element, PupilMapping, WavePlate
-from walop_jax.model.elements.wave_plate import fringe
-from walop_jax.model.instrument import Instrument, Scalar
+from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.geometry import PupilMapping
+from walop_jax.model.elements.wave_plate import WavePlate, fringe
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.light_path import Scalar
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
 from walop_jax.model.parameters import shapes_of
 from walop_jax.model.plan import Plan

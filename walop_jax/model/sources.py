@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from walop_jax.data.records import KINDS, ExposureKind
+from walop_jax.data.kinds import KINDS, ExposureKind
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.parameters import Component, number, param
 from walop_jax.model.ray import NotPlannedError

@@ -21,8 +21,7 @@ from walop_jax.model.compiled import array
 from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects import EFFECTS, Described, EffectKind, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
-from walop_jax.model.elements import WavePlate
-from walop_jax.model.elements.wave_plate import Layer
+from walop_jax.model.elements.wave_plate import Layer, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Parameter, check_names, leaves, unknown_name, values_of, with_values
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.model import fold, light
-from walop_jax.model.elements import Element
+from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for_settings

@@ -24,7 +24,8 @@ from walop_jax.calibration.accuracy import LARGEST_P, STARS, sample_stars
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.thresholds import GOAL, SMALLEST_DETERMINANT
-from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet
+from walop_jax.data.kinds import CALIBRATION_PLATE
+from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import DEFAULT_FILTER, Settings
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError

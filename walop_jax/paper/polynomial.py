@@ -33,7 +33,8 @@ from scipy.interpolate import RegularGridInterpolator
 from walop_jax.calibration.accuracy import sample_stars
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data.records import CALIBRATION_PLATE, Block, CalibrationSet
+from walop_jax.data.kinds import CALIBRATION_PLATE
+from walop_jax.data.records import Block, CalibrationSet
 from walop_jax.data.settings import DEFAULT_FILTER, Settings
 from walop_jax.io.errors import DataError
 from walop_jax.model.conventions import EXTINCTION

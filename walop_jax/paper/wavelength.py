@@ -23,7 +23,7 @@ from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import DEFAULT_FILTER, Settings
 from walop_jax.model import fold, light
 from walop_jax.model.compiled import compiled
-from walop_jax.model.elements import WavePlate
+from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for_settings

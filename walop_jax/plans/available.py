@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import CALIBRATION_PLATE
+from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.io.errors import errors_naming
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.parameters import check_names

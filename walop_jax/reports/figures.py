@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from scipy.ndimage import zoom
 
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap
-from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet
+from walop_jax.data.kinds import CALIBRATION_PLATE
+from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_file import instrument_of
 from walop_jax.io.text import two_digits, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood

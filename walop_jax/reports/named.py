@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.data.records import CALIBRATION_PLATE
+from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.io.errors import fail, nearest
 from walop_jax.io.names import FIGURE_DATA, LIMITS, POSTERIOR, PRODUCT
 from walop_jax.paper.polynomial import TERMS

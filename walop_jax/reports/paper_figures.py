@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.thresholds import GOAL
-from walop_jax.data.records import CALIBRATION_PLATE, CalibrationSet
+from walop_jax.data.kinds import CALIBRATION_PLATE
+from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_file import instrument_of
 from walop_jax.io.errors import DataError

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration, Product
-from walop_jax.data.records import CALIBRATION_PLATE, POLARISER
+from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.io.text import rounded, some, with_minus_sign
 from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.effects.free_form import FreeForm

@@ -19,16 +19,8 @@ import tomlkit
 from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.checks import checked_curve
-from walop_jax.data.records import (
-    CALIBRATION_PLATE,
-    KINDS,
-    POLARISER,
-    Exposures,
-    FilterCurve,
-    Points,
-    Position,
-    Site,
-)
+from walop_jax.data.kinds import CALIBRATION_PLATE, KINDS, POLARISER
+from walop_jax.data.records import Exposures, FilterCurve, Points, Position, Site
 from walop_jax.data.settings import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
 from walop_jax.data.units import Place
 from walop_jax.instruments.description import default_name, described, shipped
@@ -36,7 +28,7 @@ from walop_jax.io.errors import errors_naming, nearest
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.io.toml import OUT, Reader
 from walop_jax.model.effects.base import Context
-from walop_jax.model.elements import defined_elements
+from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.instrument import Instrument, as_designed, nominal_instrument
 from walop_jax.model.parameters import check_names, unknown_name
 from walop_jax.sky.moon import body_direction, local_sidereal_time, offset_direction

@@ -25,7 +25,7 @@ from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, EffectKind, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
-from walop_jax.model.elements import Analyser
+from walop_jax.model.elements.simple import Analyser
 from walop_jax.model.instrument import Instrument, adapted
 from walop_jax.model.parameters import leaves, unknown_name, values_of, with_values
 from walop_jax.model.plan import with_median

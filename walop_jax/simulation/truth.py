@@ -17,7 +17,7 @@ from walop_jax.io.text import read_text
 from walop_jax.model.dependence import left_behind
 from walop_jax.model.effects import EFFECTS, EffectKind, effect_by_name
 from walop_jax.model.effects.base import Context, Effect
-from walop_jax.model.elements import defined_elements
+from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build
 from walop_jax.model.parameters import leaves, with_values
 from walop_jax.model.standards import standards_of

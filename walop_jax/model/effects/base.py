@@ -21,7 +21,8 @@ from jaxtyping import Array, Float
 
 from walop_jax.model.conventions import CAMERAS, EXTINCTION, OF_WALOP, Units
 from walop_jax.model.effects.change import Change
-from walop_jax.model.instrument import Instrument, NoSuchPlaceError
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.parameters import Component, Parameter, field_declarations, unknown_name
 
 Scalar = Float[Array, ""]

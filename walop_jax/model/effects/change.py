@@ -26,10 +26,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from walop_jax.data.records import POLARISER
+from walop_jax.data.kinds import POLARISER
 from walop_jax.model.conventions import OF_WALOP, Units
 from walop_jax.model.effects.factors import Factor, factor
-from walop_jax.model.instrument import Instrument, Scalar
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.light_path import Scalar
 from walop_jax.model.parameters import check_names
 from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays

@@ -22,7 +22,7 @@ from walop_jax.model.alternatives import alternatives, changed
 from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects.base import Context, Effect, Scalar, numbered_camera
 from walop_jax.model.effects.change import Change, patched
-from walop_jax.model.elements import WavePlate
+from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Parameter, as_number, unknown_name
 

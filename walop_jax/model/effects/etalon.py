@@ -27,7 +27,7 @@ from walop_jax.model.conventions import REFERENCE_WAVELENGTH, Units
 from walop_jax.model.effects.base import Context, Effect, Scalar
 from walop_jax.model.effects.change import Change
 from walop_jax.model.effects.optics import LARGEST_GAP, with_air_gap
-from walop_jax.model.elements import WavePlate
+from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import param
 

@@ -22,9 +22,9 @@ from walop_jax.model.effects.change import (
     itself,
 )
 from walop_jax.model.effects.factors import EXPOSURE, FIELD, WAVELENGTH
-from walop_jax.model.elements import WavePlate
-from walop_jax.model.elements.wave_plate import Grown
-from walop_jax.model.instrument import Instrument, NoSuchPlaceError
+from walop_jax.model.elements.wave_plate import Grown, WavePlate
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.parameters import unknown_name
 from walop_jax.model.sources import ExposureArrays, MoonPatches, StandardChange, Standards
 

@@ -1,9 +1,9 @@
 """Changes of the optics: retardance, diattenuation, depolarisation, a turn; displacement of the field; fringes.
 
 Equation    M → M_Δ M_R M_D M at one place of the train, with
-            M_R = exp Σ r_i G_i (a retarder), M_D the diattenuator of vector d, M_Δ = diag(1, k, k, k)
+            M_R = exp Σ r_i G_i (a retarder), M_D the diattenuator of vector d, M_Δ = diag(1, k_q, k_u, k_v)
 Symbols     r, d sums of amplitude × factor along q, u, v; radial: x² − y² along q, 2xy along u (in units of the field);
-            diagonal: −2xy and x² − y²; k = 1 − the share that is lost; a turn by α is r_v = −2α
+            diagonal: −2xy and x² − y²; k = 1 − the share of it that is lost; a turn by α is r_v = −2α
 Source      Lu & Chipman 1996, JOSA A 13, 1106: every Mueller matrix near the identity is such a product
 Limits      exact for one kind at a place; which of several acts first is a matter of second order
 """
@@ -34,8 +34,9 @@ from walop_jax.model.effects.change import (
     product,
 )
 from walop_jax.model.effects.factors import EXPOSURE, FIELD, SHAPE, WAVELENGTH
-from walop_jax.model.elements import AddedPolarisation, AirGap
 from walop_jax.model.elements.base import Element, Mueller
+from walop_jax.model.elements.simple import AddedPolarisation
+from walop_jax.model.elements.wave_plate import AirGap
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Component
 from walop_jax.model.ray import Ray
@@ -46,9 +47,8 @@ LARGEST_GAP = 60.0  # µm of air
 
 
 AXES = ("q", "u", "v", "radial", "diagonal")
-GENERATORS = (
-    *(f"{what} {axis}" for what in ("diattenuation", "retardance") for axis in "quv"),
-    "depolarisation",
+GENERATORS = tuple(
+    f"{what} {axis}" for what in ("diattenuation", "retardance", "depolarisation") for axis in "quv"
 )
 """Kinds of which all others are sums."""
 ADDED = ("added polarisation q", "added polarisation u")
@@ -60,6 +60,8 @@ def generators_of(kind: str) -> tuple[tuple[str, float, tuple[str, ...]], ...]:
     what, _, axis = kind.partition(" ")
     if what == "turn":  # a circular retarder
         return (("retardance v", -2.0 * np.pi / 180.0, ()),)
+    if kind == "depolarisation":
+        return tuple((f"depolarisation {axis}", 1.0, ()) for axis in "quv")
     if axis == "radial":
         return (f"{what} q", 1.0, ("x2-y2",)), (f"{what} u", 1.0, ("xy",))
     if axis == "diagonal":
@@ -79,10 +81,10 @@ def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
         for what, make in (("diattenuation", mueller.diattenuator), ("retardance", mueller.general_retarder))
         if any(name.startswith(what) for name in sums)
     )
-    if "depolarisation" in sums:
-        lost = jnp.asarray(sums["depolarisation"])[..., None, None]
-        transmitted = 1.0 - lost * jnp.array([[0.0], [1.0], [1.0], [1.0]])
-        matrix = transmitted * (jnp.eye(4) if matrix is None else matrix)
+    if any(name.startswith("depolarisation") for name in sums):
+        lost = [jnp.asarray(sums.get(f"depolarisation {axis}", 0.0)) for axis in "quv"]
+        kept = 1.0 - jnp.stack(jnp.broadcast_arrays(jnp.zeros(()), *lost), axis=-1)[..., None]
+        matrix = kept * (jnp.eye(4) if matrix is None else matrix)
     assert matrix is not None
     return matrix
 
@@ -269,11 +271,9 @@ def _slots_of_fringes(instrument: Instrument, change: Change) -> list[SlotTerm]:
     return [SlotTerm(("fringes", change.place, change.gap), 1.0, factors)]
 
 
-_OPTICAL = {f"retardance {axis}": "retardance" for axis in AXES} | {
-    "depolarisation": "share",
-    "turn": "angle",
-}
+_OPTICAL = {f"retardance {axis}": "retardance" for axis in AXES} | {"turn": "angle"}
 _OPTICAL |= {f"diattenuation {axis}": "share" for axis in AXES}
+_OPTICAL |= {f"depolarisation{axis}": "share" for axis in ("", " q", " u", " v")}
 KINDS |= {
     name: Kind(amplitude, _optics, _at, grows=_grows, slots=_slots) for name, amplitude in _OPTICAL.items()
 }

@@ -1,0 +1,40 @@
+"""Kinds of exposures, and the columns of moving elements that every calibration set knows."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import NamedTuple
+
+
+class ExposureKind(NamedTuple):
+    """Facts about a KIND of exposures.
+
+    `flux_known`: its flux is one, `flux_shared`: an unknown one is the same in all exposures of a filter, `from_sky`:
+    the light comes through the telescope. `seconds` is the usual exposure time, None where no plan observes it.
+    """
+
+    flux_known: bool = False
+    flux_shared: bool = False
+    from_sky: bool = True
+    seconds: float | None = None
+
+
+KINDS: Mapping[str, ExposureKind] = {
+    "clp": ExposureKind(seconds=30.0),
+    "lamp": ExposureKind(from_sky=False, seconds=30.0),
+    "moon": ExposureKind(seconds=60.0),
+    "standard": ExposureKind(seconds=60.0),
+    "flux": ExposureKind(flux_known=True, from_sky=False),
+    "steady": ExposureKind(flux_shared=True, from_sky=False),
+}
+"""Kinds of exposures: through the polariser, lamp, full-Moon sky, standard star, known throughput, lamp of one flux."""
+
+POLARISER, CALIBRATION_PLATE = "CLP", "CHWP"
+"""Column prefixes of the moving elements that every calibration set knows."""
+
+PREFIX = re.compile(r"[A-Z][A-Z0-9_]*")
+"""Form of the column prefix of a moving element."""
+
+WAVELENGTHS = (0.2, 20.0)
+"""Light of a camera (µm), from the ultraviolet to the thermal infrared."""

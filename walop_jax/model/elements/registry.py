@@ -1,0 +1,70 @@
+"""`ELEMENTS`: the kinds of elements that a description file may name, and those that users define."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from walop_jax.io.code import classes_of
+from walop_jax.io.errors import fail
+from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.geometry import PupilMapping, Wedge
+from walop_jax.model.elements.simple import (
+    AddedPolarisation,
+    Analyser,
+    AnalysisVector,
+    Collimator,
+    Depolariser,
+    Diattenuator,
+    Polariser,
+    RadialRetarder,
+    Retarder,
+    Rotator,
+)
+from walop_jax.model.elements.spectral import FieldDiattenuator, Mirror, SpectralElement
+from walop_jax.model.elements.wave_plate import WavePlate
+
+ELEMENTS: tuple[type[Element], ...] = (
+    Polariser,
+    Collimator,
+    RadialRetarder,
+    PupilMapping,
+    Wedge,
+    WavePlate,
+    Retarder,
+    Rotator,
+    Diattenuator,
+    Depolariser,
+    AddedPolarisation,
+    SpectralElement,
+    FieldDiattenuator,
+    Mirror,
+    AnalysisVector,
+    Analyser,
+)
+
+
+def defined_elements() -> tuple[type[Element], ...]:
+    """The kinds of elements that this process has defined beside those of the package, the latest of a kind."""
+    found, waiting = {}, [Element]
+    while waiting:
+        for kind in waiting.pop(0).__subclasses__():
+            waiting.append(kind)
+            if vars(kind).get("kind") and not kind.__module__.startswith("walop_jax.model."):
+                found[kind.kind] = kind
+    return tuple(found.values())
+
+
+def load_elements(given: str | os.PathLike[str] | Sequence[type]) -> None:
+    """Run the file of kinds of elements of one's own: what is defined is known (`defined_elements`).
+
+    Raises `DataError` for a file that defines none, TypeError for a class that is none.
+    """
+    if isinstance(given, str | os.PathLike):
+        advice = "give a Python file with subclasses of Element (walop-jax docs adding-an-instrument)"
+        if not any(vars(kind).get("kind") for kind in classes_of(given, Element, advice).values()):
+            raise fail("defines no kind of element", file=given, advice=advice)
+        return
+    for kind in given:
+        if not (isinstance(kind, type) and issubclass(kind, Element)):
+            raise TypeError(f"elements: {kind!r} is no class of elements, a subclass of Element")

@@ -1,0 +1,256 @@
+"""The light path: sources, the train of elements, its arms, the cameras, and the effects that were added to it.
+
+Nothing here computes light: `light.py` folds it. An effect is a patch: `patched` is the light path with what the
+effects change, and everything that asks for light asks the patched one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Iterator
+from typing import Any, Self, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from walop_jax.io.errors import nearest
+from walop_jax.model.cameras import Cameras, Throughput
+from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.simple import Analyser, Polariser
+from walop_jax.model.elements.wave_plate import WavePlate
+from walop_jax.model.parameters import Component, check_names, number, unknown_name
+from walop_jax.model.ray import NotPlannedError, Ray
+from walop_jax.model.sources import Source, Standards
+
+Scalar = Float[Array, ""]
+AnyPart = TypeVar("AnyPart", bound=Component)
+
+
+class NoSuchPlaceError(ValueError):
+    """An effect asks for an element that this instrument does not have."""
+
+
+class Arm(Component):
+    """Light path of one part of the pupil; `path` names its elements in the order light meets them."""
+
+    name: str = eqx.field(static=True)
+    elements: tuple[Element, ...]
+    path: tuple[str, ...] = eqx.field(static=True)
+
+    def train(self) -> Iterator[Element]:
+        """Its elements ahead of the analyser, in the order light meets them."""
+        for name in self.path[:-1]:
+            yield _member(self.elements, name, f"element of arm {self.name}")
+
+    @property
+    def analyser(self) -> Analyser:
+        """The element that ends it."""
+        last = _member(self.elements, self.path[-1], f"element of arm {self.name}")
+        if not isinstance(last, Analyser):
+            raise ValueError(f"arm {self.name}: its path must end with an analyser, not with {last.name!r}")
+        return last
+
+
+class LightPath(Component):
+    """Everything that light meets, and all that is fitted. `path` names the elements ahead of the arms in their order.
+
+    `rotator_zero` (deg) is added to ROTATOR, `filter_shift` (µm) displaces broad bands; None: there is none.
+    """
+
+    name: str = eqx.field(static=True)
+    sources: tuple[Source, ...]
+    elements: tuple[Element, ...]
+    arms: tuple[Arm, ...]
+    throughput: Throughput
+    cameras: Cameras
+    path: tuple[str, ...] = eqx.field(static=True)
+    effects: tuple[Any, ...] = ()  # patches: `effects.base.Effect`
+    rotator_zero: Scalar | None = number(unit="deg", about="true ROTATOR minus the header's", default=None)
+    filter_shift: Scalar | None = number(unit="um", about="displacement of broad bands", default=None)
+    sky_films: tuple[Any, ...] = ()  # what light from the sky meets in single exposures (`optics.SkyFilm`)
+
+    # ------------------------------------------------------------------------------- asking for parts
+
+    def train(self) -> Iterator[Element]:
+        """The elements ahead of the arms, in the order light meets them."""
+        for name in self.path:
+            yield _member(self.elements, name, "element")
+
+    @property
+    def polariser(self) -> Polariser | None:
+        """The calibration polariser, if the train has one."""
+        return next((element for element in self.train() if isinstance(element, Polariser)), None)
+
+    def telescope(self) -> tuple[Element, ...]:
+        """The elements ahead of the polariser, which only light from the sky meets; none where there is no polariser.
+
+        Raises ValueError for one that moves, bends the ray or depends on the wavelength: that is not computed there.
+        """
+        if self.polariser is None:
+            return ()
+        elements = tuple(itertools.takewhile(lambda e: not isinstance(e, Polariser), self.train()))
+        for element in elements:
+            if element.moves or type(element).ray is not Element.ray or not _is_achromatic(element):
+                raise ValueError(
+                    f"element {element.name!r} stands ahead of the polariser, where nothing may move, bend the ray "
+                    "or depend on wavelength or exposure; put it behind the polariser"
+                )
+        return elements
+
+    def behind_polariser(self) -> tuple[Element, ...]:
+        """The elements behind the polariser, all where there is none."""
+        return tuple(self.train())[len(self.telescope()) + (self.polariser is not None) :]
+
+    @property
+    def standard(self) -> Standards:
+        """The standard stars."""
+        found = _member(self.sources, Standards.name, "source")
+        assert isinstance(found, Standards)
+        return found
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """KINDs of exposures that it can look at."""
+        return tuple(source.kind for source in self.sources)
+
+    def element(self, place: str) -> Element:
+        """An element by its place, as for `changed`. Raises `NoSuchPlaceError` where there is none."""
+        arm, _, name = place.rpartition(".")
+        holder = _member(self.arms, arm, "arm") if arm else self
+        return _member(holder.elements, name, "element")
+
+    def places(self, kind: type[Element]) -> tuple[str, ...]:
+        """Places, as for `changed`, of all elements of a class; arms first, then the common train."""
+        arms = [
+            f"{arm.name}.{element.name}"
+            for arm in self.arms
+            for element in arm.elements
+            if isinstance(element, kind)
+        ]
+        return (*arms, *(element.name for element in self.elements if isinstance(element, kind)))
+
+    def moving(self) -> tuple[str, ...]:
+        """Prefixes of the columns of the moving elements behind the polariser, common train first."""
+        parts = [*self.train(), *(element for arm in self.arms for element in arm.train())]
+        found = [element.moves for element in parts if element.moves and not isinstance(element, Polariser)]
+        return tuple(dict.fromkeys(found))
+
+    @property
+    def plates(self) -> str | None:
+        """Model of its wave plates (`wave_plate.MODELS`); None where it has none."""
+        elements = (*self.elements, *(element for arm in self.arms for element in arm.elements))
+        return next((element.model for element in elements if isinstance(element, WavePlate)), None)
+
+    def effect(self, name: str) -> Any:
+        """The active effect of a name; ValueError when there is none."""
+        for effect in self.effects:
+            if effect.name == name:
+                return effect
+        raise unknown_name("active effect", name, [effect.name for effect in self.effects])
+
+    # ------------------------------------------------------------------------------- changing it
+
+    def patched(self) -> Self:
+        """The instrument with what its effects change, and no effects any more."""
+        bare = dataclasses.replace(self, effects=())
+        return functools.reduce(lambda instrument, effect: effect.patch(instrument), self.effects, bare)
+
+    def changed(self, place: str, **fields: Any) -> Self:
+        """The instrument with fields of one part replaced.
+
+        `place` is a name with dots: an element, an arm's element ("half1.plate"), a layer of it
+        ("half1.plate.mgf2"), a source, or "" for the light path itself. A function is applied to what was there.
+        Raises `NoSuchPlaceError` where the instrument has no such part.
+        """
+        return _changed(self, place.split(".") if place else [], fields, place)
+
+    def inserted(self, element: Element, *, before: str = "", after: str = "") -> Self:
+        """The instrument with one more element directly before or after another one ("half1.plate" in an arm).
+
+        A name that is taken gets a number. Raises `NoSuchPlaceError` where there is no such element.
+        """
+        where, _, neighbour = (before or after).rpartition(".")
+        if where:
+            arm = next((arm for arm in self.arms if arm.name == where), None)
+            if arm is None:
+                raise NoSuchPlaceError(f"the instrument has no arm {where!r}")
+            holder = _inserted(arm, element, neighbour, bool(after))
+            arms = tuple(holder if one.name == where else one for one in self.arms)
+            return dataclasses.replace(self, arms=arms)
+        return _inserted(self, element, neighbour, bool(after))
+
+    def with_part(self, slot: str, part: Component) -> Self:
+        """The instrument with one more part of its cameras.
+
+        `slot` is "transmission", "mixing", "ghosts", "exposures" or "detectors".
+        """
+        cameras = dataclasses.replace(self.cameras, **{slot: (*getattr(self.cameras, slot), part)})
+        return dataclasses.replace(self, cameras=cameras)
+
+    def with_source(self, source: Source) -> Self:
+        """The instrument with a source of one more KIND, or with one of its sources replaced."""
+        others = tuple(one for one in self.sources if one.name != source.name)
+        if len(others) == len(self.sources):
+            return dataclasses.replace(self, sources=(*self.sources, source))
+        return dataclasses.replace(
+            self, sources=tuple(source if one.name == source.name else one for one in self.sources)
+        )
+
+
+def _member(members: tuple[AnyPart, ...], name: str, what: str) -> AnyPart:
+    for member in members:
+        if _name(member) == name:
+            return member
+    raise NoSuchPlaceError(str(unknown_name(what, name, [_name(member) for member in members])))
+
+
+def _is_achromatic(element: Element) -> bool:
+    zero = jnp.zeros(())
+    try:
+        jax.eval_shape(lambda e: e.mueller(Ray.entering(zero, zero)), element)
+    except NotPlannedError:
+        return False
+    return True
+
+
+def _name(member: Any) -> str:
+    return member.name
+
+
+def _changed(part: AnyPart, rest: list[str], fields: dict[str, Any], place: str) -> AnyPart:
+    if not rest:
+        known = [field.name for field in dataclasses.fields(part)]
+        check_names(f"field of {place or 'the instrument'}", fields, known)
+        new = {
+            name: value(getattr(part, name)) if callable(value) else value for name, value in fields.items()
+        }
+        return dataclasses.replace(part, **new)
+    known = []
+    for field in dataclasses.fields(part):
+        members = getattr(part, field.name)
+        if field.metadata.get("static", False) or not isinstance(members, tuple):
+            continue
+        known += [_name(member) for member in members if isinstance(member, Element | Arm)]
+        for i, member in enumerate(members):
+            if isinstance(member, Component) and _name(member) == rest[0]:
+                new = (*members[:i], _changed(member, rest[1:], fields, place), *members[i + 1 :])
+                return dataclasses.replace(part, **{field.name: new})
+    raise NoSuchPlaceError(f"the instrument has no part {place!r}; {nearest(rest[0], known)}")
+
+
+def _inserted(holder: Any, element: Element, neighbour: str, after: bool) -> Any:
+    if neighbour not in holder.path:
+        raise NoSuchPlaceError(str(unknown_name("element", neighbour, holder.path)))
+    name, number_ = element.name or element.kind, 1
+    while name in holder.path:
+        number_ += 1
+        name = f"{element.name or element.kind}_{number_}"
+    at = holder.path.index(neighbour) + (1 if after else 0)
+    path = (*holder.path[:at], name, *holder.path[at:])
+    return dataclasses.replace(
+        holder, elements=(*holder.elements, dataclasses.replace(element, name=name)), path=path
+    )
