@@ -114,23 +114,17 @@ def certify(
     job.tell("checking")
     source: Any = fit_of(calibration)
     if isinstance(source, Calibration | FitResult):
-        calibration_in_memory = Calibration.from_fit(source) if isinstance(source, FitResult) else source
-        path, product, catalogue = (
-            Path(IN_MEMORY),
-            calibration_in_memory.product,
-            calibration_in_memory.model.catalogue,
-        )
+        held = Calibration.from_fit(source) if isinstance(source, FitResult) else source
+        path, product, catalogue = (Path(IN_MEMORY), held.product, held.model.catalogue)
     else:
         path = product_path(folder_of(source))
         product, catalogue = read_product(path), catalogue_of(effects)
     with errors_naming(path):
         checks = tuple(checks_of(product, catalogue))
     rebuilt = any(check.name == "model" and check.passed for check in checks)
-    requirements_met = _requirements(job, source, path, catalogue) if rebuilt else ()
+    needs = _requirements(job, source, path, catalogue) if rebuilt else ()
     parents = tuple(entry.sha256 for entry in product.inputs)
-    certificate = Certificate(
-        path, checks, requirements_met, validity(product), product.content_hash(), parents
-    )
+    certificate = Certificate(path, checks, needs, validity(product), product.content_hash(), parents)
     why = "; ".join(f"{check.name} ({check.found})" for check in certificate.failed)
     return Outcome(
         certificate,

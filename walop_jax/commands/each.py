@@ -61,11 +61,11 @@ def for_each(
     ]
     ended = []
     with executor_of(workers, scheduler) as executor:
-        tasks = [(command.__name__, job.overwrite, outcome) for outcome in calls]
-        for number, outcome in enumerate(mapped(_run, tasks, executor), start=1):
+        tasks = [(command.__name__, job.overwrite, end) for end in calls]
+        for number, end in enumerate(mapped(_run, tasks, executor), start=1):
             job.tell(f"{number} of {len(calls)} catalogues")
-            ended.append(outcome)
-    failed = [outcome.error for outcome in ended if outcome.error]
+            ended.append(end)
+    failed = [end.error for end in ended if end.error]
     existing = len(files) - len(calls)
     remark = (
         f"{existing} of {len(files)} tables were there already, and are left; --overwrite makes them again"
@@ -77,13 +77,11 @@ def for_each(
             "made": len(ended) - len(failed),
             "left": existing,
             "failed": failed,
-            "catalogues": [outcome.document for outcome in ended if not outcome.error],
+            "catalogues": [end.document for end in ended if not end.error],
         },
-        "\n".join(outcome.text for outcome in ended if outcome.text) or f"{output}: nothing was left to do",
+        "\n".join(end.text for end in ended if end.text) or f"{output}: nothing was left to do",
         warnings=list(
-            dict.fromkeys(
-                [*(w for outcome in ended for w in outcome.warnings), *([remark] if existing else [])]
-            )
+            dict.fromkeys([*(w for end in ended for w in end.warnings), *([remark] if existing else [])])
         ),
         failure="; ".join(failed),
     )

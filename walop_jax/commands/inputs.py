@@ -70,7 +70,7 @@ Product = Annotated[
     Argument("Calibration product, or the folder of a run.", "RUN/calibration.fits", Path),
 ]
 OptionalProduct = Annotated["Calibration | FitResult | Diagnosed | Run | PathLike | None", None]
-"""Where a command does without, under an option of its own."""
+"""Of commands that do without one; each adds its own option."""
 DataOf = Annotated[
     "Sequence[PathLike] | None",
     Option("Calibration set of the fit, if it has moved; again for each.", "CALSET", list[Path]),
@@ -261,12 +261,8 @@ def calibration_of(given: Product, effects: Effects = None) -> Calibration:
 
     held: Any = fit_of(given)
     if isinstance(held, Calibration | FitResult):
-        calibration = held if isinstance(held, Calibration) else Calibration.from_fit(held)
-        return (
-            calibration
-            if calibration.path is not None
-            else dataclasses.replace(calibration, path=Path(IN_MEMORY))
-        )
+        result = held if isinstance(held, Calibration) else Calibration.from_fit(held)
+        return result if result.path is not None else dataclasses.replace(result, path=Path(IN_MEMORY))
     return read_calibration(folder_of(held), catalogue_of(effects))
 
 

@@ -51,8 +51,7 @@ class InspectedSets(Displayed):
 
 @command(jax=False)
 def inspect(
-    job: Job,
-    data: Annotated[Sets, Argument(SETS.help.partition(",")[0] + ".", SETS.metavar, SETS.kind)],
+    job: Job, data: Annotated[Sets, Argument(SETS.help.partition(",")[0] + ".", SETS.metavar, SETS.kind)]
 ) -> Outcome[InspectedSets]:
     """Say what is in calibration sets and what is wrong with them.
 

@@ -14,10 +14,7 @@ TEXT = Option("Print the description itself, to start one's own from.")
 
 @command(jax=False, elements=True)
 def instrument(
-    job: Job,
-    source: Annotated[PathLike | None, SOURCE] = None,
-    *,
-    text: Annotated[bool, TEXT] = False,
+    job: Job, source: Annotated[PathLike | None, SOURCE] = None, *, text: Annotated[bool, TEXT] = False
 ) -> Outcome[Any]:
     """Print and check an instrument: its elements, cameras and parameters, from its description file.
 
@@ -37,11 +34,7 @@ def instrument(
     if source is None:
         names = {name: described(name).about for name in shipped()}
         width = max(map(len, names))
-        return Outcome(
-            names,
-            names,
-            "\n".join(f"{name:<{width}}  {about}" for name, about in names.items()),
-        )
+        return Outcome(names, names, "\n".join(f"{name:<{width}}  {about}" for name, about in names.items()))
     if text:
         written = read_description(source).text
         return Outcome(written, {"name": str(source), "text": written}, written)

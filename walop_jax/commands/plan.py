@@ -108,25 +108,23 @@ def plan(
         available != "" and Path(str(available)).is_dir()
     ):
         after, available = available, ""
-    calibration = None if after is None else calibration_of(after, effects)
-    catalogue = (
-        catalogue_of(effects) if effects is not None or calibration is None else calibration.model.catalogue
-    )
+    prior = None if after is None else calibration_of(after, effects)
+    catalogue = catalogue_of(effects) if effects is not None or prior is None else prior.model.catalogue
     alike = (apart,) if isinstance(apart, str) else tuple(apart or ())
     if criterion == "apart" and not alike:
-        if calibration is None:
+        if prior is None:
             raise UsageError("give the effects that are to be told apart, or a RUN of diagnose", "apart")
-        alike = _alike(after, calibration)
+        alike = _alike(after, prior)
     if candidates is not None:
         available = candidates
-    elif available == "" and calibration is not None:
+    elif available == "" and prior is not None:
         moving = {
-            prefix: _stood_at(calibration.exposures, prefix)
-            for prefix in calibration.design.moving()
+            prefix: _stood_at(prior.exposures, prefix)
+            for prefix in prior.design.moving()
             if prefix != CALIBRATION_PLATE
         }
         available = ObservingPlan(
-            calibration.design if calibration.design.description else calibration.instrument, moving=moving
+            prior.design if prior.design.description else prior.instrument, moving=moving
         )
     chosen = (
         read_input_table(criterion)
@@ -139,7 +137,7 @@ def plan(
             Available.of(available),  # pyright: ignore[reportArgumentType]
             minutes,
             criterion=chosen,
-            known=calibration,
+            known=prior,
             goal=goal,
             draws=draws,
             apart=alike,

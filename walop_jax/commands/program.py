@@ -18,16 +18,7 @@ import typer
 from typer.core import TyperGroup
 
 from walop_jax.commands import COMMANDS, GROUPS, INTERRUPTED
-from walop_jax.commands.command import (
-    COMMON,
-    Argument,
-    Command,
-    Job,
-    Option,
-    Outcome,
-    UsageError,
-    command_of,
-)
+from walop_jax.commands.command import COMMON, Argument, Command, Job, Option, Outcome, UsageError, command_of
 from walop_jax.io.progress import interrupts_answered
 
 STARTED = time.perf_counter()

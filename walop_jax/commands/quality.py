@@ -65,15 +65,11 @@ def quality(
         check_output(figure, overwrite=True)
     sources = several(runs)
     rows, remarks = [], []
-    for number, source in enumerate(sources, start=1):
+    for number, run in enumerate(sources, start=1):
         job.tell(f"run {number} of {len(sources)}", "reading")
-        held = calibration_of(source, effects)
+        held = calibration_of(run, effects)
         folder = (
-            source.folder
-            if isinstance(source, Run)
-            else Path(source)
-            if isinstance(source, str | os.PathLike)
-            else None
+            run.folder if isinstance(run, Run) else Path(run) if isinstance(run, str | os.PathLike) else None
         )
         documents = RunFolder(folder).documents if folder is not None and folder.is_dir() else {}
         rows.append(

@@ -150,7 +150,5 @@ def next_steps(trusted: bool, output: PathLike | None, data: Sets, **options: ob
     if trusted:
         return (f"walop-jax report {output}", f"walop-jax apply {output} STARS.fits -o OUT.fits")
     sets = " ".join(str(path) for path in paths_of(data)) if output is not None else "CALSET"
-    given_options = "".join(
-        f" --{name} {value}" for name, value in options.items() if isinstance(value, str | Path)
-    )
-    return (f"walop-jax report {output}", f"walop-jax diagnose {sets}{given_options} -o {output}_diagnosis")
+    typed = "".join(f" --{name} {value}" for name, value in options.items() if isinstance(value, str | Path))
+    return (f"walop-jax report {output}", f"walop-jax diagnose {sets}{typed} -o {output}_diagnosis")

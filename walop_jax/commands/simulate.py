@@ -123,26 +123,22 @@ def simulate(
     about: dict[str, Any] = {"output": output, "instrument": plan.name, "seed": job.seed, "truth": truth}
     about["effects"] = [hidden_effect.name for hidden_effect in hidden]
     job.tell("following the light", "following")
-    simulation: Any
+    data: Any
     if stars is not None:
         if "standard" not in plan.design.kinds:
             raise UsageError(f"{plan.name} sees no stars", "stars")
         sources, true = true_instrument(plan, job.seed, **drawn)
-        catalogue_of_stars = simulated_stars(
-            plan, true, stars, job.seed, night=night or 0, noiseless=noiseless
-        )
-        simulation = astropy_table(catalogue_of_stars.columns, {"INSTRUME": plan.name})
-        truth_content = truth_document(plan, job.seed, sources, true) | {
-            "stars": catalogue_of_stars.document()
-        }
+        field = simulated_stars(plan, true, stars, job.seed, night=night or 0, noiseless=noiseless)
+        data = astropy_table(field.columns, {"INSTRUME": plan.name})
+        content = truth_document(plan, job.seed, sources, true) | {"stars": field.document()}
         about["stars"] = stars
         which = f"seed {job.seed}" if like is None or isinstance(like, tuple) else str(like)
         text = f"{output}: {plan.name}, {stars} stars of the instrument of {which}"
-        suggested, times = (f"walop-jax apply RUN {output} -o OUT.fits",), simulation["MJD"]
+        suggested, times = (f"walop-jax apply RUN {output} -o OUT.fits",), data["MJD"]
     else:
-        simulation = simulated(plan, job.seed, noiseless=noiseless, night=night, **drawn)
-        calset, true = simulation
-        truth_content = truth_document(plan, job.seed, calset.sources, true)
+        data = simulated(plan, job.seed, noiseless=noiseless, night=night, **drawn)
+        calset, true = data
+        content = truth_document(plan, job.seed, calset.sources, true)
         about |= {"exposures": len(calset.exposures), "points": len(calset.points)}
         about["rows"] = calset.intensities.rows
         text = f"{output}: {plan.name}, {about['exposures']} exposures of {about['points']} points"
@@ -153,18 +149,18 @@ def simulate(
     with contextlib.ExitStack() as stack:
         if truth is not None:
             temporary = stack.enter_context(atomic_path(truth, overwrite=job.overwrite))
-            temporary.write_text(json_text(truth_content), encoding="utf-8")
-        if output is not None and isinstance(simulation, Simulated):
-            write_calibration_set(output, simulation.calset, overwrite=job.overwrite)
+            temporary.write_text(json_text(content), encoding="utf-8")
+        if output is not None and isinstance(data, Simulated):
+            write_calibration_set(output, data.calset, overwrite=job.overwrite)
         elif output is not None:
-            write_table(output, simulation, overwrite=job.overwrite)
+            write_table(output, data, overwrite=job.overwrite)
     text += f"; {'; '.join(map(_sized, true.effects)) or 'nothing'} beyond the base model"
     if template is not None:
         mjd = float(np.nanmin(times))
         text += f"; the night of {date_of(mjd)}"
         about |= {"like": None if isinstance(like, tuple) else str(like), "night": night, "mjd": mjd}
     return Outcome(
-        simulation,
+        data,
         about,
         text,
         warnings=left_out_sentences(lost, like if isinstance(like, str | os.PathLike) else None),

@@ -253,41 +253,37 @@ def solve(system: System) -> Solution:
     before: Cell | None = None
     last: Eliminated | None = None
     for cell in system.cells:
-        block, border, source = _block(system, cell)
+        block, border, rhs = _block(system, cell)
         coupling = _walks(system, cell, before, block, rows_of)
-        rows_of.append((block, border, source, coupling))
+        rows_of.append((block, border, rhs, coupling))
         before = cell
     # Forwards. A block knows what the walk to the next cell adds to it only when that cell was made.
     done: list[Eliminated] = []
-    for cell, (block, border, source, coupling) in zip(system.cells, rows_of, strict=True):
-        left_block, reduced_border, reduced_source = block, border, source
+    for cell, (block, border, rhs, coupling) in zip(system.cells, rows_of, strict=True):
+        left_block, reduced, remainder = block, border, rhs
         if last is not None and coupling.any():
             gain = linalg.cho_solve(last.factor, coupling.T, check_finite=False).T
-            left_block, reduced_border, reduced_source = (
+            left_block, reduced, remainder = (
                 block - gain @ coupling.T,
                 border - gain @ last.left,
-                source - gain @ last.right,
+                rhs - gain @ last.right,
             )
-        factor = (
-            _factored(left_block, cell.parameter, int(cell.units[0])) if len(source) else (left_block, True)
-        )
-        last = Eliminated(block, border, coupling, factor, reduced_border, reduced_source)
+        factor = _factored(left_block, cell.parameter, int(cell.units[0])) if len(rhs) else (left_block, True)
+        last = Eliminated(block, border, coupling, factor, reduced, remainder)
         done.append(last)
-        if len(source):
-            gain = linalg.cho_solve(
-                factor, np.column_stack([reduced_border, reduced_source]), check_finite=False
-            )
-            top -= reduced_border.T @ gain[:, :-1]
-            right -= reduced_border.T @ gain[:, -1]
+        if len(rhs):
+            gain = linalg.cho_solve(factor, np.column_stack([reduced, remainder]), check_finite=False)
+            top -= reduced.T @ gain[:, :-1]
+            right -= reduced.T @ gain[:, -1]
     factor = _factored(0.5 * (top + top.T), at, None) if size else (top, True)
     shared = linalg.cho_solve(factor, right) if size else right
     values: list[Vector] = [np.zeros(0)] * len(done)
     for c in range(len(done) - 1, -1, -1):
         if len(done[c].right):
-            reduced_source = done[c].right - done[c].left @ shared
+            remainder = done[c].right - done[c].left @ shared
             if c + 1 < len(done) and len(values[c + 1]):
-                reduced_source = reduced_source - done[c + 1].before.T @ values[c + 1]
-            values[c] = linalg.cho_solve(done[c].factor, reduced_source, check_finite=False)
+                remainder = remainder - done[c + 1].before.T @ values[c + 1]
+            values[c] = linalg.cho_solve(done[c].factor, remainder, check_finite=False)
     return Solution(system, shared, tuple(values), tuple(done), factor)
 
 

@@ -258,12 +258,10 @@ def night_equations(
             terms, _ = likelihood.data_terms(point)
             select = model.selection()
             chi2, gradient, matrix = terms.data, select.T @ terms.gradient, select.T @ terms.matrix @ select
-            amplitudes, census = {}, terms.census
+            beyond, census = {}, terms.census
         else:
-            amplitudes = (
-                candidates_of(model, subset.exposures, model.catalogue) if changes is None else changes
-            )
-            chi2, gradient, matrix = with_candidates(likelihood, point, amplitudes)
+            beyond = candidates_of(model, subset.exposures, model.catalogue) if changes is None else changes
+            chi2, gradient, matrix = with_candidates(likelihood, point, beyond)
             census = likelihood.census
         if not (np.isfinite(chi2) and np.isfinite(gradient).all() and np.isfinite(matrix).all()):
             raise DataError(
@@ -285,15 +283,12 @@ def night_equations(
                 n_data=census.n_data,
                 dof=round(float(census.rows @ likelihood.data_per_row)),
                 chi2=chi2,
-                parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in amplitudes.values())),
-                candidates=len(amplitudes),
+                parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in beyond.values())),
+                candidates=len(beyond),
                 reference=np.concatenate(
                     [
                         point[model.free],
-                        [
-                            0.0 if change else point[model.index(name)]
-                            for name, (_, change) in amplitudes.items()
-                        ],
+                        [0.0 if change else point[model.index(name)] for name, (_, change) in beyond.items()],
                     ]
                 ),
                 gradient=gradient,
@@ -312,13 +307,9 @@ def with_candidates_of(night: Night, before: Night) -> Night:
     cut = len(before.parameters) - before.candidates
     if not before.candidates or night.candidates or night.names != before.names[:cut]:
         return night
-    free, cross, candidate_block = (
-        before.matrix[:cut, :cut],
-        before.matrix[cut:, :cut],
-        before.matrix[cut:, cut:],
-    )
+    free, cross, block = (before.matrix[:cut, :cut], before.matrix[cut:, :cut], before.matrix[cut:, cut:])
     along = cross @ pseudo_inverse(free, 1e-13)
-    beyond, pull = candidate_block - along @ cross.T, before.gradient[cut:] - along @ before.gradient[:cut]
+    beyond, pull = block - along @ cross.T, before.gradient[cut:] - along @ before.gradient[:cut]
     slope = along @ night.matrix
     return dataclasses.replace(
         night,
@@ -415,16 +406,16 @@ def together(nights: Sequence[Night]) -> Together:
         raise fail("no night was given", advice="give fits, sets or files of nights")
     ordered = tuple(sorted(nights, key=lambda night: (night.mjd, night.sha256)))
     check_together(ordered)
-    all_parameters: dict[str, Parameter] = {}
+    union: dict[str, Parameter] = {}
     for candidate in (False, True):
         for night in ordered:
             cut = len(night.parameters) - night.candidates
             for p in night.parameters[cut:] if candidate else night.parameters[:cut]:
-                all_parameters.setdefault(p.name, p)
+                union.setdefault(p.name, p)
     of_model = {
         p.name for night in ordered for p in night.parameters[: len(night.parameters) - night.candidates]
     }
-    names, n = list(all_parameters), len(all_parameters)
+    names, n = list(union), len(union)
     place, origin = {name: k for k, name in enumerate(names)}, np.full(n, np.nan)
     gradient, matrix = np.zeros((len(ordered), n)), np.zeros((len(ordered), n, n))
     chi2 = np.zeros(len(ordered))
@@ -439,7 +430,7 @@ def together(nights: Sequence[Night]) -> Together:
         gradient[u, at] = night.gradient + slope
         matrix[u][np.ix_(at, at)] = night.matrix
     mean, width = np.zeros(n), np.full(n, np.inf)
-    for k, p in enumerate(all_parameters.values()):
+    for k, p in enumerate(union.values()):
         if p.name in of_model and (p.prior is not None or p.loose is not None):
             centre, width[k] = p.prior if p.prior is not None else (p.start, p.loose)
             mean[k] = centre - origin[k]
@@ -458,9 +449,7 @@ def together(nights: Sequence[Night]) -> Together:
         matrix,
         scale,
     )
-    return Together(
-        ordered, tuple(all_parameters.values()), n - len(of_model), origin, mean, width, equations
-    )
+    return Together(ordered, tuple(union.values()), n - len(of_model), origin, mean, width, equations)
 
 
 def _numbers(nights: Sequence[Night]) -> Int[np.ndarray, " u"]:
@@ -481,17 +470,15 @@ def check_together(nights: Sequence[Night]) -> None:
     for name, remedy in advice.items():
         for night in nights:
             if getattr(night, name) != getattr(first, name):
-                first_entry, second_entry = (
-                    f"{getattr(entry, name)[:12]} ({entry.source})" for entry in (first, night)
-                )
-                raise fail(f"the nights are of two {name}s, {first_entry} and {second_entry}", advice=remedy)
+                mine, theirs = (f"{getattr(entry, name)[:12]} ({entry.source})" for entry in (first, night))
+                raise fail(f"the nights are of two {name}s, {mine} and {theirs}", advice=remedy)
     stars: dict[str, tuple[Parameter, Night]] = {}
     for night in nights:
         for p in night.parameters:
-            first_entry, second_entry = stars.setdefault(p.name, (p, night))
-            if p.name.startswith("standard.") and p.prior != first_entry.prior:
+            mine, theirs = stars.setdefault(p.name, (p, night))
+            if p.name.startswith("standard.") and p.prior != mine.prior:
                 star = p.name.split(".")[1]
-                what = f"the catalogue has other values of {star} in {night.source} than in {second_entry.source}"
+                what = f"the catalogue has other values of {star} in {night.source} than in {theirs.source}"
                 raise fail(what, extension="SOURCES", advice=_ONE_STAR)
     earlier: dict[Any, Night] = {}
     for night in nights:

@@ -132,10 +132,8 @@ class Maker:
         if not task.candidates:  # a gauge stays where its column was made
             cut = len(night.names) - night.candidates
             values |= dict(zip(night.names[cut:], night.reference[cut:].tolist(), strict=True))
-        (night_again,) = night_equations(
-            calset, model, values, candidates, number=night.number, sets=self.count
-        )
-        return Made([with_candidates_of(night_again, night)])
+        (anew,) = night_equations(calset, model, values, candidates, number=night.number, sets=self.count)
+        return Made([with_candidates_of(anew, night)])
 
     def _set_and_model(self, data: Data) -> tuple[CalibrationSet, Model]:
         assert self.like is not None

@@ -173,9 +173,5 @@ def nights_in(place: str | os.PathLike[str]) -> list[Night]:
         return read_nights(path)
     files = [path / NIGHTS] if (path / NIGHTS).exists() else sorted(path.glob("night*.fits"))
     if not files:
-        raise fail(
-            "holds no nights",
-            file=place,
-            advice="give sets, RUNs of walop-jax refit or a SURVEY",
-        )
+        raise fail("holds no nights", file=place, advice="give sets, RUNs of walop-jax refit or a SURVEY")
     return [night for file in files for night in read_nights(file)]

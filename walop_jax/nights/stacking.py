@@ -37,13 +37,7 @@ from walop_jax.model.specification import effect_context
 from walop_jax.nights.algebra import Solution, UndeterminedError
 from walop_jax.nights.breaks import Break, at_solution, part_of, solved
 from walop_jax.nights.breaks import find as breaks_of
-from walop_jax.nights.equations import (
-    Night,
-    Together,
-    data_hash,
-    source_of,
-    together,
-)
+from walop_jax.nights.equations import Night, Together, data_hash, source_of, together
 from walop_jax.nights.making import Data, Maker, Makers, Task
 from walop_jax.nights.night_file import nights_in, read_nights, write_nights
 from walop_jax.nights.survey import Survey
@@ -241,10 +235,7 @@ def _opened(one: Given, catalogue: Sequence[EffectKind]) -> _Opened:
 
 
 def _settled(
-    data: Together,
-    laws: Sequence[Law | None],
-    at_hand: Mapping[tuple[str, int], Data],
-    makers: Makers,
+    data: Together, laws: Sequence[Law | None], at_hand: Mapping[tuple[str, int], Data], makers: Makers
 ) -> tuple[Together, Solution, bool]:
     """Linearise nights at the common solution until that would not move it by `EXACT` errors; whether it would not.
 
@@ -298,12 +289,10 @@ def _with_candidates_anew(
     """The nights linearised at the solution, with their candidates."""
     values, _ = _in_units(data, solution)
     nights = list(data.nights)
-    with_data = [u for u, night in enumerate(nights) if night.key in at_hand]
-    points = [dict(zip(data.names, values[u].tolist(), strict=True)) for u in with_data]
-    tasks = [
-        Task(at_hand[nights[u].key], nights[u], at, True) for u, at in zip(with_data, points, strict=True)
-    ]
-    for u, (night,) in zip(with_data, makers.make(tasks), strict=True):
+    units = [u for u, night in enumerate(nights) if night.key in at_hand]
+    points = [dict(zip(data.names, values[u].tolist(), strict=True)) for u in units]
+    tasks = [Task(at_hand[nights[u].key], nights[u], at, True) for u, at in zip(units, points, strict=True)]
+    for u, (night,) in zip(units, makers.make(tasks), strict=True):
         nights[u] = night
     return together(nights)
 

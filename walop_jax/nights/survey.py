@@ -168,12 +168,8 @@ class Survey(Displayed):
         x, y = product.raster(SIZE)
         matrix, covariance, slopes = product.over_field(x, y, settings, NODES, TOLERANCE)
         structure = covariance - slopes @ product.covariance @ slopes.swapaxes(1, 2)
-        with_u = measures_u(matrix.reshape(-1, 2, 3))
-        return (
-            (matrix[with_u], slopes[with_u], structure[with_u], float(np.mean(~with_u)))
-            if with_u.any()
-            else None
-        )
+        good = measures_u(matrix.reshape(-1, 2, 3))
+        return (matrix[good], slopes[good], structure[good], float(np.mean(~good))) if good.any() else None
 
     @property
     def last(self) -> float:
@@ -219,14 +215,14 @@ class Survey(Displayed):
         evenings = sorted({n.number for n in nights})
         value, covariance = self.solution.predict(mjd, evenings.index(number) if number in evenings else None)
         value, covariance = self.data.origin + value * scale, covariance * np.outer(scale, scale)
-        for entry in self.breaks:
-            if entry.kind == "step" and entry.before < mjd < entry.after:
+        for case in self.breaks:
+            if case.kind == "step" and case.before < mjd < case.after:
                 i, share = (
-                    self.data.names.index(entry.name),
-                    (mjd - entry.before) / (entry.after - entry.before),
+                    self.data.names.index(case.name),
+                    (mjd - case.before) / (case.after - case.before),
                 )
-                value[i] += entry.size * (share - (mjd >= entry.date))
-                covariance[i, i] += (entry.size**2 + entry.error**2) * share * (1.0 - share)
+                value[i] += case.size * (share - (mjd >= case.date))
+                covariance[i, i] += (case.size**2 + case.error**2) * share * (1.0 - share)
         return value, covariance
 
     def at(self, mjd: float, *, force: bool = False) -> Calibration:
@@ -356,7 +352,7 @@ class Survey(Displayed):
             "valid_from": start, "valid_until": stop, "validity": self.validity,
             "error_of_p": None if self._matrix is None else self.error_of_p(self.last),
             "without_u": None if self._matrix is None else self._matrix[3],
-            "breaks": [dataclasses.asdict(entry) | {"date": entry.date} for entry in self.breaks],
+            "breaks": [dataclasses.asdict(case) | {"date": case.date} for case in self.breaks],
             "events": [{"mjd": mjd, "what": what} for mjd, what in self.events],
             "by_night": [
                 {"night": n.number, "mjd": n.mjd, "chi2": float(chi2), "dof": n.dof, "excess": float(excess)}
@@ -377,16 +373,16 @@ class Survey(Displayed):
         sentences = (
             [] if self.trusted else ["Look at the nights that scatter too much: walop-jax diagnose NIGHT."]
         )
-        for entry in self.breaks:
-            if entry.alike:
+        for case in self.breaks:
+            if case.alike:
                 needed = (
-                    "no more nights like these would tell" if math.isinf(entry.nights_needed)
-                    else f"{'or ' if entry.separated_by else ''}{entry.nights_needed:.0f} more nights like these"
+                    "no more nights like these would tell" if math.isinf(case.nights_needed)
+                    else f"{'or ' if case.separated_by else ''}{case.nights_needed:.0f} more nights like these"
                 )  # fmt: skip
-                names = ", ".join(entry.alike[:3]) + (" …" if len(entry.alike) > 3 else "")
-                how = "; ".join((*entry.separated_by, needed))
+                names = ", ".join(case.alike[:3]) + (" …" if len(case.alike) > 3 else "")
+                how = "; ".join((*case.separated_by, needed))
                 sentences.append(
-                    f"MJD {entry.night}: {entry.name} cannot be told from {names}. To separate them: {how}."
+                    f"MJD {case.night}: {case.name} cannot be told from {names}. To separate them: {how}."
                 )
         return (*sentences, f"Calibrate again before MJD {self.until:.1f}.")
 
@@ -405,11 +401,11 @@ class Survey(Displayed):
             facts["changes"] = "none found beyond the laws"
         rows = tuple(
             (
-                entry.kind, entry.name, " ± ".join(value_and_error(entry.size, entry.error)), entry.unit,
-                str(entry.night),
-                f"{entry.z:+.1f}", ", ".join(entry.alike[:3]),
+                case.kind, case.name, " ± ".join(value_and_error(case.size, case.error)), case.unit,
+                str(case.night),
+                f"{case.z:+.1f}", ", ".join(case.alike[:3]),
             )
-            for entry in self.breaks
+            for case in self.breaks
         )  # fmt: skip
         return Display(
             f"Survey of {nights[0].instrument}: {verdict.words}",

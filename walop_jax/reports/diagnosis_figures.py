@@ -67,13 +67,9 @@ def residual_maps(
 @styled
 def effect_figure(data: DiagnosisFigureData, number: int = 1, on: Canvas = PAGE) -> AnyFigure:
     """Residuals without the effect of a comparison, what it explains, and with it; of 0: starting and final model."""
-    comparison = data.comparisons[number]
-    without, with_it = (f"without\n{comparison.effect}", f"with\n{comparison.effect}") if number else _MODELS
-    rows = {
-        without: comparison.before,
-        comparison.effect or "explained": comparison.explained,
-        with_it: comparison.after,
-    }
+    c = data.comparisons[number]
+    without, with_it = (f"without\n{c.effect}", f"with\n{c.effect}") if number else _MODELS
+    rows = {without: c.before, c.effect or "explained": c.explained, with_it: c.after}
     return residual_maps(data.points, rows, data.cameras, on)
 
 

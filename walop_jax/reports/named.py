@@ -152,8 +152,7 @@ FIGURES: Mapping[str, NamedFigure] = {
         possible=_small,
     ),
     "matrix": NamedFigure(
-        "the elements of the instrument matrix",
-        lambda s: figures.matrix_maps_figure(s.maps, on=s.canvas),
+        "the elements of the instrument matrix", lambda s: figures.matrix_maps_figure(s.maps, on=s.canvas)
     ),
     "matrix-errors": NamedFigure(
         "their standard errors", lambda s: figures.matrix_errors_figure(s.maps, s.canvas)
@@ -194,9 +193,7 @@ FIGURES: Mapping[str, NamedFigure] = {
         LIMITS,
     ),
     "separation": NamedFigure(
-        "which effects look alike",
-        lambda s: diagnosis_figures.separation_figure(s.limits, s.canvas),
-        LIMITS,
+        "which effects look alike", lambda s: diagnosis_figures.separation_figure(s.limits, s.canvas), LIMITS
     ),
     "ladder": NamedFigure(
         "χ² of the starting model and of every model after it",
@@ -241,13 +238,13 @@ FIGURES: Mapping[str, NamedFigure] = {
 
 def possible(source: FigureSource) -> dict[str, NamedFigure]:
     """The figures that a run, or a result in memory, can give; its plates go by their names."""
-    figures_by_name = {
+    figures = {
         name: entry for name, entry in FIGURES.items() if entry.needs in source and entry.possible(source)
     }
-    if "retardance" in figures_by_name:
+    if "retardance" in figures:
         about = f"maps of the retardance of {listed(_plates(source))}"
-        figures_by_name["retardance"] = dataclasses.replace(figures_by_name["retardance"], about=about)
-    return figures_by_name
+        figures["retardance"] = dataclasses.replace(figures["retardance"], about=about)
+    return figures
 
 
 def draw(name: str, source: FigureSource) -> AnyFigure:

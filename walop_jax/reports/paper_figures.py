@@ -58,16 +58,16 @@ def retardance_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
     figure, axes = on.panels(3.9 * len(names), 3.3, 1, len(names), squeeze=False)
     for name, axis, values in zip(names, axes[0], retardances, strict=True):
         # Unwrapped: a map that jumps by 360° would show the jump and nothing else.
-        unwrapped = np.unwrap(
+        smooth = np.unwrap(
             np.unwrap(values.reshape(_PIXELS, _PIXELS), axis=1, period=360.0), axis=0, period=360.0
         )
-        unwrapped -= 360.0 * np.floor(unwrapped[_PIXELS // 2, _PIXELS // 2] / 360.0)
+        smooth -= 360.0 * np.floor(smooth[_PIXELS // 2, _PIXELS // 2] / 360.0)
         field_axes(axis, f"{PLATES.get(name, name)} at {1e3 * _WAVELENGTH:.0f} nm")
-        norm = Normalize(float(unwrapped.min()), float(unwrapped.max()))
+        norm = Normalize(float(smooth.min()), float(smooth.max()))
         label = "retardance (deg)" if axis is axes[0, -1] else ""
-        colour_bar(figure, pixel_map(axis, unwrapped, calibration.field, norm, SEQUENTIAL), axis, label)
+        colour_bar(figure, pixel_map(axis, smooth, calibration.field, norm, SEQUENTIAL), axis, label)
         lines = axis.contour(
-            unwrapped,
+            smooth,
             extent=calibration.field,
             levels=6,
             colors="w",
@@ -130,11 +130,9 @@ def _unwrapped_retardances(
 @styled
 def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = PAGE) -> AnyFigure:
     """Maps of the ten coefficients of the method of Paper II, a row for q and one for u."""
-    polynomials = fit_paper(calset, filter_name)
+    fits = fit_paper(calset, filter_name)
     figure, axes = on.panels(10.6, 4.3, 2, 5, turned=True, sharex=True, sharey=True)
-    for row, quantity, coefficients in zip(
-        axes, "qu", np.moveaxis(polynomials.coefficients, 1, 0), strict=True
-    ):
+    for row, quantity, coefficients in zip(axes, "qu", np.moveaxis(fits.coefficients, 1, 0), strict=True):
         for axis, name, values in zip(row, COEFFICIENTS, coefficients.T, strict=True):
             field_axes(axis, f"{quantity}, {name}{'' if name == COEFFICIENTS[0] else ' term'}")
             low, high = _most(values)  # where an exposure holds no u a few are larger by orders of magnitude
@@ -142,7 +140,7 @@ def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = P
             if both_signs:
                 low, high = -max(-low, high), max(-low, high)
             colours = DIVERGING if both_signs else SEQUENTIAL
-            shown = point_map(axis, polynomials.x, polynomials.y, values, Normalize(low, high), colours)
+            shown = point_map(axis, fits.x, fits.y, values, Normalize(low, high), colours)
             colour_bar(figure, shown, axis, extend="both")
     outer_labels(axes)
     return figure

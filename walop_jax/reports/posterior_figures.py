@@ -15,14 +15,7 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.text import RAISED, with_error
-from walop_jax.reports.style import (
-    PAGE,
-    SMALL,
-    AnyFigure,
-    Canvas,
-    PaperFigure,
-    styled,
-)
+from walop_jax.reports.style import PAGE, SMALL, AnyFigure, Canvas, PaperFigure, styled
 
 SHARES = (0.393, 0.865)  # of the draws: inside 1 and 2 σ of a normal distribution of two coefficients
 BINS = 30  # of a histogram, along each axis

@@ -242,7 +242,7 @@ def read_run(run: Run | Path) -> RunContents:
                 f"{DIAGNOSIS} is of another fit than {SUMMARY}: this folder was written to again since."
             )
     sampled = POSTERIOR in run
-    optional_contents = {
+    extras = {
         "sample": optional(SAMPLE, lambda: run.document(SAMPLE), "no verdict on the sampling", sampled),
         "corner": optional(CORNER, (run.folder / CORNER).read_bytes, "no corner plot", sampled),
         "limits": optional(LIMITS, lambda: _limits(run, summary), "no protection level", False),
@@ -258,9 +258,7 @@ def read_run(run: Run | Path) -> RunContents:
             run.calset  # noqa: B018
         except (ValueError, OSError) as error:
             missing.append(f"Residuals are not drawn: {error}.")
-    return RunContents(
-        source, summary, product, diagnosis, pictures, missing=tuple(missing), **optional_contents
-    )
+    return RunContents(source, summary, product, diagnosis, pictures, missing=tuple(missing), **extras)
 
 
 def read_limits(path: Path) -> DetectionLimits:

@@ -129,10 +129,8 @@ class Canvas:
         group = columns
         if turned:
             rows, columns, group = columns, rows, rows
-            opposite = {"row": "col", "col": "row"}
-            options |= {
-                key: opposite.get(str(value), value) for key, value in options.items() if key in SHARED
-            }
+            swap = {"row": "col", "col": "row"}
+            options |= {key: swap.get(str(value), value) for key, value in options.items() if key in SHARED}
         elif self._narrow(columns, least) and "width_ratios" not in options:
             fitting = [n for n in range(1, columns) if not self._narrow(n, least)]
             divisors = [n for n in fitting if columns % n == 0] if rows > 1 else fitting
@@ -182,15 +180,12 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def draw(*args: P.args, **options: P.kwargs) -> T:
-        axes = (argument.ax for argument in (*args, *options.values()) if isinstance(argument, Canvas))
+        axes = (arg.ax for arg in (*args, *options.values()) if isinstance(arg, Canvas))
         if any(ax is not None for ax in axes):
             return function(*args, **options)
         with own_style():
             figure = function(*args, **options)
-            if any(
-                isinstance(argument, Canvas) and argument.width is not None
-                for argument in (*args, *options.values())
-            ):
+            if any(isinstance(arg, Canvas) and arg.width is not None for arg in (*args, *options.values())):
                 _in_print(figure)
             return figure
 
@@ -274,9 +269,7 @@ def point_map(
     tiles.set_array(values[visible])
     tiles.set_rasterized(bool(visible.sum() > MOST_VECTOR))
     axis.add_collection(tiles)
-    _set_limits(
-        axis, *((float(coordinate[shown].min()), float(coordinate[shown].max())) for coordinate in (x, y))
-    )
+    _set_limits(axis, *((float(v[shown].min()), float(v[shown].max())) for v in (x, y)))
     return tiles
 
 

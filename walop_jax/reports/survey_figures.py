@@ -8,17 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from walop_jax.reports.style import (
-    AFTER,
-    BEFORE,
-    FONT,
-    PAGE,
-    QUIET,
-    SMALL,
-    calendar,
-    day_of,
-    styled,
-)
+from walop_jax.reports.style import AFTER, BEFORE, FONT, PAGE, QUIET, SMALL, calendar, day_of, styled
 from walop_jax.science.quality import ERRORS, GAIN, OUTSIDE, Limits
 from walop_jax.science.watch_found import Watch
 

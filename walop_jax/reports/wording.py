@@ -45,10 +45,8 @@ def hidden_in_words(summary: Mapping[str, Any]) -> str:
         f"{entry['name']} ({rounded(entry['size'], '.2g')} {entry['unit']})".replace(" )", ")")
         for entry in entries
     ]
-    introduction = (
-        "Mistakes larger than the errors that these data would not show, up to the size in brackets"
-    )
-    return f"{introduction}: {listed(sizes)}." if sizes else ""
+    lead = "Mistakes larger than the errors that these data would not show, up to the size in brackets"
+    return f"{lead}: {listed(sizes)}." if sizes else ""
 
 
 _MJD_0 = datetime.datetime(1858, 11, 17)

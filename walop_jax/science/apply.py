@@ -133,8 +133,8 @@ def residuals_of(
     chosen = work.sample(rows)
     return [
         residuals
-        for _, rows_of_block in work.blocks()
-        for residuals in work.residuals(work.block(rows_of_block), chosen)
+        for _, rows_there in work.blocks()
+        for residuals in work.residuals(work.block(rows_there), chosen)
     ]
 
 

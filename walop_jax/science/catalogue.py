@@ -12,12 +12,7 @@ from jaxtyping import Bool, Float, Int
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, plain_column
 from walop_jax.data.table_intensities import equal_rows
 from walop_jax.data.units import Place
-from walop_jax.data.user_tables import (
-    OF_STARS,
-    InputTable,
-    numeric_column,
-    vector_columns,
-)
+from walop_jax.data.user_tables import OF_STARS, InputTable, numeric_column, vector_columns
 from walop_jax.io.errors import rows_text
 from walop_jax.model.instrument import Instrument
 from walop_jax.science.colours import LIMITS, SOURCE, temperature_of

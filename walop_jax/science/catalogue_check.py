@@ -32,8 +32,8 @@ from walop_jax.science.instrument_changes import (
     ALARM,
     MOST_LIKELY,
     RIVAL,
-    Change,
     InstrumentChange,
+    PossibleChange,
     chance_of,
     threshold,
 )
@@ -114,7 +114,7 @@ class CatalogueCheck(Displayed):
     rows: float | None
     rows_p: float
     scale: tuple[float, float]
-    tests: tuple[Change, ...]
+    tests: tuple[PossibleChange, ...]
     changes: tuple[InstrumentChange, ...]
     smallest: float
     growth: Growth = IN_UNITS
@@ -178,7 +178,7 @@ class CatalogueCheck(Displayed):
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
 
-        def entry(change: Change) -> dict[str, Any]:
+        def entry(change: PossibleChange) -> dict[str, Any]:
             return {key: getattr(change, key) for key in ("kind", "name", "unit", "size", "error", "sigma")}
 
         return {
@@ -272,10 +272,14 @@ class CatalogueSearch:
         units = {"flux": "per 1e6 electron", "light": "electron"}
         self.cameras = tuple(cameras)
         self.questions = [
-            Change(name, True, kind=kind, unit=units.get(kind, "")) for kind in kinds for name in cameras
+            PossibleChange(name, True, kind=kind, unit=units.get(kind, ""))
+            for kind in kinds
+            for name in cameras
         ]
         plain = stars.plain.shape[-1]
-        self.questions += [Change(name, False, kind="optics", unit=unit) for name, unit in parameters[:plain]]
+        self.questions += [
+            PossibleChange(name, False, kind="optics", unit=unit) for name, unit in parameters[:plain]
+        ]
         # Columns: those of the cameras, all parameters, two of the colours; from them questions and nuisances are made.
         count, shown = len(kinds) * len(cameras), len(root)
         questions, nuisances = count + plain, self.root.shape[1]
@@ -446,7 +450,7 @@ class CatalogueSearch:
     def _alarm(self) -> float:
         return ALARM / (self.asked + 2)
 
-    def _suspicious(self, look: _Look, tests: list[Change]) -> bool:
+    def _suspicious(self, look: _Look, tests: list[PossibleChange]) -> bool:
         """True if anything comes near an alarm."""
         near = 100.0 * self._alarm
         rows = 1.0 if look.rows is None else _chance_beside(look.rows, look.noise)
@@ -471,7 +475,7 @@ class CatalogueSearch:
 
     def _beside(
         self, matrix: Float[np.ndarray, "c c"], score: Float[np.ndarray, " c"], chosen: list[int]
-    ) -> list[Change]:
+    ) -> list[PossibleChange]:
         """Every question, alone beside `chosen`, which have no answer here."""
         free = [n for n in range(self.asked) if n not in chosen]
         order = [*free, *chosen, *range(self.asked, len(score))]
@@ -486,7 +490,7 @@ class CatalogueSearch:
     def _change(
         self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], asked: int
     ) -> InstrumentChange:
-        """Change that was found, and what describes the same residuals as well."""
+        """A detected change, and all that describe the same residuals as well."""
         away = np.zeros_like(sizes)
         away[asked] = sizes[asked]
         score = look.score + look.matrix @ away
@@ -497,7 +501,7 @@ class CatalogueSearch:
         ranked = sorted(alike, key=lambda entry: (entry.kind != "gain", -abs(entry.sigma)))
         return InstrumentChange(ranked[0], tuple(ranked))
 
-    def _smallest(self, tests: list[Change]) -> float:
+    def _smallest(self, tests: list[PossibleChange]) -> float:
         """The gain change of one camera that raises the alarm in 99 % of cases."""
         errors = [t.error for t in tests if t.kind == "gain" and np.isfinite(t.error)]
         return (threshold(self._alarm) + MOST_LIKELY) * min(errors) if errors else np.nan

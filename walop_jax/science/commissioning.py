@@ -90,24 +90,17 @@ def requirements(
 
 def is_go(asked: Sequence[Requirement]) -> bool:
     """True if everything that is needed is met."""
-    return all(requirement.met for requirement in asked if requirement.needed)
+    return all(need.met for need in asked if need.needed)
 
 
 def requirement_rows(asked: Sequence[Requirement]) -> tuple[tuple[str, str, str], ...]:
     """A row for each requirement: ok, NO where it is needed, no where it is advice; what is asked, what was found."""
     return tuple(
-        (
-            "ok" if requirement.met else "NO" if requirement.needed else "no",
-            requirement.what,
-            requirement.found,
-        )
-        for requirement in asked
+        ("ok" if need.met else "NO" if need.needed else "no", need.what, need.found) for need in asked
     )
 
 
 def requirement_advice(asked: Sequence[Requirement]) -> tuple[str, ...]:
     """Advice on requirements that are not met, what is needed first."""
-    ordered = sorted(asked, key=lambda requirement: not requirement.needed)
-    return tuple(
-        f"{requirement.found}: {requirement.advice}" for requirement in ordered if not requirement.met
-    )
+    ordered = sorted(asked, key=lambda need: not need.needed)
+    return tuple(f"{need.found}: {need.advice}" for need in ordered if not need.met)

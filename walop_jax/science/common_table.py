@@ -142,33 +142,29 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
     systematic = covariance - _covariance(rows["Q_PHOTON"], rows["U_PHOTON"], rows["QU_PHOTON"])
     longitude, latitude, north = galactic(ra, dec)
     qu_gal, covariance_gal = to_galactic(qu, covariance, north)
-    columns_made: dict[str, np.ndarray] = {
+    cells: dict[str, np.ndarray] = {
         "Name": designations(ra, dec), "GLON": longitude, "GLAT": latitude,
         "Inst": np.full(len(keep), str(source.table.meta.get("INSTRUME", "WALOP"))),
         "PA_gal": np.mod(number("EVPA")[keep] - north, 180.0),
     }  # fmt: skip
     if "MJD" in present and np.isfinite(number("MJD")[keep]).any():
-        columns_made["JD"] = number("MJD")[keep] + MJD_ZERO
+        cells["JD"] = number("MJD")[keep] + MJD_ZERO
     for end, matrix in (("", covariance), ("_sys", systematic), ("_gal", covariance_gal)):
-        columns_made[f"e_q{end}"], columns_made[f"e_u{end}"] = np.sqrt(
-            np.maximum(np.einsum("nii->in", matrix), 0.0)
-        )
-        columns_made[f"cov_qu{end}"] = matrix[:, 0, 1]
+        cells[f"e_q{end}"], cells[f"e_u{end}"] = np.sqrt(np.maximum(np.einsum("nii->in", matrix), 0.0))
+        cells[f"cov_qu{end}"] = matrix[:, 0, 1]
     for end, pair in (("", qu), ("_gal", qu_gal)):
-        columns_made[f"q{end}"], columns_made[f"u{end}"] = pair.T
+        cells[f"q{end}"], cells[f"u{end}"] = pair.T
     for name, entry in COLUMNS.items():
         if name == "Filter":
             rule = Column("str", missing="SDSS-r")
-            columns_made[name] = numeric_column(source, entry.of, rule)[keep]
+            cells[name] = numeric_column(source, entry.of, rule)[keep]
         elif name == "GaiaID" and entry.of in present:
-            columns_made[name] = np.asarray(source.table.columns[present.index(entry.of)])[keep]
+            cells[name] = np.asarray(source.table.columns[present.index(entry.of)])[keep]
         elif entry.of in present:
             column = number(entry.of)[keep]
-            columns_made[name] = column.astype(np.int64) if name in _WHOLE else column
+            cells[name] = column.astype(np.int64) if name in _WHOLE else column
     columns = {
-        name: (columns_made[name], entry.unit, entry.about)
-        for name, entry in COLUMNS.items()
-        if name in columns_made
+        name: (cells[name], entry.unit, entry.about) for name, entry in COLUMNS.items() if name in cells
     }
     carried = ("CALHASH", "PESTIM", "HOLDS", "TRUSTED", "ERRFROM")
     meta = {key: source.table.meta[key] for key in carried if key in source.table.meta}

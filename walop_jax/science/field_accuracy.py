@@ -91,12 +91,10 @@ class FieldAccuracy:
                 Shortfall("the calibration is not trusted", "walop-jax diagnose looks for what is missing"),
             )
         allowed, lacks = self.goal / 2, []
-        for name, mistake in unmeasured(self.not_measured).items():
-            if mistake.error[0] > allowed:
+        for name, gap in unmeasured(self.not_measured).items():
+            if gap.error[0] > allowed:
                 lacks.append(
-                    Shortfall(
-                        f"{name} not measured, {off_by(*mistake.error)} at the usual size", mistake.remedy
-                    )
+                    Shortfall(f"{name} not measured, {off_by(*gap.error)} at the usual size", gap.remedy)
                 )
         if self.reached > allowed:
             if self.without_u > 1.0 - SHARE and self.median <= allowed:
@@ -151,24 +149,15 @@ class FieldAccuracy:
         median_error += f"; below {goal} over {100 * self.share:.0f} % of the field"
         lines = [("p of a star", median_error if complete else f"{median_error}, if nothing were missing")]
         if complete:
-            verdict = [f"no: {lacks[0].what}", *(shortfall.what for shortfall in lacks[1:])] if lacks else []
+            verdict = [f"no: {lacks[0].what}", *(lack.what for lack in lacks[1:])] if lacks else []
             verdict = verdict or [f"yes: {two_digits(100 * self.reached)} % in {self.judged}"]
             lines += zip([f"good for {goal}", *[""] * (len(verdict) - 1)], verdict, strict=True)
-            lines += [
-                ("what to do", shortfall.advice) for shortfall in lacks[:1] if shortfall.advice != self.remedy
-            ]
+            lines += [("what to do", lack.advice) for lack in lacks[:1] if lack.advice != self.remedy]
         if self.limited_by:
             lines.append(("limited by", self.limited_by))
         if self.not_measured:
-            unmeasured_mistakes = unmeasured(self.not_measured).items()
-            lines.append(
-                (
-                    "not measured",
-                    "; ".join(
-                        f"{name}: {off_by(*shortfall.error)}" for name, shortfall in unmeasured_mistakes
-                    ),
-                )
-            )
+            gaps = unmeasured(self.not_measured).items()
+            lines.append(("not measured", "; ".join(f"{name}: {off_by(*lack.error)}" for name, lack in gaps)))
         if self.hidden > 0:
             lines += [("could hide", off_by(self.hidden, self.hidden_worst)), ("from", self.hidden_by)]
         if self.hidden > 0 and self.remedy:

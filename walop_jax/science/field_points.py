@@ -12,12 +12,7 @@ from jaxtyping import Bool, Float
 from walop_jax.data.schema import EXPOSURES, Column, check, finite
 from walop_jax.data.settings import TEMPERATURE, Settings
 from walop_jax.data.units import Place
-from walop_jax.data.user_tables import (
-    InputTable,
-    empty_cells,
-    numeric_column,
-    read_input_table,
-)
+from walop_jax.data.user_tables import InputTable, empty_cells, numeric_column, read_input_table
 from walop_jax.io.errors import rows_text
 from walop_jax.model.instrument import Instrument
 

@@ -45,20 +45,17 @@ class Gathered:
 
 
 def gather(
-    catalogues: Sequence[CameraCatalogue],
-    names: Sequence[str],
-    pointing: Pointing,
-    tolerance: float = 1.0,
+    catalogues: Sequence[CameraCatalogue], names: Sequence[str], pointing: Pointing, tolerance: float = 1.0
 ) -> Gathered:
     """One catalogue of the stars of all cameras; `names` are those of the cameras, `tolerance` is in arcsec.
 
     Raises `DataError` for catalogues of different fields, and for those that have too few stars in common.
     """
-    places = [_place(catalogue, pointing) for catalogue in catalogues]
+    places = [_place(camera, pointing) for camera in catalogues]
     moves = _registrations(catalogues, places, tolerance)
-    texts = dict.fromkeys(text for catalogue in catalogues for text in catalogue.remarks)
+    texts = dict.fromkeys(text for camera in catalogues for text in camera.remarks)
     remarks = [
-        f"{', '.join(str(catalogue.path) for catalogue in catalogues if text in catalogue.remarks)}: {text}"
+        f"{', '.join(str(camera.path) for camera in catalogues if text in camera.remarks)}: {text}"
         for text in texts
     ]
     remarks += _about_moves(moves, names, tolerance)
@@ -141,14 +138,14 @@ def _registrations(
 ) -> tuple[Registration, ...]:
     """Shift and rotation of each camera, against the median of all."""
     first, moves = catalogues[0], [NOT_MOVED]
-    for catalogue, place in zip(catalogues[1:], places[1:], strict=True):
-        move = registered(place, places[0], _brightness(catalogue), _brightness(first), tolerance)
+    for camera, place in zip(catalogues[1:], places[1:], strict=True):
+        move = registered(place, places[0], _brightness(camera), _brightness(first), tolerance)
         if not move.pairs:
             apart = 60.0 * np.hypot(*(np.median(place, axis=0) - np.median(places[0], axis=0)))
             what = f"has no stars in common with {first.path} within {REACH / 60.0:g} arcmin"
             where = f" (their centres are {apart:.2g} arcmin apart)" if apart > 1.0 else ""
             raise fail(
-                what + where, file=catalogue.path, advice="is it of the same field, and is its WCS right?"
+                what + where, file=camera.path, advice="is it of the same field, and is its WCS right?"
             )
         moves.append(move)
     shift = np.median([move.shift for move in moves], axis=0)
@@ -231,23 +228,15 @@ def _columns(
         )
 
     ra, dec = pointing.sky_of(*place.T)
-    flag = of_cameras([catalogue.flag for catalogue in catalogues], 0)
+    flag = of_cameras([camera.flag for camera in catalogues], 0)
     columns: Columns = {
         "RA": (ra, "deg", "right ascension, ICRS"),
         "DEC": (dec, "deg", "declination, ICRS"),
         "X": (place[:, 0], "deg", "field coordinate"),
         "Y": (place[:, 1], "deg", "field coordinate"),
         "ROTATOR": (pointing.rotator_at(ra, dec), "deg", "position angle of +X at the star"),
-        "N": (
-            of_cameras([catalogue.flux for catalogue in catalogues], np.nan),
-            "",
-            "electrons in each camera",
-        ),
-        "N_ERR": (
-            of_cameras([catalogue.error for catalogue in catalogues], np.nan),
-            "",
-            "standard errors of N",
-        ),
+        "N": (of_cameras([camera.flux for camera in catalogues], np.nan), "", "electrons in each camera"),
+        "N_ERR": (of_cameras([camera.error for camera in catalogues], np.nan), "", "standard errors of N"),
         "N_FLAG": (
             (flag | np.where(ambiguous, BLEND, 0)).astype(np.int32),
             "",
@@ -256,17 +245,17 @@ def _columns(
     }
     remarks = []
     for name, (unit, about) in OF_STARS.items():
-        with_column = [k for k, catalogue in enumerate(catalogues) if name in catalogue.of_stars]
+        with_column = [k for k, camera in enumerate(catalogues) if name in camera.of_stars]
         if not with_column:
             continue
         texts = name == "SOURCE_ID"
-        values_of_cameras = [
+        each_camera = [
             catalogues[k].of_stars.get(name) if k in with_column else None for k in range(len(catalogues))
         ]
         empty = "" if texts else np.nan
         filled = [
-            np.full(len(catalogue), empty, object if texts else float) if v is None else v
-            for catalogue, v in zip(catalogues, values_of_cameras, strict=True)
+            np.full(len(camera), empty, object if texts else float) if v is None else v
+            for camera, v in zip(catalogues, each_camera, strict=True)
         ]
         values, differ = _agreed(of_cameras(filled, empty), texts)
         if differ.any():
@@ -274,14 +263,14 @@ def _columns(
                 f"{name} is not the same in all cameras for {int(differ.sum())} stars: taken as unknown"
             )
         columns[name] = (_whole(values) if texts else values, unit, about)
-    for name in sorted({name for catalogue in catalogues for name in catalogue.of_exposure}):
-        values_of_cameras = {str(catalogue.of_exposure.get(name)) for catalogue in catalogues}
-        if len(values_of_cameras) > 1 and name != "MJD":
+    for name in sorted({name for camera in catalogues for name in camera.of_exposure}):
+        each_camera = {str(camera.of_exposure.get(name)) for camera in catalogues}
+        if len(each_camera) > 1 and name != "MJD":
             raise fail(
-                f"{name} is {' and '.join(sorted(values_of_cameras))} in catalogues of one exposure",
+                f"{name} is {' and '.join(sorted(each_camera))} in catalogues of one exposure",
                 advice="correct it",
             )
-        value = next(catalogue.of_exposure[name] for catalogue in catalogues if name in catalogue.of_exposure)
+        value = next(camera.of_exposure[name] for camera in catalogues if name in camera.of_exposure)
         columns[name] = (np.full(len(ra), value), "", "of the exposure")
     return columns, remarks
 

@@ -24,18 +24,12 @@ MOST_LIKELY = 2.33
 """Standard deviations above the alarm from which 99 % are detected (one-sided)."""
 UNNAMED = "unnamed"
 """Kind and name of a change that nothing in its range describes."""
-FIRST_DATE = 1e3  # times above are dates, not numbers of groups
 _UNEXPLAINED = "a change that no camera, arm or place of the field makes"
 _ONE_CATALOGUE = {
     "x": " at the edge of the field along +X",
     "y": " at the edge of the field along +Y",
     "time": " at the end of the catalogue than in its middle",
     "flux": " for every 10⁶ electrons",
-}
-_COURSES = {
-    "step": "from {} on",
-    "drift": "at the end, drifting since {}",
-    "once": "in the exposures of {} only",
 }
 
 
@@ -68,7 +62,7 @@ class History(NamedTuple):
 ALL_ALONG = History("step", 0)
 
 
-class Change(NamedTuple):
+class PossibleChange(NamedTuple):
     """A possible change: of cameras or of a number of the optics, by how much, and since when.
 
     `kind` is gain (a camera), arm (its cameras together, NAME+NAME), gradient or spot (of a camera or an arm), optics,
@@ -131,11 +125,11 @@ class Change(NamedTuple):
 class InstrumentChange:
     """A change since the calibration: the simplest description, and all that describe the stars alike (it included)."""
 
-    best: Change
-    alike: tuple[Change, ...]
+    best: PossibleChange
+    alike: tuple[PossibleChange, ...]
 
     @property
-    def rivals(self) -> tuple[Change, ...]:
+    def rivals(self) -> tuple[PossibleChange, ...]:
         """Descriptions of other cameras or numbers of the optics, each once."""
         return tuple({entry.thing: entry for entry in self.alike if entry.thing != self.best.thing}.values())
 
@@ -144,40 +138,9 @@ class InstrumentChange:
         text = f"changed since the calibration, {abs(self.best.sigma):.0f} σ: {self.best.words()}"
         if not self.rivals:
             return text
-        return f"{text}. These rows cannot distinguish it from {_listed(self.rivals, 4, ', ')}"
+        return f"{text}. These rows cannot distinguish it from {listed(self.rivals, 4, ', ')}"
 
 
-@dataclasses.dataclass(frozen=True)
-class WatchedChange(InstrumentChange):
-    """A change and when it began (MJD, or the number of the group).
-
-    That is at `time`, or, as others describe the stars as well, at any `between` the first and the last of theirs.
-    """
-
-    time: float = np.nan
-    between: tuple[float, float] = (np.nan, np.nan)
-
-    @property
-    def camera(self) -> str | None:
-        """The camera, if it is one and no other, and not the optics."""
-        names = {entry.name for entry in self.alike}
-        single = len(names) == len(self.best.members) == 1 and self.best.kind != UNNAMED
-        return self.best.name if single else None
-
-    def words(self) -> str:
-        """The change in a sentence."""
-        date, *ends = (
-            f"MJD {time:.4f}" if time > FIRST_DATE else f"group {time:g}"
-            for time in (self.time, *self.between)
-        )
-        when = _COURSES[self.best.history.kind].format(date)
-        spread = f"; it began between {ends[0]} and {ends[1]}" if ends[0] != ends[1] else ""
-        significance = f"({abs(self.best.sigma):.0f} σ{spread})"
-        if not self.rivals:
-            return f"{self.best.words()} {when} {significance}"
-        listed = _listed((self.best, *self.rivals), 5, " or ")
-        return f"{when} {significance}, one of these, which the stars cannot tell apart: {listed}"
-
-
-def _listed(changes: Iterable[Change], most: int, between: str) -> str:
+def listed(changes: Iterable[PossibleChange], most: int, between: str) -> str:
+    """The first of some changes in words, and how many more there are."""
     return some([change.words() for change in changes], most, between)

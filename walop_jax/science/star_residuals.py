@@ -193,10 +193,7 @@ Columns = Callable[[StarResiduals, slice], Float[np.ndarray, "r k c"]]
 
 
 def normal_matrix(
-    stars: StarResiduals,
-    residual: Float[np.ndarray, "r k"],
-    columns: Columns,
-    weights: Weights,
+    stars: StarResiduals, residual: Float[np.ndarray, "r k"], columns: Columns, weights: Weights
 ) -> tuple[Matrix, Float[np.ndarray, " c"]]:
     """Q and g (head of this file) of columns; `residual` is that of `stars`, with or without changes."""
     matrix, score, diagonal = np.zeros((0, 0)), np.zeros(0), np.zeros(0)

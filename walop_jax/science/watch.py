@@ -45,9 +45,8 @@ from walop_jax.science.instrument_changes import (
     MOST_LIKELY,
     RIVAL,
     UNNAMED,
-    Change,
     History,
-    WatchedChange,
+    PossibleChange,
     threshold,
 )
 from walop_jax.science.star_residuals import (
@@ -68,7 +67,7 @@ from walop_jax.science.star_residuals import (
     of_few,
     own_variance,
 )
-from walop_jax.science.watch_found import Watch
+from walop_jax.science.watch_found import Watch, WatchedChange
 from walop_jax.science.watch_readings import Answers, Readings
 from walop_jax.science.watch_spots import SpotFound, Spots, of_stars, profile
 
@@ -346,10 +345,10 @@ class Watching:
     def _errors(self, part: StarResiduals) -> Float[np.ndarray, "r k n"]:
         return np.concatenate([part.parameters() @ self.root, part.colour], axis=-1)
 
-    def suspects(self, found: Answers) -> list[Change]:
+    def suspects(self, found: Answers) -> list[PossibleChange]:
         """Every reading with the histories compared, the most significant first; those too large for theirs last."""
         listed = [
-            Change(
+            PossibleChange(
                 reading.name, reading.kind != "optics", self.histories[n], float(found.size[n, k]),
                 float(found.error[n, k]), reading.unit, reading.kind,
                 () if reading.across is None else (float(found.angle[n, k]),),
@@ -361,7 +360,7 @@ class Watching:
         return sorted(listed, key=lambda entry: (not self.readings.possible(entry), -abs(entry.sigma)))
 
     def without(
-        self, residual: Float[np.ndarray, "r k"], change: Change, size: float
+        self, residual: Float[np.ndarray, "r k"], change: PossibleChange, size: float
     ) -> Float[np.ndarray, "r k"]:
         """Residuals behind a change."""
         grown = change.history.over(self.time)[self.group, None] * size
@@ -432,7 +431,7 @@ class Watching:
         Histories compared are the best of each kind and camera and their neighbours. The fit is repeated with the
         stars that it keeps.
         """
-        best: Change | None = None
+        best: PossibleChange | None = None
         total, remaining, alike = 0.0, residual, []
         for _ in range(_ROUNDS):
             if best is not None:
@@ -459,7 +458,7 @@ class Watching:
             alike = [best]
         return self._dated(best, alike), remaining
 
-    def _dated(self, best: Change, alike: list[Change]) -> WatchedChange:
+    def _dated(self, best: PossibleChange, alike: list[PossibleChange]) -> WatchedChange:
         began = self.time[[entry.history.start for entry in alike]]
         when = float(self.time[best.history.start]), (float(began.min()), float(began.max()))
         return WatchedChange(best, tuple(alike), *when)
@@ -483,7 +482,7 @@ class Watching:
         spot, start, z, root = strongest
         place, described = self.spots.refined(spot, z, root)
         name, since = self.readings.of_cameras[spot.unit].name, History("step", start)
-        ranked = [Change(name, True, since, kind="spot", place=place)]
+        ranked = [PossibleChange(name, True, since, kind="spot", place=place)]
         weights = weights._replace(inverse=np.where(described, of_all.inverse, weights.inverse))
         for _ in range(2):  # which cameras, and from when on
             best = ranked[0]
@@ -498,8 +497,8 @@ class Watching:
         return self._dated(best, alike), self.without(residual, best, best.size)
 
     def _sized(
-        self, residual: Float[np.ndarray, "r k"], asked: list[Change], weights: Weights
-    ) -> list[Change]:
+        self, residual: Float[np.ndarray, "r k"], asked: list[PossibleChange], weights: Weights
+    ) -> list[PossibleChange]:
         """Changes with size and error, each alone, the most significant first; without those that no star sees."""
 
         def columns(part: StarResiduals, rows: slice) -> Float[np.ndarray, "r k c"]:

@@ -12,10 +12,48 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import two_digits, with_minus_sign
 from walop_jax.science.catalogue_check import NOISE_MATTERS
-from walop_jax.science.instrument_changes import FIRST_DATE, Change, WatchedChange
+from walop_jax.science.instrument_changes import UNNAMED, InstrumentChange, PossibleChange, listed
 
 SCATTERED = 4.0
 """χ² per degree of freedom from which stars in which no change is found do not say that a calibration holds."""
+FIRST_DATE = 1e3  # times above are dates, not numbers of groups
+_COURSES = {
+    "step": "from {} on",
+    "drift": "at the end, drifting since {}",
+    "once": "in the exposures of {} only",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class WatchedChange(InstrumentChange):
+    """A change and when it began (MJD, or the number of the group).
+
+    That is at `time`, or, as others describe the stars as well, at any `between` the first and the last of theirs.
+    """
+
+    time: float = np.nan
+    between: tuple[float, float] = (np.nan, np.nan)
+
+    @property
+    def camera(self) -> str | None:
+        """The camera, if it is one and no other, and not the optics."""
+        names = {entry.name for entry in self.alike}
+        single = len(names) == len(self.best.members) == 1 and self.best.kind != UNNAMED
+        return self.best.name if single else None
+
+    def words(self) -> str:
+        """The change in a sentence."""
+        date, *ends = (
+            f"MJD {time:.4f}" if time > FIRST_DATE else f"group {time:g}"
+            for time in (self.time, *self.between)
+        )
+        when = _COURSES[self.best.history.kind].format(date)
+        spread = f"; it began between {ends[0]} and {ends[1]}" if ends[0] != ends[1] else ""
+        significance = f"({abs(self.best.sigma):.0f} σ{spread})"
+        if not self.rivals:
+            return f"{self.best.words()} {when} {significance}"
+        either = listed((self.best, *self.rivals), 5, " or ")
+        return f"{when} {significance}, one of these, which the stars cannot tell apart: {either}"
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -60,7 +98,7 @@ class Watch(Displayed):
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
 
-        def plain(entry: Change) -> dict[str, Any]:
+        def plain(entry: PossibleChange) -> dict[str, Any]:
             start = float(self.time[entry.history.start])
             return entry._asdict() | {"history": entry.history.kind, "start": start, "sigma": entry.sigma}
 
