@@ -222,7 +222,7 @@ def _counted(alone: bool) -> dict[Any, str]:
 
 
 def _about_noise(counts: Any, sigma: Any) -> Iterator[str]:
-    """A sentence where errors of bright stars are as large as what they count."""
+    """A sentence where errors of bright stars are as large as their counts."""
     import numpy as np
 
     bright = counts > BRIGHT

@@ -1,4 +1,4 @@
-"""`walop-jax certify`: is this calibration fit for use? Go or no-go, with what is missing."""
+"""`walop-jax certify`: is this calibration fit for use? Go or no-go, with advice."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FOLDER = Option(f"Folder for {DOCUMENT}; it may be that of the fit.", "RUN", Pat
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Certificate(Displayed):
-    """The checks of a product and what is asked of it for stars, its range of application, hash, and parents.
+    """The checks of a product and its requirements for stars, its range of application, hash, and parents.
 
     `content` is its content hash, `parents` are the SHA-256 of its inputs.
     """
@@ -51,7 +51,7 @@ class Certificate(Displayed):
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Advice on requirements that are not met, what is needed first."""
+        """Advice on requirements that are not met, the needed ones first."""
         from walop_jax.science.commissioning import requirement_advice
 
         return requirement_advice(self.requirements)
@@ -73,7 +73,7 @@ class Certificate(Displayed):
         }
 
     def display(self) -> Display:
-        """Go or no-go, a line for each check and requirement, and what is missing."""
+        """Go or no-go, a line for each check and requirement, and advice on those that are not met."""
         from walop_jax.science.commissioning import requirement_rows
 
         rows = [("ok" if check.passed else "FAILED", check.name, check.found) for check in self.checks]
@@ -98,7 +98,7 @@ def certify(
 
     A go needs a fit that converged and explains the data, exposures that are enough for a fit, and p of stars (p ≤ 5 %)
     known to 0.05 % in half of the field by the calibration alone; else it is a no-go, exit code 3. How well p is known
-    in 95 % of the field, what else the exposures lack, and mistakes that they would not show, are told with what to do.
+    in 95 % of the field, gaps in the exposures, and mistakes that they would not show, are reported with a remedy.
     To rehearse a night, give the fit of a set of walop-jax simulate PLAN.
 
     In Python: a `Certificate`. Raises `DataError` for a file that cannot be read, has been changed, or is of another

@@ -1,4 +1,4 @@
-"""`walop-jax diagnose`: find what the model lacks, name it, add it, show the gap shrink."""
+"""`walop-jax diagnose`: find effects missing from the model, name and add them, show the gap shrink."""
 
 from __future__ import annotations
 

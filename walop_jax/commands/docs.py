@@ -23,7 +23,7 @@ def docs(
 
     Recipes, conventions, file formats, the model, effects, how to add an effect or an instrument, vocabulary, sources;
     and `effect NAME` or `element NAME` for a page about a single one: equation, parameters, at what size it is found,
-    what it can be confused with.
+    its rivals.
 
     In Python: its text.
 

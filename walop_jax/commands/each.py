@@ -1,7 +1,7 @@
 """A command for each of many files, in this process or by the workers of an executor (`nights.making.executor_of`).
 
-An output appears whole or not at all, and one that is there is not made again, so that what was interrupted goes on
-with the same command.
+An output appears whole or not at all, and one that is there is not made again, so that an interrupted command goes on
+when it is typed again.
 """
 
 from __future__ import annotations

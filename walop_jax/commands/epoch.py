@@ -1,4 +1,4 @@
-"""`walop-jax epoch`: does last month's calibration still fit, and what has moved?"""
+"""`walop-jax epoch`: does last month's calibration still fit, and which parameters have moved?"""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from walop_jax.science.epoch import Epoch
 
 OLD = Argument("Old calibration product, or folder of a run.", "OLD", Path)
-FOLDER = Option("Folder for the new calibration and what was found.", "RUN", Path, "-o")
+FOLDER = Option("Folder for the new calibration and the comparison.", "RUN", Path, "-o")
 OUTPUTS = ("calibration.fits", "epoch.json")
 
 
@@ -29,10 +29,10 @@ def epoch(
 ) -> Outcome[Epoch]:
     """Fit new calibration sets and compare with an old calibration: is the instrument still the same?
 
-    Says what has changed by how much, and how far off stars would be if the old calibration were still used; lists the
-    parameters by how far they have moved, and tests all of them together. The new fit is that of the old model: plates,
-    effects, priors and what is held. Where that does not explain the new data and did explain the old ones, what is
-    missing is looked for as walop-jax diagnose does, and the old calibration is compared with the model found.
+    Reports the changes with their sizes, and how far off stars would be if the old calibration were still used; lists
+    the parameters by how far they have moved, and tests all of them together. The new fit is that of the old model:
+    plates, effects, priors and what is held. Where that does not explain the new data and did explain the old ones,
+    what is missing is looked for as walop-jax diagnose does, and the old calibration is compared with the model found.
 
     Exit code 0 only where the old calibration still holds; 3 where something has moved, or where the new data are not
     explained.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from walop_jax import CalibrationSet
 
 FOLDER = Argument('Folder of "Polarization Transmission" text exports.', "FOLDER", Path)
-INSTRUMENT = Option("Which instrument; default: what the titles say.", kind=str)
+INSTRUMENT = Option("Which instrument; default: that of the titles.", kind=str)
 CAMERAS = Option("Configurations of the design that are the cameras.", "O1,E1,O2,E2", str)
 ERROR = Option("Error of a transmission, as a share of it: how far to trust the design.")
 
@@ -36,7 +36,7 @@ def import_zemax(
 
     Rows that lack a camera are left out, transmissions of 0 are flagged, with a warning in both cases.
 
-    In Python: the set; its `remarks` say what was left out.
+    In Python: the set; its `remarks` name the rows that were left out.
 
     >>> design = walop.import_zemax("exports")  # doctest: +SKIP
     """

@@ -1,7 +1,7 @@
 """Arguments that several commands take, on the command line and in Python, and their readers.
 
 Sets, models, calibrations and tables may be given in memory or as files; `read` reads whatever the program has written.
-What is given in place of one of them is a TypeError: what it is, and what to give.
+Anything else is a TypeError with advice.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ EFFECTS = Option(
 
 Sets = Annotated["CalibrationSet | PathLike | Sequence[PathLike]", SETS]
 ModelLike = Annotated[
-    "Model | PathLike | None", Option("Model file: what is free, tied, known, added.", "MODEL.toml", Path)
+    "Model | PathLike | None",
+    Option("Model file: parameters free, tied, held; effects added.", "MODEL.toml", Path),
 ]
 InstrumentLike = Annotated[
     "Instrument | PathLike | None",
@@ -152,7 +153,7 @@ def catalogue_of(effects: Effects) -> tuple[EffectKind, ...]:
 
 
 def path_of(given: Any, what: str, advice: str) -> Path:
-    """A path. Raises TypeError for what is none and stands for `what`; `advice` says what to give."""
+    """A path. Raises TypeError, with `advice`, for anything else in place of `what`."""
     if not isinstance(given, str | os.PathLike):
         raise TypeError(f"{reprlib.repr(given)} is not {what}; give {advice}")
     return Path(given)
@@ -212,7 +213,7 @@ def set_and_model(
     """Calibration sets as one, and the model to fit to them.
 
     `model` is one, or a model file (None: the base model); `instrument` as designed, or its name or description file
-    (None: what the sets say); `effects` are those that a model file may name. With `output` the folder of a
+    (None: that of the sets); `effects` are those that a model file may name. With `output` the folder of a
     run is written: it is made from files, so that it can be made again.
 
     Raises `DataError` for files that cannot be read, ValueError, naming the file, for a model that does not fit.
@@ -382,7 +383,7 @@ def table_outcome(
     extra: Mapping[str, Any] | None = None,
     remade: Callable[[Any], tuple[Any, Sequence[str]]] | None = None,
 ) -> Outcome[Any]:
-    """A table with what a calibration adds to it, written if it has an output.
+    """A table with the columns of a calibration, written if it has an output.
 
     The bits of FLAG that are `counted` have a warning each, unless it is empty; `extra` goes into the document. Columns
     of the table that are not used or are replaced are named. `remade` makes another table of that, with remarks.

@@ -1,4 +1,4 @@
-"""`walop-jax inspect`: what is in calibration sets, and what is wrong with them."""
+"""`walop-jax inspect`: contents and faults of calibration sets."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def inspect(
 
     Each file by itself; then whether they can be fitted as one. Exit code 1 if any cannot be read or fitted.
 
-    In Python: an `InspectedSets`. Raises `DataError` only if the sets cannot be one: what is wrong with a single file
-    is among its faults.
+    In Python: an `InspectedSets`. Raises `DataError` only if the sets cannot be one: errors of a single file are
+    among its faults.
 
     >>> walop.inspect("night.fits").faults
     ()

@@ -21,9 +21,9 @@ def instrument(
     The description is read, every element is made, and light is sent through it on the axis and at the edge of the
     field. Without a name the instruments that come with the package are listed.
 
-    In Python: a `CheckedInstrument`, whose `instrument` is the instrument; without a name, what each is, by name; with
-    `text`, the description. Raises `DataError` for a description that is wrong, and for optics that are not finite or
-    give more light than came in.
+    In Python: a `CheckedInstrument`, whose `instrument` is the instrument; without a name, a line about each, by name;
+    with `text`, the description. Raises `DataError` for a description that is wrong, and for optics that are not finite
+    or give more light than came in.
 
     >>> print(walop.instrument("WALOP-SOUTH"))
     WALOP-SOUTH: 4 cameras (O1, E1, O2, E2)

@@ -1,4 +1,4 @@
-"""`walop-jax limits`: what a calibration set can show, before anything is found in it."""
+"""`walop-jax limits`: sizes of effects that a calibration set can show, before anything is found in it."""
 
 from __future__ import annotations
 

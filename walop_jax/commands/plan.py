@@ -26,12 +26,12 @@ FOLDER = Option(f"Folder for {PLAN} and plan.json; without it the plan is printe
 What = Annotated[
     "ObservingPlan | FitResult | Calibration | Diagnosis | Run | PathLike",
     Argument(
-        "What could be observed: a plan file, an instrument by name, or the RUN to add to.",
+        "Candidate exposures: a plan file, an instrument by name, or the RUN to add to.",
         "PLAN.toml|INSTRUMENT|RUN",
         Path,
     ),
 ]
-More = Annotated[Any, Option("What could be observed, of a RUN or an instrument.", "PLAN.toml", Path)]
+More = Annotated[Any, Option("Candidate exposures of a RUN or an instrument.", "PLAN.toml", Path)]
 After = Annotated[Any, Option("A calibration that is there already: plan what to add to it.", "RUN", Path)]
 Minutes = Annotated[
     float,
@@ -40,7 +40,7 @@ Minutes = Annotated[
 Criterion = Annotated[
     Any,
     Option(
-        "What is to be known best: worst (default: the largest error of p over field and colour), mean, a parameter, "
+        "Quantity to be known best: worst (default: the largest error of p over field and colour), mean, a parameter, "
         "a table of stars (X, Y in degrees, Q, U), or apart: effects that --apart names, or those that a diagnosis of "
         "RUN could not tell apart.",
         "NAME|TABLE",
@@ -84,10 +84,10 @@ def plan(
 ) -> Outcome[ExposurePlan]:
     """Plan the calibration exposures of a night: those that make the error of p smallest where it is largest.
 
-    What could be observed is said by a plan file (see `walop-jax docs files`): filters, settings of the calibration
+    Candidate exposures are given by a plan file (see `walop-jax docs files`): filters, settings of the calibration
     plate, Moon patches, standards, exposure times, costs. The polariser may stand at any angle; so may the plate, of an
     INSTRUMENT, of a RUN, or where the file says so. Printed are the exposures in order, the errors that they promise,
-    and what no plan of the same time could undercut, which is proven. RUN/plan.toml is the plan for `simulate` and
+    and a proven bound that no plan of the same time undercuts. RUN/plan.toml is the plan for `simulate` and
     `limits`, RUN/plan.json holds all numbers; --schedule writes it for the telescope.
 
     In Python: the plan. Raises ValueError for a time that pays for nothing or determines nothing.

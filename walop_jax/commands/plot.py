@@ -51,10 +51,10 @@ def plot(
     half-wave plates, camera transmissions, corner plots, and others. The format follows the name of the file.
 
     In Python: the matplotlib figure, of a run or of a fit, calibration, diagnosis or posterior in memory, written if
-    `output` is given; without a name, what each figure shows, by name. `figsize` (inches) is its size; with `ax` it is
-    drawn there (one of several panels in a subfigure that takes the room of these axes). `width` is that in print (mm,
-    "column" or "page"): panels are arranged for it. `reference` holds values by name that a corner plot marks.
-    Raises `DataError`, with the nearest names, for a figure that does not exist and for what the run lacks.
+    `output` is given; without a name, a line about each figure, by name. `figsize` (inches) is its size; with `ax` it
+    is drawn there (one of several panels in a subfigure that takes the room of these axes). `width` is that in print
+    (mm, "column" or "page"): panels are arranged for it. `reference` holds values by name that a corner plot marks.
+    Raises `DataError`, with the nearest names, for a figure that does not exist and for data that the run lacks.
 
     >>> walop.plot()["modulation"]
     'q_m and u_m against polariser angle'

@@ -219,7 +219,7 @@ def _run(command: Command[Any], given: dict[str, Any]) -> None:
 
 
 def _next_steps(command: Command[Any], given: dict[str, Any]) -> tuple[str, ...]:
-    """The lines of `NEXT` for what was given; those that need an output which was not written are left out."""
+    """The lines of `NEXT` for the given arguments; those that need an output which was not written are left out."""
     words = {
         name: " ".join(map(str, value)) if isinstance(value, list) else str(value)
         for name, value in given.items()
@@ -240,7 +240,7 @@ def _show(found: Outcome[Any], quiet: bool, json: bool) -> None:
     elif not quiet and (text := found.printed()):
         _print(text, found.markdown)
         if found.next and not found.failure:
-            # On stderr: what is on stdout may be redirected into a file.
+            # On stderr: stdout may be redirected into a file.
             typer.echo(f"Done in {seconds_since_start():.0f} s. Next: {' or '.join(found.next)}", err=True)
     if found.failure:
         sys.stdout.flush()
@@ -298,7 +298,7 @@ def warn(message: str) -> None:
 
 @contextlib.contextmanager
 def progress(quiet: bool, stages: Sequence[str] = ()) -> Iterator[Callable[[str], None]]:
-    """Give a function that shows on stderr what is being done and for how long: on a terminal in a line that goes.
+    """Give a function that shows progress and time on stderr: on a terminal in a line that goes.
 
     Elsewhere a line is printed when there has been none for `LINE_EVERY` seconds. `stages` are those of the work, in
     their order: they are counted. A message that knows its share of the work (`share`) moves a bar.

@@ -62,10 +62,10 @@ def sample(
     priors, sampler, settings or versions have changed. Other samplers start anew. A chain that has not converged is
     written and marked so, with exit code 1; the covariance of the fit then stays in calibration.fits.
 
-    In Python: a `PosteriorSample`, of a fit in memory or of a run, which is then written. `parameters` names what is
-    sampled (None: the physics coefficients); `options` (`walop.Options`) are all settings at once, with those that the
-    command line does not have, in place of the others and of `seed`.
-    Raises `DataError` if the run is no folder of a fit, holds a posterior already, or does not fit its data any more.
+    In Python: a `PosteriorSample`, of a fit in memory or of a run, which is then written. `parameters` names the
+    sampled ones (None: the physics coefficients); `options` (`walop.Options`) are all settings at once, with those that
+    the command line does not have, in place of the others and of `seed`. Raises `DataError` if the run is no folder of
+    a fit, holds a posterior already, or does not fit its data any more.
 
     >>> walop.sample(result, seed=1).to_arviz()  # doctest: +SKIP
     """

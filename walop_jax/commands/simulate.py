@@ -65,8 +65,9 @@ def simulate(
 ) -> Outcome[Simulated]:
     """Make a calibration set of an instrument whose as-built values are drawn from their priors.
 
-    The light path is the one that a fit uses; noise is that of photons and of the detectors (30 electrons). What is
-    observed is said by a plan file (see walop-jax docs files): field points, angles, Moon patches, standards, filters.
+    The light path is the one that a fit uses; noise is that of photons and of the detectors (30 electrons). The
+    exposures are those of a plan file (see walop-jax docs files): field points, angles, Moon patches, standards,
+    filters.
 
     Nights of one instrument, to rehearse epoch, stack and watch on: --like TRUTH.json --night 10. Each night has
     noise and weather of its own, also with the same seed.

@@ -1,4 +1,4 @@
-"""`walop-jax stack`: many nights of one instrument under laws of time, and what has changed between them."""
+"""`walop-jax stack`: many nights of one instrument under laws of time, and the changes between them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 NIGHTS = Argument("Calibration sets, folders of refit, or a SURVEY.", "NIGHT...", list[Path])
 LAWS = Option("Model file with [law] tables (default: that of the first fit).", "MODEL.toml", Path)
 LIKE = Option("Fit with the model of all nights (default: the first RUN or SURVEY given).", "RUN", Path)
-EVENTS = Option("Table of what was done to the instrument: MJD, WHAT.", "TABLE", Path)
+EVENTS = Option("Table of works on the instrument: MJD, WHAT.", "TABLE", Path)
 KNOWN = Option("Do not look for breaks.")
 WORKERS = Option("Make nights in so many processes of this machine, by Dask.", "N", int, least=1)
 SCHEDULER = Option("Make nights on the workers of a Dask cluster that share the files.", "ADDRESS", str)
@@ -41,8 +41,9 @@ def stack(
 
     Breaks of any parameter, or of an effect that the model lacks, are looked for, named and dated, and become laws.
     Laws stand in the [law] tables of a model file: a value for each night or file, a random walk, intervals, steps,
-    drifts, annual terms; what has none is shared by all nights (walop-jax docs nights). A night is linearised at the
-    values of a fit, and again at the common solution; its normal equations are kept, so that it need not be read again.
+    drifts, annual terms; parameters without one are shared by all nights (walop-jax docs nights). A night is linearised
+    at the values of a fit, and again at the common solution; its normal equations are kept, so that it need not be read
+    again.
 
     SURVEY holds the nights (nights.fits), every parameter against time (tracks.fits), the calibration of the last
     night (calibration.fits), that about which nights are linearised, with the laws (reference.fits), and survey.json.

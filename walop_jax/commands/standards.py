@@ -65,7 +65,7 @@ def _direction(near: str | tuple[float, float]) -> tuple[float, float]:
 
 
 def _plain(value: Any) -> Any:
-    """A cell as JSON has it; what is not known is null."""
+    """A cell as JSON has it; unknown values are null."""
     plain = getattr(value, "value", value)
     plain = plain.item() if hasattr(plain, "item") else plain
     return None if plain != plain else plain

@@ -33,7 +33,7 @@ def watch(
     without MJD are a group each, in their order. Steps, drifts and single exposures of cameras and arms are looked for,
     as a whole, growing over the field, or in a spot of it, with their size, date, and the smallest that would have been
     seen. Stars that are seen at several settings of the plate or the rotator tell which camera it is; others hardly
-    can. What the optics may have done as well is told.
+    can. Changes of the optics that explain the stars as well are reported.
 
     Exit code 0 only where the calibration still holds, 3 where it does not.
 

@@ -4,9 +4,9 @@ A unit (the exposures of one file in one night) says of the values θ of all par
 
     χ²_u(θ) = χ²_u + 2 g_uᵀ θ + θᵀ H_u θ,        θ = D_u x,
 
-with D_u what the laws make of the unknowns x: `globals`, each with a function of time, and locals, that belong to one
-cell, which is a night, or several that a file joins. With A the equations of the globals, T those of the locals (block
-tridiagonal, as a random walk couples neighbours and nothing else does) and B what lies between,
+with D_u the design of the laws for the unknowns x: `globals`, each with a function of time, and locals, that belong to
+one cell, which is a night, or several that a file joins. With A the equations of the globals, T those of the locals
+(block tridiagonal, as a random walk couples neighbours and nothing else does) and B the block between them,
 
     S_c  = T_c − C_c S_{c−1}⁻¹ C_cᵀ,      B'_c = B_c − C_c S_{c−1}⁻¹ B'_{c−1}          forwards
     K    = A − Σ B'_cᵀ S_c⁻¹ B'_c                                                      the globals
@@ -77,7 +77,7 @@ class Cell(NamedTuple):
 
 
 class Eliminated(NamedTuple):
-    """A cell in the elimination: its own block and border, coupling to the cell before, what is left of both."""
+    """A cell in the elimination: its own block and border, coupling to the cell before, and both reduced."""
 
     block: Matrix
     border: Float[np.ndarray, "_ _"]
@@ -257,7 +257,7 @@ def solve(system: System) -> Solution:
         coupling = _walks(system, cell, before, block, rows_of)
         rows_of.append((block, border, rhs, coupling))
         before = cell
-    # Forwards. A block knows what the walk to the next cell adds to it only when that cell was made.
+    # Forwards, after all blocks: the walk to the next cell adds to a block.
     done: list[Eliminated] = []
     for cell, (block, border, rhs, coupling) in zip(system.cells, rows_of, strict=True):
         left_block, reduced, remainder = block, border, rhs

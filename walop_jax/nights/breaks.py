@@ -1,7 +1,7 @@
-"""Breaks: what has changed, when, by how much, and what else it may be. Asked of a stack, not of its data.
+"""Breaks: changes with dates, sizes and rivals. Asked of a stack, not of its data.
 
 A change of any parameter or candidate is a step at the boundary of two nights, one bad night, or a drift. Its z and
-size come from `changes`, with everything else fitted anew: what a random walk may do by itself is no break. The largest
+size come from `changes`, with everything else fitted anew: the course of a random walk is no break. The largest
 |z| of all is one if chance makes one as large in less than `CHANCE` of series:
 
     P(max |z| ≥ u)  ≤  Σ P(|z_i| ≥ u)  −  Σ_(i,k) P(|z_i| ≥ u, |z_k| ≥ u)

@@ -4,7 +4,7 @@
 
 of the data alone: priors are laid on when nights are stacked, once. J holds the derivatives of the normalised residuals
 r, fluxes eliminated, with respect to the free parameters and to the amplitudes of effects that the model lacks (at 0):
-what is not in the model can be asked for afterwards without the data. So can the throughput that is held because the
+effects beyond the model can be tested afterwards without the data. So can the throughput that is held because the
 fluxes take it up: held in every night it is no gauge of what changes between them, as its camera may be the one that
 does.
 
@@ -60,7 +60,7 @@ class Night:
     """The normal equations of one file in one night.
 
     `number` is the MJD of the evening, `begin`, `end` and `mjd` (UTC) the first, last and mean exposure; `source` and
-    `sha256` the data, `model` a hash of what the model holds fixed. `dof` counts data less fluxes. The last parameters
+    `sha256` the data, `model` a hash of the fixed part of the model. `dof` counts data less fluxes. The last parameters
     are `candidates`, amplitudes beyond the model with reference 0; `gradient` and `matrix` are halves of the
     derivatives of `chi2`.
     """
@@ -352,7 +352,7 @@ def _bytes(record: object) -> bytes:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Together:
-    """Nights in the order of time, with equations in the parameters of all: what a stack is solved from.
+    """Nights in the order of time, with equations in the parameters of all: the input of a stack.
 
     `origin` are the values that equations count from; `mean` and `width` (inf: none) the priors in the same way.
     """
@@ -371,7 +371,7 @@ class Together:
         return tuple(p.name for p in self.parameters)
 
     def aligned(self) -> list[Night]:
-        """The nights in the parameters of all, about the common origin: what a file of nights can hold together."""
+        """The nights in the parameters of all, about the common origin, as a file of nights holds them."""
         e, up = self.equations, 1.0 / self.equations.scale
         return [
             dataclasses.replace(
@@ -383,7 +383,7 @@ class Together:
 
     @property
     def reference(self) -> Float[np.ndarray, "u n"]:
-        """The values that every night was linearised at; the origin for what a night does not know."""
+        """The values that every night was linearised at; the origin for parameters that a night lacks."""
         values, place = np.tile(self.origin, (len(self.nights), 1)), {n: k for k, n in enumerate(self.names)}
         for u, night in enumerate(self.nights):
             values[u, [place[name] for name in night.names]] = night.reference

@@ -1,4 +1,4 @@
-"""From what users have to a survey: nights are made of fits, runs and sets, stacked, and kept in a folder.
+"""Surveys from fits, runs and sets: nights are made, stacked, and kept in a folder.
 
 The files of a survey: docs, files. Nights that are made lie in its folder `partial` until all are.
 """
@@ -57,7 +57,7 @@ PARTIAL = "partial"
 
 
 class _Opened(NamedTuple):
-    """Nights as given, or data that they can be made of, with what comes with them."""
+    """Nights as given, or data that they can be made of, with their fit, breaks and events."""
 
     nights: list[Night]
     data: Data | None = None
@@ -80,16 +80,16 @@ def stack(
 ) -> Survey:
     """Fit all nights together under laws of time, from their normal equations.
 
-    Nights are fits, calibration sets (linearised at the values of `like`, no fit is needed), or what was kept of them.
+    Nights are fits, calibration sets (linearised at the values of `like`, no fit is needed), or kept nights.
     `laws` are as the [law] tables of `model.laws`, or a file with them, by default those of the model of `like`; a
     parameter without one is shared by all nights. `like` is a calibration of their model, by default the first that is
     given. Sets and fits are linearised again at the common solution until none is far from it; kept nights cannot be.
-    With `find` breaks are looked for in three nights and more, and become laws. `events` is a table of what was done to
+    With `find` breaks are looked for in three nights and more, and become laws. `events` is a table of works on
     the instrument (MJD, WHAT); `partial` is a folder that nights are kept in while others are made,
     `executor` makes them in other processes, to the same result (`nights.making`).
 
     Raises `DataError` for nights that do not belong together, that do not determine a parameter under its law, and for
-    nights without a filter in common; ValueError for laws that are wrong, or of what does not exist.
+    nights without a filter in common; ValueError for laws that are wrong, or of parameters that do not exist.
     """
     opened = [_opened(entry, catalogue) for entry in nights]
     fits = [entry for entry in (like, *(source.fit for source in opened)) if entry is not None]
@@ -124,7 +124,7 @@ def stack(
             breaks += new_breaks
         data, solution, settled = _settled(data, chosen, at_hand, makers)
         if at_hand and any(law is not None for law in chosen[len(chosen) - data.candidates :]):
-            # What takes part in the solution is to be known there, not only what is left of it.
+            # Candidates with a law are linearised at the solution as well.
             data = _with_candidates_anew(data, solution, at_hand, makers)
             data, solution, settled = _settled(data, chosen, at_hand, makers)
     except UndeterminedError as error:
@@ -157,7 +157,7 @@ def events_of(table: Any) -> list[tuple[float, str]]:
 
 
 def laws_of_all(data: Together, laws: Mapping[str, Law | Mapping[str, Any]]) -> tuple[Law | None, ...]:
-    """A law for every parameter and candidate of nights (None: absent). ValueError for what is wrong in `laws`."""
+    """A law for every parameter and candidate of nights (None: absent). ValueError for wrong `laws`."""
     tables = {name: law.document() if isinstance(law, Law) else law for name, law in laws.items()}
     cut = len(data.names) - data.candidates
     alone = [name for name, gauge in zip(data.names, data.gauge, strict=True) if gauge]
@@ -241,7 +241,7 @@ def _settled(
 
     Those that lie farthest from the solution are linearised there first, the n-th of them to see: were each of the rest
     as far from linear, how far would all together move the solution? As far as may be, and the rest stays as it is.
-    What a model lacks may lead ever farther away: the search ends where all nights come no closer.
+    A missing effect may lead ever farther away: the search ends where all nights come no closer.
     """
     solution, anew, enough, farthest = solved(data, laws), list[int](), False, np.inf
     for _ in range(ROUNDS):
@@ -277,7 +277,7 @@ def _settled(
             if seeing:
                 after, _ = _in_units(data, solution)
                 remaining = np.full((len(nights), 1), len(again) - begin - len(batch))
-                remaining[u] = min(remaining[u], 1)  # what is its own moves with no other night
+                remaining[u] = min(remaining[u], 1)  # its own values move with no other night
                 if enough := bool(np.all(remaining * np.abs(after - before) <= EXACT * sigma)):
                     break
     return data, solution, False

@@ -50,10 +50,10 @@ SUSPECT = 5.0  # excess of χ² of a night over its expectation, in its own stan
 class Survey(Displayed):
     """Nights under laws: `at(mjd)` is the calibration of a moment, `tracks` every parameter against time.
 
-    `laws` are those of every parameter and candidate (None: absent), `breaks` what was found and made a law. `like` is
+    `laws` are those of every parameter and candidate (None: absent), `breaks` the detected ones, now laws. `like` is
     a calibration of the same model, from which field, filters, site and parameters that are held are taken (None:
-    there is no calibration of a moment); `doubts` are what speaks against it beside χ²; `events` what users have
-    written down (MJD, words).
+    there is no calibration of a moment); `doubts` are those beside χ²; `events` the notes of
+    users (MJD, words).
     """
 
     data: Together
@@ -68,16 +68,16 @@ class Survey(Displayed):
 
     @functools.cached_property
     def excess(self) -> Vector:
-        """(χ² − dof)/√(2 dof) of every night: how far its data are from what the laws say."""
+        """(χ² − dof)/√(2 dof) of every night: the distance of its data from the laws."""
         dof = np.array([night.dof for night in self.data.nights], float)
         return (self.solution.unit_chi2 - dof) / np.sqrt(2.0 * np.maximum(dof, 1.0))
 
     @functools.cached_property
     def _counts(self) -> tuple[float, int]:
-        """χ² of data and of what is known beforehand, and its degrees of freedom.
+        """χ² of data and priors, and its degrees of freedom.
 
-        These are data less fluxes, plus what is known, less unknowns. Loose widths only keep the search inside: they
-        are no knowledge, and what they add to χ² is left out as in a fit.
+        These are data less fluxes, plus priors, less unknowns. Loose widths only keep the search inside: they are no
+        knowledge, and their part of χ² is left out as in a fit.
         """
         system, chi2 = self.solution.system, self.solution.chi2 + self.solution.penalty
         prior = np.array([p.prior is not None for p in self.data.parameters])
@@ -293,7 +293,7 @@ class Survey(Displayed):
 
     @functools.cached_property
     def tracks(self) -> Any:
-        """Every parameter in every night as an astropy table: value and error under its law, and what a night adds.
+        """Every parameter in every night as an astropy table: value and error under its law, and deviation.
 
         DEVIATION is by how much the parameter would differ in that night, or in nights that a file joins, if it alone
         were free to differ there, with everything else fitted anew; NaN where its law takes that up.
@@ -329,7 +329,7 @@ class Survey(Displayed):
         })  # fmt: skip
 
     def to_table(self) -> Any:
-        """The nights as an astropy table: time, χ², what it should be, and how far off that is."""
+        """The nights as an astropy table: time, χ², its expectation, and the distance."""
         nights = self.data.nights
         return astropy_table({
             "NIGHT": (np.array([n.number for n in nights]), "", "MJD of the evening"),
@@ -387,7 +387,7 @@ class Survey(Displayed):
         return (*sentences, f"Calibrate again before MJD {self.until:.1f}.")
 
     def display(self) -> Display:
-        """Quality tonight, what has changed since when, and what to do."""
+        """Quality tonight, changes with dates, and advice."""
         verdict, (start, stop), nights = self.verdict, self.span, self.data.nights
         facts = {
             "χ²/dof": f"{verdict.chi2:.1f} / {verdict.dof} = {verdict.chi2 / max(verdict.dof, 1):.4g}",

@@ -66,7 +66,7 @@ def residual_maps(
 
 @styled
 def effect_figure(data: DiagnosisFigureData, number: int = 1, on: Canvas = PAGE) -> AnyFigure:
-    """Residuals without the effect of a comparison, what it explains, and with it; of 0: starting and final model."""
+    """Residuals without and with the effect of a comparison, and its part; of 0: starting and final model."""
     c = data.comparisons[number]
     without, with_it = (f"without\n{c.effect}", f"with\n{c.effect}") if number else _MODELS
     rows = {without: c.before, c.effect or "explained": c.explained, with_it: c.after}
@@ -134,10 +134,11 @@ def _signs(axis: Axes, points: Points, values: Float[np.ndarray, " p"], norm: No
 def signature_figure(
     comparison: ResidualComparison, exposures: Table, cameras: Sequence[str], on: Canvas = PAGE
 ) -> AnyFigure:
-    """Residuals averaged over the field, camera by camera: data as dots, what the effect explains as a line.
+    """Residuals averaged over the field, camera by camera: data as dots, the part of the effect as a line.
 
     Against the polariser angle where the comparison shows a harmonic of it, or most of its signal is behind the
-    polariser; against time otherwise. Exposures at one angle are averaged. The lower panels hold what is left.
+    polariser; against time otherwise. Exposures at one angle are averaged. The lower panels hold the remaining
+    residuals.
     """
     angular = _against_angle(comparison, exposures)
     grid = {"sharex": True, "sharey": "row", "height_ratios": (2.2, 1), "squeeze": False}

@@ -1,4 +1,4 @@
-"""The figures of a run by name: what each shows, and what it is drawn from."""
+"""The figures of a run by name: a line about each, and the data that it is drawn from."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def _modulation(source: FigureSource) -> AnyFigure:
 
 @dataclasses.dataclass(frozen=True)
 class NamedFigure:
-    """A figure with what it shows in a few words, the file of a run that it needs, and whether a run can give it."""
+    """A figure with a line about it, the file of a run that it needs, and whether a run can give it."""
 
     about: str
     draw: Callable[[FigureSource], AnyFigure]
@@ -248,7 +248,7 @@ def possible(source: FigureSource) -> dict[str, NamedFigure]:
 
 
 def draw(name: str, source: FigureSource) -> AnyFigure:
-    """The figure of a name; `DataError` with the nearest names if there is none, or if the run lacks what it needs."""
+    """The figure of a name; `DataError` with the nearest names if there is none, or if the run lacks its data."""
     if name not in FIGURES:
         raise fail(
             f"there is no figure {name!r}", advice=f"{nearest(name, FIGURES)} (walop-jax plot RUN lists all)"

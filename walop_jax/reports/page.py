@@ -1,6 +1,6 @@
 """Pages about runs: single HTML files, figures inside, nothing fetched from anywhere.
 
-A page is a header (what the command displayed first of its result), then sections: what else it displayed, and figures.
+A page is a header (the first lines that the command displayed of its result), then sections: the rest, and figures.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def picture(
 
 
 def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str, ...]]:
-    """The HTML text of the page about a fit or a diagnosis, and in words what the run lacks for it.
+    """The HTML text of the page about a fit or a diagnosis, and in words the files that the run lacks for it.
 
     `goal` is the error of p that is wanted (None: as the fit was asked).
     """
@@ -253,7 +253,7 @@ class _Drawn:
             return []
 
     def accuracy(self, missing: list[str]) -> list[Picture]:
-        """The error of p over the field, and what a mistake could do unnoticed."""
+        """The error of p over the field, and the effect of a mistake that goes unnoticed."""
         pictures = (
             []
             if self.product is None
@@ -323,7 +323,7 @@ def _diagnosed(run: RunContents, head: Display) -> list[Section]:
 
 
 def _candidates(run: RunContents) -> Section:
-    """Every effect of the catalogue at the first look, limits on what was not found, other descriptions."""
+    """Every effect of the catalogue at the first look, limits on effects that were not found."""
     assert run.diagnosis is not None
     catalogue = EFFECTS if run.source.run is None else run.source.run.catalogue
     rows = tuple(
@@ -482,9 +482,9 @@ def kind_of_run(folder: Path) -> str:
 
 
 def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
-    """The HTML text of the page about such a folder, and in words what the folder lacks for it.
+    """The HTML text of the page about such a folder, and in words the files that the folder lacks for it.
 
-    Raises `DataError` for a document that cannot be read or lacks what the page shows.
+    Raises `DataError` for a document that cannot be read or lacks contents of the page.
     """
     page, missing = OTHERS[kind], []
     document = RunFolder(folder).document(page.file, ("shown",))
@@ -553,7 +553,7 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
 
 
 def _change_of_the_matrix(folder: Path, document: Mapping[str, Any], missing: list[str]) -> list[Picture]:
-    """Maps of what has changed of the instrument matrix, if both calibrations are there and worth comparing."""
+    """Maps of the change of the instrument matrix, if both calibrations are there and worth comparing."""
     if document["fits"] is None or document.get("same"):
         return []
     try:

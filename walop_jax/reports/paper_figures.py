@@ -163,7 +163,7 @@ def transmission_figure(
 ) -> AnyFigure:
     """Share of the light in each camera against the polariser angle at the field point nearest to `place` (deg).
 
-    With the model of Paper II, a constant plus terms in q and u of the polariser, and what it leaves below.
+    With the model of Paper II, a constant plus terms in q and u of the polariser; its residuals below.
     """
     e = calset.exposures
     rows = np.flatnonzero(e.clp_in & ~e.position(CALIBRATION_PLATE).inside & (e.filter == filter_name))
@@ -249,7 +249,7 @@ def map_figure(comparison: Comparison) -> Figure:
 
 @styled
 def offset_figure(comparison: Comparison) -> Figure:
-    """Δq and Δu: against what the weakest direction of the design matrix predicts, and with one exposure more."""
+    """Δq and Δu: against those of the weakest direction of the design matrix, and with one exposure more."""
     offsets = comparison.offsets
     figure, (left, middle, right) = PAGE.panels(9.6, 3.2, 1, 3)
     for axis, c, name in ((left, 0, "q"), (middle, 1, "u")):

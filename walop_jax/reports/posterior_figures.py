@@ -185,7 +185,7 @@ def trace_figure(
 def save_figure(
     path: str | os.PathLike[str], figure: Figure, *, overwrite: bool = False, exact: bool = False
 ) -> None:
-    """Write a figure (format by the name), cut to what is drawn, or of its `exact` size; whole or not at all."""
+    """Write a figure (format by the name), without empty margins, or of its `exact` size; whole or not at all."""
     with atomic_path(path, overwrite=overwrite) as temporary:
         if exact:
             figure.savefig(temporary, dpi=300)

@@ -1,4 +1,4 @@
-"""A run as figures and pages read it: what a figure needs, and the contents of a page, checked against each other."""
+"""A run as figures and pages read it: data of a figure, and contents of a page, checked against each other."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from walop_jax.science.field_accuracy import FieldAccuracy, field_accuracy
 
 SUMMARY_KEYS = ("chi2", "dof", "n_data", "parameters", "converged", "message", "versions", "inputs")
 DIAGNOSIS_KEYS = ("verdict", "steps", "candidates", "unexplained")
-DEFAULTS: dict[str, Any] = {"warnings": [], "remarks": [], "misfit": None}  # what a summary may lack
+DEFAULTS: dict[str, Any] = {"warnings": [], "remarks": [], "misfit": None}  # keys that a summary may lack
 SAME_CHI2 = 1e-6  # relative difference of χ²/dof of one and the same fit, read from two files
 
 T = TypeVar("T")
@@ -50,7 +50,7 @@ Drawable = FitResult | Calibration | Diagnosis | PosteriorSample | Run
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class FigureSource:
-    """The run, or the result in memory, that a figure is drawn from; a lack of what it needs is a `DataError`.
+    """The run, or the result in memory, that a figure is drawn from; missing data are a `DataError`.
 
     `held` are the contents of a result in memory under the names of the files of a run that would hold them, its data
     as `DATA`; it has no `run`. `sample` is a posterior in memory, which has the walkers as well. `parameters` are
@@ -182,7 +182,7 @@ class FigureSource:
 
 @dataclasses.dataclass(frozen=True)
 class RunContents:
-    """The contents of a run; None for what is not there. `missing` says what that means for a page.
+    """The contents of a run; None for files that are not there. `missing` names their sections of a page.
 
     `source` is what figures are drawn from. `summary`, `diagnosis` and `sample` are the contents of the JSON files;
     `corner` are the bytes of a PNG; `limits` are detection limits of the same data, `commissioning` is a go or no-go

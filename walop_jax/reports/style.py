@@ -53,7 +53,7 @@ Map = Float[np.ndarray, "y x"]
 Maps = Float[np.ndarray, "m y x"]
 Field = tuple[float, float, float, float]
 AnyFigure = Any
-"""A figure, or the subfigure that took the room of axes: what is drawn on a `Canvas`."""
+"""A figure on a `Canvas`, or the subfigure that took the room of axes."""
 
 
 def own_style() -> contextlib.AbstractContextManager[None]:
@@ -121,7 +121,7 @@ class Canvas:
     ) -> tuple[Any, Any]:
         """A figure, and panels in it with small numbers, as `subplots` makes them.
 
-        `least` is the width (inches) of the narrowest panel that can be read, `labels` the height of what is written
+        `least` is the width (inches) of the narrowest panel that can be read, `labels` the height of the labels
         around each at any size; where columns are narrower, rows become
         columns (`turned`), or groups of columns go below each other.
         """
@@ -323,7 +323,7 @@ def calendar(axis: Axes, mjd: Any) -> bool:
 
 
 def day_of(mjd: Any) -> Any:
-    """Days of matplotlib (since 1970) of MJD; what is no MJD, the number of an exposure group, stays."""
+    """Days of matplotlib (since 1970) of MJD; numbers of exposure groups stay as they are."""
     mjd = np.asarray(mjd, float)
     return mjd - 40587.0 if mjd.size and np.nanmin(mjd) > EARLIEST else mjd
 

@@ -19,7 +19,7 @@ MOST = 8  # parameters in a figure
 def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
     """Parameters whose law lets them change, against time; None where there is none.
 
-    The band is the value under the law with its error, dots what each night would have by itself. A step is a step:
+    The band is the value under the law with its error, dots the value of each night alone. A step is a step:
     grey across is the time in which it can have been; dashed lines are other breaks of that parameter, dotted ones the
     events that the user wrote down.
     """

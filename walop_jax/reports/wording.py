@@ -180,13 +180,13 @@ CAPTIONS: Mapping[str, str] = {
     "planned": "Error of p (%) before and after the plan: median over the instruments drawn, largest of all filters "
     "and colours. Crosses: one exposure holds no u there.",
     "change": "Change of the instrument matrix over the field, new − old, in per cent.",
-    "tracks": "Parameters that change: value under the law and its error (band), what each night would have by itself "
-    "(dots), breaks (dashed) and what was done (dotted).",
+    "tracks": "Parameters that change: value under the law and its error (band), values of single nights (dots), "
+    "breaks (dashed) and events (dotted).",
     "nights": "χ² of every night against its expectation, in standard deviations; the band is ±2.",
     "comparison_histogram.png": "Errors of q, u and p over the field, on the grid points and between them.",
     "comparison_map.png": "Maps of the errors of q and u of both methods.",
     "comparison_offset.png": "Where the offsets Δq and Δu of Paper II come from.",
-    "comparison_spectral.png": "Efficiencies across the filter, and what the colour of a star changes.",
+    "comparison_spectral.png": "Efficiencies across the filter, and the effect of the colour of a star.",
     "watch.png": "Gain of every camera since the calibration, group by group.",
 }
 """Captions of figures by name, and of pictures by file."""

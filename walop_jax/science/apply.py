@@ -1,7 +1,7 @@
 """A calibration applied to a science catalogue: q, u of every star with errors of photons and calibration.
 
-Rows are taken star by star in blocks that fit into memory. What is computed for a star does not depend on what else is
-in the catalogue, until all of it is looked at together (`catalogue_check`): then errors grow for all stars by what
+Rows are taken star by star in blocks that fit into memory. The result of a star does not depend on the rest of
+the catalogue, until all of it is looked at together (`catalogue_check`): then errors grow for all stars by what
 that has found.
 """
 
@@ -58,11 +58,11 @@ class Stars:
 
     On the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere. `covariance`
     is the sum of `photon`, `calibration` (parameters of the optics and of the detectors), `spectrum`: a TEFF has its
-    error, a star without one the colour of a population (`COOL`, `HOT`), and `changed`: what the whole catalogue says
-    has changed since the calibration. `colour` is the error of (q, u) if TEFF were ignored; without TEFF, half the
-    difference between stars of 3500 K and 10 000 K. `hidden` is the largest shift of q and u by a single mistake
-    that the data of the calibration would not have shown (NaN: nobody asked). `flag` holds bits of `Quality`;
-    `rows` counts the rows of a star. `check` is what all stars say together, `sky_bound` the largest shift by light of
+    error, a star without one the colour of a population (`COOL`, `HOT`), and `changed`: changes since
+    the calibration that the whole catalogue shows. `colour` is the error of (q, u) if TEFF were ignored; without TEFF,
+    half the difference between stars of 3500 K and 10 000 K. `hidden` is the largest shift of q and u by a single
+    mistake that the data of the calibration would not have shown (NaN: nobody asked). `flag` holds bits of `Quality`;
+    `rows` counts the rows of a star. `check` is that of all stars together, `sky_bound` the largest shift by light of
     the sky left over that they do not exclude (None: the level of the sky is not stated).
     """
 
@@ -96,8 +96,8 @@ def apply(
     """Stokes parameters of all stars of a catalogue.
 
     `progress` is told how many rows of how many are done. Raises `DataError` for a filter that nobody knows, for a
-    catalogue with more optical settings than can be tabulated, and, unless `force` is given, for what the calibration
-    does not cover (`check_validity`).
+    catalogue with more optical settings than can be tabulated, and, unless `force` is given, for settings that the
+    calibration does not cover (`check_validity`).
     """
     work = _Application(AnalysisVectors(calibration), catalogue, force=force)
     chosen = work.sample(STAR_SAMPLE)
@@ -398,7 +398,7 @@ class _Application:
         return check
 
     def together(self, stars: Stars, check: CatalogueCheck) -> Stars:
-        """The stars with errors, and a bit of FLAG, that hold what all of them say together."""
+        """The stars with the errors, and a bit of FLAG, of the check of all of them."""
         if check.holds:
             return dataclasses.replace(stars, check=check)
         changed, flag = stars.changed, stars.flag
@@ -481,7 +481,7 @@ def _ignored_colour(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:
 def _unsure_colour(
     teff: Float[np.ndarray, " r"], error: Float[np.ndarray, " r"]
 ) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
-    """Mixtures of spectra: mean of what the colour of a star may be less what it was taken to be, and the deviation.
+    """Mixtures of spectra: mean of the possible colours of a star less the assumed one, and their deviation.
 
     The effect of the colour is close to linear in 1/T, in which `COOL` and `HOT` lie two deviations from the mean of
     the stars without TEFF, and in which a TEFF (K) has its `error`, (1/T) · error/T.

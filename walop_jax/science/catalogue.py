@@ -31,9 +31,9 @@ class Catalogue:
     `points` are positions and settings, `teff_err` the errors of the colour temperatures [K] (0: none); `counts` and
     `sigma` [electron] are NaN where a camera is not used; `spoilt` marks rows in which a camera was flagged, `copy`
     those that repeat another row of their star to the last bit, which are not used, and `repeated` those that have the
-    counts of another star or setting. `star` numbers the stars from 0; `sky` [electron] is what was subtracted
+    counts of another star or setting. `star` numbers the stars from 0; `sky` [electron] is the level subtracted
     (None: not stated), `rotator` [deg] NaN for results in the instrument frame, `time` [MJD, d] where it is not known.
-    `remarks` say what is odd in the table, and what of it is not used.
+    `remarks` name oddities of the table, and unused columns.
     """
 
     points: FieldPoints

@@ -3,7 +3,7 @@
 Asked are, of the residuals of `star_residuals`:
 
 noise       Σ χ² against Σ ν, from both sides: N_ERR too small or too large
-rows        what the rows of one star have in common: rows that are there twice, noise that is correlated
+rows        the common part of the rows of one star: rows that are there twice, noise that is correlated
 places      stars that disagree together at one place of the field (`places`)
 changes     the mean residual of every camera and how it grows with X, Y, time and flux, light that is added to every
             row, and all parameters of the optics; the strongest is fitted with the errors of the calibration and
@@ -98,11 +98,11 @@ class CatalogueCheck(Displayed):
     """Findings from the stars of a catalogue together.
 
     `noise` is χ² per degree of freedom behind the changes (1 expected; without outliers) and `noise_p` its chance;
-    `rows` the factor by which the variance of what the rows of a star share exceeds N_ERR, None where every star has
+    `rows` the factor by which the common variance of the rows of a star exceeds N_ERR, None where every star has
     one row, and `rows_p` its chance beside `noise`. `scale` are the factors on the photon covariance of stars of one
     row and of several: 1 unless errors are off. `tests` are the `asked` questions in their first answer; `smallest` is
     the gain change of the camera seen best that would be found in 99 % of cases (nan: none). `stars` and `rows_used`
-    count what was looked at; `growth` holds the units of X, Y and time; stars of `places` disagree together; `sky` is
+    count the sample; `growth` holds the units of X, Y and time; stars of `places` disagree together; `sky` is
     the light of the sky left over (None: its level is not stated).
     """
 
@@ -128,7 +128,7 @@ class CatalogueCheck(Displayed):
 
     @property
     def noise_is_off(self) -> bool:
-        """True if N_ERR is not what the counts scatter by."""
+        """True if the counts do not scatter by N_ERR."""
         off = not 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS
         return self.noise > NO_NOISE and self.noise_p < self.alarm and off and not self.rows_agree
 
@@ -242,7 +242,7 @@ NOTHING_TO_SPARE = CatalogueCheck(0, 0, 0, 1.0, 1.0, None, 1.0, (1.0, 1.0), (), 
 
 
 class CatalogueSearch:
-    """The columns of all questions, then of the errors of the calibration; what has been found so far.
+    """The columns of all questions, then of the errors of the calibration.
 
     `cameras` are names; `parameters` names and units of those of `stars.parameters()`, of which the first, as many as
     `stars.plain` has, are asked as well; `root` is a square root of their covariance, C = root rootᵀ. `at` are the
@@ -343,7 +343,7 @@ class CatalogueSearch:
         if stated:
             return look(noise._replace(value=1.0))
         weighted = look(noise)
-        # What all stars have in common is no noise: weights come from the scatter about the gains that fit them best.
+        # A common shift of all stars is no noise: weights come from the scatter about the gains that fit them best.
         for _ in range(ABOUT_GAINS if is_off(noise, self._alarm) else 0):
             gains, fitted = self._gains(weighted)
             about = beside_fitted(scale_of(self._left(sizes + gains)), dof, fitted)
@@ -364,7 +364,7 @@ class CatalogueSearch:
         return gains, root.shape[1]
 
     def answer(self) -> CatalogueCheck:
-        """All questions, then again behind what was found."""
+        """All questions, then again behind the changes that were detected."""
         sizes = self.start
         chosen: list[int] = []
         look = self._looked(sizes)
@@ -404,7 +404,7 @@ class CatalogueSearch:
             smallest=smallest,
             growth=self.growth,
         )
-        # χ² of rows that repeat each other says nothing of N_ERR: what they share does.
+        # χ² of rows that repeat each other does not test N_ERR: their common part does.
         single = noise.value if check.noise_is_off else 1.0
         several = float(rows.value) if rows is not None and check.rows_agree else single
         check = dataclasses.replace(check, scale=(single, several))
@@ -490,7 +490,7 @@ class CatalogueSearch:
     def _change(
         self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], asked: int
     ) -> InstrumentChange:
-        """A detected change, and all that describe the same residuals as well."""
+        """A detected change, and its rivals."""
         away = np.zeros_like(sizes)
         away[asked] = sizes[asked]
         score = look.score + look.matrix @ away

@@ -1,4 +1,4 @@
-"""Go or no-go: what a calibration must show before stars are measured with it, and what the exposures lack for it."""
+"""Go or no-go: requirements on a calibration before stars are measured with it, and gaps in its exposures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from walop_jax.science.field_accuracy import SHARE, FieldAccuracy
 
 @dataclasses.dataclass(frozen=True)
 class Requirement:
-    """Something that is asked of a calibration: whether it is met, what was found, and what to do if not.
+    """A requirement on a calibration: whether it is met, the value, and advice if not.
 
     One that is not `needed` is no reason against a go.
     """
@@ -94,13 +94,13 @@ def is_go(asked: Sequence[Requirement]) -> bool:
 
 
 def requirement_rows(asked: Sequence[Requirement]) -> tuple[tuple[str, str, str], ...]:
-    """A row for each requirement: ok, NO where it is needed, no where it is advice; what is asked, what was found."""
+    """A row for each requirement: ok, NO where it is needed, no where it is advice; the requirement, the value."""
     return tuple(
         ("ok" if need.met else "NO" if need.needed else "no", need.what, need.found) for need in asked
     )
 
 
 def requirement_advice(asked: Sequence[Requirement]) -> tuple[str, ...]:
-    """Advice on requirements that are not met, what is needed first."""
+    """Advice on requirements that are not met, the needed ones first."""
     ordered = sorted(asked, key=lambda need: not need.needed)
     return tuple(f"{need.found}: {need.advice}" for need in ordered if not need.met)

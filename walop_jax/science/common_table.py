@@ -2,7 +2,7 @@
 
 Panopoulou et al. 2025 (ApJS 276, 15) ask that catalogues of stellar polarisation share one tabular format. The names of
 columns that their compilation has at CDS (J/ApJS/276/15: Name, RAJ2000, DEJ2000, Gmag, Pol, e_Pol, PA, e_PA) are taken
-as they are there, p as a fraction; what a calibrated survey has beyond them (q, u with covariances, the part of the
+as they are there, p as a fraction; columns of a calibrated survey beyond them (q, u with covariances, the part of the
 calibration, Galactic values) has names of the same kind. Every column has a unit (or is a pure number), a UCD and a
 description.
 

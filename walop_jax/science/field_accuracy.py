@@ -1,4 +1,4 @@
-"""Accuracy of the degree of polarisation over the field of a calibration, what limits it, and what could hide.
+"""Accuracy of the degree of polarisation over the field of a calibration, its limits, and mistakes that could hide.
 
 Stars with p ≤ 5 % at any angle, without photon noise. An error δm of the instrument matrix makes
 δ(q, u) = −M⁻¹ (δm₁ + δM (q, u)), hence its variance along the polarisation, averaged over the stars, is the error of p.
@@ -22,7 +22,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import two_digits
 from walop_jax.likelihood.inverses import whitening
 
-SHARE = 0.95  # of the field where one exposure measures u: what a calibration is judged by
+SHARE = 0.95  # of the field where one exposure measures u: the part that a calibration is judged by
 SIZE = 21  # points along each axis of the map
 COARSE = 8  # the same where the question is what limits it
 FEW_STARS = 20
@@ -141,7 +141,7 @@ class FieldAccuracy:
         }  # fmt: skip
 
     def facts(self, *, complete: bool = True) -> tuple[tuple[str, str], ...]:
-        """The answer in a few lines: how well, limited by what, and what could hide; of a `complete` model or not."""
+        """The answer in a few lines: accuracy, its limits, mistakes that could hide; of a `complete` model or not."""
         if not self.trusted:
             return (("p of a star", "not known: the calibration is not trusted"),)
         median_error = f"{two_digits(100 * self.median)} %{self.apart_from} (median error for p ≤ 5 %)"

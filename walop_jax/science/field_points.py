@@ -137,7 +137,7 @@ def true_matrices(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
     """X, Y (deg) and M21, M22, … of a table of true matrices, three for each arm.
 
-    Raises `DataError` for what is missing or not finite.
+    Raises `DataError` for values that are missing or not finite.
     """
     source = read_input_table(path)
     points = field_points(source, instrument)

@@ -138,7 +138,7 @@ def _fitted(
 
 
 def _scatter(left: Float[np.ndarray, " s"], variance: Float[np.ndarray, " s"]) -> float:
-    """Variance beyond the stated one for which χ² of residuals is their number, less what was fitted."""
+    """Variance beyond the stated one for which χ² of residuals is their number less three."""
 
     def excess(scatter: float) -> float:
         return float(np.sum(left**2 / (variance + scatter))) - (len(left) - 3.0)
@@ -149,7 +149,7 @@ def _scatter(left: Float[np.ndarray, " s"], variance: Float[np.ndarray, " s"]) -
 
 
 def with_sky(stars: Stars, catalogue: Catalogue) -> Stars:
-    """The stars with what the sky left in them may do, where the catalogue states its level."""
+    """The stars with errors and bounds of the sky left in them, where the catalogue states its level."""
     if catalogue.sky is None:
         return stars
     stated = np.isfinite(catalogue.counts) & np.isfinite(catalogue.sky)

@@ -3,7 +3,7 @@
     χ² = Σ dᵀ W d      W = (C_photon + k C_calibration)⁻¹,  d = (q, u) of a row less the mean of its star, weighted by W
 
 Errors of the calibration are common to all stars and have k = `COMMON`, so that they raise no alarm by themselves. The
-sum of the cameras has no part in χ², so that it sees what no other check of a catalogue does.
+sum of the cameras has no part in χ², so that it sees errors that no other check of a catalogue does.
 """
 
 from __future__ import annotations

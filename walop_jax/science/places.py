@@ -103,7 +103,7 @@ def places_of(
 ) -> tuple[DisagreeingPlace, ...]:
     """Places of the field where stars disagree together, the most significant first; none in `alarm` of catalogues.
 
-    `cameras` are names. `residual` is that of `stars` or what is left of it behind changes, `variance` that of the
+    `cameras` are names. `residual` is that of `stars`, with or without changes, `variance` that of the
     residuals of every star over that of its noise (None: `own_variance`).
     """
     stars_seen = _seen(

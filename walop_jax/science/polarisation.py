@@ -2,8 +2,8 @@
 
     p = √(q² + u²),    EVPA = ½ arctan2(u, q),    n = (q, u)/p,    t = (−u, q)/p
 
-Errors      σ_p² = nᵀ C n;  σ_EVPA = σ_t / 2p with σ_t² = tᵀ C t, and no more than 180°/√12, what a uniform
-            distribution has. Where p < 5 σ_p, (q, u) may as well lie on the other side of 0: there σ_EVPA is the rms
+Errors      σ_p² = nᵀ C n;  σ_EVPA = σ_t / 2p with σ_t² = tᵀ C t, and no more than 180°/√12, that of a
+            uniform distribution. Where p < 5 σ_p, (q, u) may as well lie on the other side of 0: there it is the rms
             distance, within half a turn, of the angles of a normal distribution about (q, u) from EVPA. Where C = 1 and
             m = |(q, u)|, the angle α of the vectors from that of their mean has the density
             f(α) = φ(m) (1 + b Φ(b)/φ(b)) / √(2π), b = m cos α, φ and Φ the normal density and its integral

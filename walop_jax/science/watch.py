@@ -15,11 +15,11 @@ once        h = 1 in a single group
 All cameras together are flux: no history of theirs leaves a trace. Asked are the gains of cameras and of arms (all
 cameras of one), their gradients over the field (of any direction φ: β cos φ x + β sin φ y, as χ² of two numbers), spots
 (`watch_spots`) and the numbers of the optics (thicknesses, axes of plates, …). One correction for all of it: noise
-raises an alarm in one of 1/`ALARM` catalogues, at z₀; what is seen in 99 % is (z₀ + 2.33) σ_β. What was found competes
-with all others of the same history: those that describe the stars as well are told together, and a camera is named
-only if no other is among them. A number of the optics that would have to change by more than `FARTHEST` widths of its
-prior explains nothing: its columns are first-order, and no optics moves that far. If only such a number describes the
-stars, they have changed by something that has no name here.
+raises an alarm in one of 1/`ALARM` catalogues, at z₀; the size seen in 99 % is (z₀ + 2.33) σ_β. A detected change
+competes with all others of the same history: those that describe the stars as well are told together, and a camera is
+named only if no other is among them. A number of the optics that would have to change by more than `FARTHEST` widths of
+its prior explains nothing: its columns are first-order, and no optics moves that far. If only such a number describes
+the stars, they have changed by something that has no name here.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ RIVALS = (
     "telescope_polarisation",
     "filter_shift",
 )
-"""Effects of the optics that may be what has changed, beside the parameters of the model."""
+"""Effects of the optics that may have changed, beside the parameters of the model."""
 _CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
 _MOST_CHANGES = 4
 _ROUNDS = 6
@@ -121,7 +121,7 @@ def watch(
 
 
 def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[Catalogue], tuple[str, ...]]:
-    """Catalogues with a time in every row, the number of the catalogue where none has any; what was left out."""
+    """Catalogues with a time in every row, the number of the catalogue where none has any; remarks on rows left out."""
     has_time = [np.isfinite(catalogue.time) for catalogue in catalogues]
     if not any(map(np.any, has_time)):
         numbered = enumerate(catalogues)
@@ -290,7 +290,7 @@ class Watching:
             mixed = np.einsum("arc,nrc->ran", shapes, free[count:], optimize=True)
             np.add.at(cross.reshape(groups, count, nuisances), group, mixed)
             nuisance += nuisance_columns @ nuisance_columns.T
-            # What the stars take by their q and u: sums over the rows of a star in each group.
+            # The part taken by q and u of the stars: sums over the rows of a star in each group.
             half = np.linalg.cholesky(subset.photon).swapaxes(1, 2)
             row = half[subset.star] @ np.einsum("rik,ark->ria", subset.tangent, shapes, optimize=True)
             pair, where = np.unique(subset.star * groups + group, return_inverse=True)
@@ -319,7 +319,7 @@ class Watching:
         of_star: Int[np.ndarray, " p"],
         of_group: Int[np.ndarray, " p"],
     ) -> None:
-        """Take what the stars take from the matrix: between all groups that a star is in."""
+        """Subtract the part taken by the stars, between all groups that a star is in."""
         pairs = np.bincount(of_star)
         alone = pairs[of_star] == 1
         products = np.einsum("pia,pib->pab", sums[alone], sums[alone])
@@ -426,7 +426,7 @@ class Watching:
         return self.readings.answers(*self._by_group(matrix, score), self.shapes)
 
     def settled(self, residual: Float[np.ndarray, "r k"], answers: Answers) -> Settled:
-        """A change with its rivals, and what is left behind it.
+        """A change with its rivals, and the residuals behind it.
 
         Histories compared are the best of each kind and camera and their neighbours. The fit is repeated with the
         stars that it keeps.
@@ -464,7 +464,7 @@ class Watching:
         return WatchedChange(best, tuple(alike), *when)
 
     def spotted(self, residual: Float[np.ndarray, "r k"], weights: Weights) -> Settled | None:
-        """A step in a spot of the field, and what is left behind it; None where noise makes as much."""
+        """A step in a spot of the field, and the residuals behind it; None where noise makes as much."""
         # Stars that lie off may be those of the spot.
         common = np.zeros(len(self.time) + 1)
         np.maximum.at(common, self.pool, weights.inverse * self.variance)
@@ -539,7 +539,7 @@ class Watching:
         score: Float[np.ndarray, " c"],
         whole: Scale,
     ) -> Watch:
-        """The record: gains are what is left behind the changes, and the changes that each camera may be."""
+        """The record: gains are those behind the changes, and the changes that each camera may be."""
         groups, cameras = len(self.time), len(self.cameras)
         blocks, slopes = self._by_group(matrix, score)
         gain, error, smallest = (np.full((groups, cameras), np.nan) for _ in range(3))

@@ -86,7 +86,7 @@ class Watch(Displayed):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A sentence for every change, and one if N_ERR is not what the counts scatter by."""
+        """A sentence for every change, and one if the counts do not scatter by N_ERR."""
         texts = (*(change.words() for change in self.changes), *self.remarks)
         if 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS:
             return texts
@@ -150,7 +150,7 @@ class Watch(Displayed):
         return astropy_table(columns)
 
     def display(self) -> Display:
-        """The verdict, what has changed, what would have been seen, and the groups."""
+        """The verdict, the changes, the smallest step seen, and the groups."""
         percent = 100.0
         rows = tuple(
             (
