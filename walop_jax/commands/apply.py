@@ -165,9 +165,8 @@ def apply(
         },
     )
     crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
-    text = f"{output}: {table.rows} rows, {len(stars.qu)} stars, {job.seconds:.1f} s{_errors(columns)}"
-    if crossed:
-        text += f"; {crossed} in zones of high cross-talk (FLAG 16)"
+    zones = f"; {crossed} in zones of high cross-talk (FLAG 16)" if crossed else ""
+    text = f"{output}: {table.rows} rows, {len(stars.qu)} stars, {job.seconds:.1f} s{_errors(columns)}{zones}"
     return dataclasses.replace(outcome, text=text, next=(f"topcat {output}",) if common else ())
 
 

@@ -8,7 +8,6 @@ are given together.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -138,9 +137,4 @@ class InstrumentChange:
         text = f"changed since the calibration, {abs(self.best.sigma):.0f} σ: {self.best.words()}"
         if not self.rivals:
             return text
-        return f"{text}. These rows cannot distinguish it from {listed(self.rivals, 4, ', ')}"
-
-
-def listed(changes: Iterable[PossibleChange], most: int, between: str) -> str:
-    """The first of some changes in words, and how many more there are."""
-    return some([change.words() for change in changes], most, between)
+        return f"{text}. These rows cannot distinguish it from {some([entry.words() for entry in self.rivals], 4)}"

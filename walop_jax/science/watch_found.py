@@ -10,9 +10,9 @@ from jaxtyping import Float, Int
 
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.text import two_digits, with_minus_sign
+from walop_jax.io.text import some, two_digits, with_minus_sign
 from walop_jax.science.catalogue_check import NOISE_MATTERS
-from walop_jax.science.instrument_changes import UNNAMED, InstrumentChange, PossibleChange, listed
+from walop_jax.science.instrument_changes import UNNAMED, InstrumentChange, PossibleChange
 
 SCATTERED = 4.0
 """χ² per degree of freedom from which stars in which no change is found do not say that a calibration holds."""
@@ -52,7 +52,7 @@ class WatchedChange(InstrumentChange):
         significance = f"({abs(self.best.sigma):.0f} σ{spread})"
         if not self.rivals:
             return f"{self.best.words()} {when} {significance}"
-        either = listed((self.best, *self.rivals), 5, " or ")
+        either = some([entry.words() for entry in (self.best, *self.rivals)], 5, " or ")
         return f"{when} {significance}, one of these, which the stars cannot tell apart: {either}"
 
 
