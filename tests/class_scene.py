@@ -13,7 +13,7 @@ from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import only_a_class, with_average
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import Diagnosis, Step
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.fit.verdict import Quality
 from walop_jax.likelihood.likelihood import Likelihood

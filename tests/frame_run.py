@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from walop_jax.data.frames import Grid
+from walop_jax.data.grid import Grid
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
-from walop_jax.data.frames import Grid, image_names
+from walop_jax.data.frames import image_names
+from walop_jax.data.grid import Grid, grid_cards
 from walop_jax.data.records import CalibrationSet, DataFlag, Points
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.data.write import grid_cards, write_calibration_set
+from walop_jax.data.write import write_calibration_set
 
 SLAB = 1 << 18  # (exposure, pixel) pairs that are written at a time
 

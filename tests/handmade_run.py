@@ -12,9 +12,8 @@ from builders import NAN, exposures, monochromatic
 from walop_jax.calibration.calibration import Product
 from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.calibration.product import write_calibration
-from walop_jax.data.calset import empty_sources
-from walop_jax.data.frames import Grid
-from walop_jax.data.records import InputFile, Points, Site
+from walop_jax.data.grid import Grid
+from walop_jax.data.records import InputFile, Points, Site, Sources
 from walop_jax.diagnosis.figure_data import (
     DiagnosisFigureData,
     ResidualComparison,
@@ -121,7 +120,7 @@ def product() -> Product:
         field=(-0.2, 0.2, -0.2, 0.2),
         exposures=exposures({"clp_angle": 0.0}, {"clp_angle": 45.0}),
         filters={"band": monochromatic(0.62)},
-        sources=empty_sources(),
+        sources=Sources.none(),
         inputs=(InputFile(Path("night.fits"), "ab" * 32),),
         versions={"python": "3.11.7"},
     )

@@ -41,8 +41,8 @@ from walop_jax.data.records import CalibrationSet as CalibrationSet
 from walop_jax.data.records import FilterCurve as FilterCurve
 from walop_jax.data.settings import Settings as Settings
 from walop_jax.data.write import write_calibration_set as write_calibration_set
+from walop_jax.fit.base_model import base_model as base_model
 from walop_jax.fit.forward import forward as forward
-from walop_jax.fit.model_file import base_model as base_model
 from walop_jax.fit.refit import FitResult as FitResult
 from walop_jax.io.errors import DataError as DataError
 from walop_jax.likelihood.forward import Forward as Forward

@@ -14,7 +14,7 @@ from walop_jax.calibration.calibration import Product
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap, matrix_names, residual_names
 from walop_jax.calibration.product import read_product, write_calibration
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.data.frames import Grid
+from walop_jax.data.grid import Grid
 from walop_jax.fit.verdict import Quality, Verdict
 from walop_jax.io.errors import DataError
 

@@ -16,7 +16,7 @@ from walop_jax.calibration.calibration import Product
 from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.calibration.product import read_product, write_calibration
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.data.frames import Grid
+from walop_jax.data.grid import Grid
 from walop_jax.data.records import Position
 from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.fit.verdict import Verdict

@@ -14,7 +14,7 @@ from walop_jax.calibration.residual_map import cell_of, cells_for, residual_map_
 from walop_jax.data.records import Block
 from walop_jax.data.settings import Settings
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.parameters import values_of
 from walop_jax.model.planning import plan_for_settings

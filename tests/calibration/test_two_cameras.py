@@ -17,8 +17,7 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import _physics
 from walop_jax.calibration.matrix import analysis_vectors, matrices
-from walop_jax.data.calset import empty_sources
-from walop_jax.data.records import Exposures, FilterCurve, Position, Site
+from walop_jax.data.records import Exposures, FilterCurve, Position, Site, Sources
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Verdict
@@ -123,7 +122,7 @@ def calibration(model) -> Calibration:
         verdict=verdict,
         filters=LINE,
         exposures=exposures,
-        sources=empty_sources(),
+        sources=Sources.none(),
         site=Site("", np.nan, np.nan, np.nan),
         origin="",
         field=(-0.15, 0.15, -0.15, 0.15),

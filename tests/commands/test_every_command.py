@@ -27,7 +27,7 @@ from zemax_exports import write_folder
 import walop_jax as walop
 from walop_jax.commands import COMMANDS
 from walop_jax.commands.program import NEXT, UNTRUSTED
-from walop_jax.data.frames import Grid
+from walop_jax.data.grid import Grid
 from walop_jax.likelihood import limits
 from walop_jax.simulation.simulate import simulate
 

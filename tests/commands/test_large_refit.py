@@ -15,7 +15,7 @@ from frames_file import write_frames
 
 from walop_jax.calibration.matrix import residual_names
 from walop_jax.calibration.product import read_product, write_calibration
-from walop_jax.data.frames import Grid
+from walop_jax.data.grid import Grid
 from walop_jax.likelihood import limits
 from walop_jax.reports import figures
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn

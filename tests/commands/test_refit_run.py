@@ -12,7 +12,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_product
 from walop_jax.calibration.residual_map import residual_map
 from walop_jax.commands.refit import refit
-from walop_jax.data.frames import Grid
+from walop_jax.data.grid import Grid
 from walop_jax.fit import search
 from walop_jax.likelihood import limits, runner
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn

@@ -12,7 +12,8 @@ from astropy.wcs import WCS
 from frames_file import write_frames
 
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.data.frames import FrameIntensities, Grid
+from walop_jax.data.frames import FrameIntensities
+from walop_jax.data.grid import Grid
 from walop_jax.data.records import Block
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.write import write_calibration_set

@@ -12,7 +12,7 @@ from small_run import SEED, SMALL
 from walop_jax.data.calset import checked, from_arrays
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.io.errors import DataError
 from walop_jax.simulation.simulate import simulate
 

@@ -11,7 +11,7 @@ from frames_file import write_frames
 
 import walop_jax as walop
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.data.frames import Grid
+from walop_jax.data.grid import Grid
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import Compression
 from walop_jax.io.errors import DataError

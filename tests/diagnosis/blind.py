@@ -32,7 +32,7 @@ from walop_jax.diagnosis.examination import Evidence, Examination, examine
 from walop_jax.diagnosis.hypotheses import Probe, Ranked, probes, said_by
 from walop_jax.diagnosis.score import ScoreSpace, separations
 from walop_jax.diagnosis.search import State, search
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.inverses import whitening

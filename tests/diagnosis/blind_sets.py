@@ -24,7 +24,7 @@ from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates, probes
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.likelihood import Likelihood

@@ -24,7 +24,7 @@ from matrix_at import matrix_at
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS

@@ -10,7 +10,7 @@ from scenes import PLAN
 from walop_jax.diagnosis.descriptions import other_descriptions
 from walop_jax.diagnosis.findings import Choice, document
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import alternatives, changed

@@ -16,7 +16,7 @@ from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import _with_ties, averaged, only_a_class
 from walop_jax.diagnosis.examination import examine
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood

@@ -17,7 +17,7 @@ from walop_jax.diagnosis.design import Design, Measured, strata
 from walop_jax.diagnosis.examination import Evidence, upper_limit
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.columns import own_columns
 from walop_jax.likelihood.likelihood import Likelihood

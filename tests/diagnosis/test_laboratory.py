@@ -11,7 +11,7 @@ from walop_jax.data.calset import from_arrays
 from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.instruments.description import parsed
 from walop_jax.model.instrument import build
 

@@ -16,7 +16,7 @@ from walop_jax.data.records import CalibrationSet, Position
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.readings import _angles, mixups
 from walop_jax.diagnosis.trust import examined
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.refit import refit as plain_refit
 from walop_jax.io.errors import DataError

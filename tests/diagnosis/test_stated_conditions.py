@@ -15,6 +15,7 @@ from small_run import SEED, SMALL, small_fit, small_fit_with_plate
 
 from walop_jax.calibration.accuracy import change_of_qu
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.could_hide import hidden_errors
 from walop_jax.calibration.matrix import first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
@@ -102,6 +103,33 @@ def test_one_number_is_among_those_that_are_told(change, what, size):
     value, error = re.search(re.escape(what) + r" ([−\d.]+) ± ([\d.]+)", told).groups()  # type: ignore[union-attr]
     off = float(value.replace("−", "-")) - size
     assert abs(off) < 4 * float(error) + (2.0 if size > 0 else 0.0)  # terms beyond the first, in years
+
+
+def under_sky(calset: CalibrationSet, left: float) -> CalibrationSet:
+    """Faint standards: under a sky of one to six times their light, polarised by 10 %, of which a share is left."""
+    table, e, rng = calset.intensities, calset.exposures, np.random.default_rng(1)
+    level, angle = rng.uniform(1.0, 6.0, len(e)), rng.uniform(0.0, 2.0 * np.pi, len(e))
+    pattern = 1 + 0.1 * np.stack([np.cos(angle), -np.cos(angle), np.sin(angle), -np.sin(angle)], axis=1)
+    of_sky = np.where(e.direct("standard"), level, 0.0)[:, None] * pattern
+    sky = of_sky[table.exposure] * table.counts.mean(axis=1, keepdims=True)
+    table = dataclasses.replace(table, counts=table.counts + left * sky, sky=sky)
+    return dataclasses.replace(calset, intensities=table)
+
+
+def test_a_share_of_the_sky_that_is_left_is_told_with_its_size():
+    plain = simulate(SMALL, seed=SEED).calset
+    result = examined(refit(under_sky(plain, 0.01)))
+    assert not result.trusted
+    (told,) = [text for text in result.verdict.doubts if "residuals ask for the light of the sky" in text]
+    value, error = re.search(r"in units of SKY, ([\d.]+) ± ([\d.]+), not 0 \(subtract", told).groups()  # type: ignore[union-attr]
+    assert float(value) == pytest.approx(0.01, abs=4 * float(error))
+    assert float(error) < 0.001
+    sound = refit(under_sky(plain, 0.0))
+    (score,) = [
+        one.score for one in condition_scores(Design.of(sound)) if "light of the sky" in one.stated.what
+    ]
+    assert abs(score.amplitudes[0]) < 3 * np.sqrt(score.covariance[0, 0])
+    assert examined(sound).trusted
 
 
 @pytest.mark.parametrize(
@@ -272,7 +300,8 @@ def test_what_could_hide_is_ranked_by_what_it_does_to_stars():
     seen = []
     for number in range(len(hidden)):
         one = Hidden(*(getattr(hidden, f.name)[number : number + 1] for f in dataclasses.fields(Hidden)))
-        seen.append(np.nanmedian(dataclasses.replace(calibration, hidden=one).protection(x, y)[0]))
+        hiding = dataclasses.replace(calibration, hidden=one)
+        seen.append(np.nanmedian(hidden_errors(hiding, x, y, hiding.usual_settings())[0]))
     assert len(seen) > 3
     assert all(after <= 1.3 * before for before, after in itertools.pairwise(seen))  # 0: out of the beam
 

@@ -16,7 +16,7 @@ from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import document
 from walop_jax.diagnosis.hypotheses import probes
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, refit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS

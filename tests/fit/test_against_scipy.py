@@ -8,7 +8,7 @@ from oracle import fit as oracle_fit
 from oracle import forward
 
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
 

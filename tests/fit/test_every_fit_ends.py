@@ -12,7 +12,7 @@ from walop_jax.data.records import Position
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.fit.search import FAR_OFF, most_passes
 from walop_jax.likelihood.likelihood import Likelihood

@@ -7,7 +7,7 @@ import pytest
 
 import walop_jax as walop
 from walop_jax.data.merge import merge_calibration_sets
-from walop_jax.fit.model_file import LEVEL, LEVEL_POINTS, base_model
+from walop_jax.fit.base_model import LEVEL, LEVEL_POINTS, base_model
 
 ANGLES = [0.0, 30.0, 60.0, 90.0]
 

@@ -16,7 +16,7 @@ from walop_jax.data.records import CalibrationSet, Position
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit import robust
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit, refit
 from walop_jax.fit.robust import field_cells, larger, states
 from walop_jax.fit.verdict import STATED

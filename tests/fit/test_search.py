@@ -10,8 +10,9 @@ from small_run import SEED, SMALL
 
 import walop_jax as walop
 from walop_jax.data.records import Compression
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.minimise import TOLERANCE
-from walop_jax.fit.model_file import base_model, model_without_data
+from walop_jax.fit.model_file import model_without_data
 from walop_jax.fit.refit import _start
 from walop_jax.fit.search import _order_starts, _search, find_minimum
 from walop_jax.instruments.description import parsed

@@ -24,7 +24,7 @@ from scipy.sparse import lil_matrix
 
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.write import write_calibration_set
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.observing_plan import ObservingPlan

@@ -20,8 +20,8 @@ from walop_jax.calibration.matrix import matrices
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.minimise import minimise
-from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import FitResult, fit, refit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.instrument import Instrument

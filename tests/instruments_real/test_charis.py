@@ -11,7 +11,7 @@ import pytest
 from astropy.table import Table
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.model.instrument import Instrument
 from walop_jax.science.epoch import epoch, fit_like

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, refit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.instrument import Instrument

@@ -13,7 +13,7 @@ from walop_jax.calibration.product import read_calibration
 from walop_jax.commands.refit import refit
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import Model

@@ -9,7 +9,7 @@ from small_run import SMALL, WITH_PLATE
 
 from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.hypotheses import applicable, probes, said_by, showable
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood.columns import Columns, columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Described, effect_by_name

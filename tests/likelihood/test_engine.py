@@ -14,7 +14,7 @@ from oracle import forward, validate
 
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import Block, CalibrationSet, Intensities, Points, Site, Sources
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.flux import eliminate_flux
 from walop_jax.likelihood.likelihood import Likelihood

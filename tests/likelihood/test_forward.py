@@ -15,8 +15,8 @@ from oracle import forward as oracle
 from small_run import SEED, SMALL, small_fit
 
 from walop_jax.data.settings import Settings
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.forward import forward
-from walop_jax.fit.model_file import base_model
 from walop_jax.likelihood import optics
 from walop_jax.likelihood.forward import Forward
 from walop_jax.model import light, materials

@@ -9,8 +9,8 @@ import pytest
 from frame_run import frame_run
 
 from walop_jax.fit import misfit, search
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.minimise import minimise
-from walop_jax.fit.model_file import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.layout import thinned

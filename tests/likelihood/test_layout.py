@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from frame_run import frame_run
 
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import Layout, bytes_per_point
 from walop_jax.likelihood.likelihood import Likelihood

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_run import WITH_PLATE
 
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood import field_table as nodes

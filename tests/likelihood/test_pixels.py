@@ -13,12 +13,13 @@ from frames_file import write_frames
 from walop_jax.calibration import residual_map
 from walop_jax.calibration.residual_map import residual_map_of_pixels
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.data.frames import Grid, RowReader, float64
+from walop_jax.data.frames import RowReader, float64
+from walop_jax.data.grid import Grid
 from walop_jax.data.merge import merge_calibration_sets, without_frames
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.write import write_calibration_set
 from walop_jax.diagnosis.trust import examined, pixel_structure
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, with_honest_errors
 from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixel_structure
 from walop_jax.io.errors import DataError

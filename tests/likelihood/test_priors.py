@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from walop_jax.diagnosis.design import Design
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.posterior.target import Target

@@ -12,7 +12,7 @@ import pytest
 from jax.extend import core
 from small_run import SMALL
 
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import columns, engine
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.simulate import simulate

@@ -17,7 +17,7 @@ from frame_run import frame_run
 from jax import monitoring
 from small_run import SEED, SMALL
 
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.runner import Runner

@@ -37,10 +37,10 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import analysis_vectors
 from walop_jax.calibration.residual_map import residual_map
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.data.frames import Grid
+from walop_jax.data.grid import Grid
 from walop_jax.data.records import Block, CalibrationSet, Intensities
 from walop_jax.data.settings import Settings
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.compressed import compressed

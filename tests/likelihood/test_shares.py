@@ -10,7 +10,7 @@ import pytest
 
 from walop_jax.data.records import CalibrationSet, Points, Site, Sources
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.instrument import Instrument, nominal_instrument

@@ -14,7 +14,7 @@ from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.write import write_calibration_set
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model.instrument import Instrument

@@ -9,8 +9,8 @@ import pytest
 import walop_jax as walop
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
+from walop_jax.fit.base_model import model_for
 from walop_jax.fit.minimise import minimise
-from walop_jax.fit.model_file import model_for
 from walop_jax.fit.refit import FitResult
 from walop_jax.instruments.description import parsed
 from walop_jax.io.errors import DataError

@@ -12,7 +12,7 @@ from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import InputFile, Position, Site
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.variance_components import groupings
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood

@@ -14,7 +14,7 @@ from command import run_program
 from small_run import SMALL
 
 import walop_jax as walop
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood

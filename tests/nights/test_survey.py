@@ -16,7 +16,7 @@ import walop_jax as walop
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.merge import merge_calibration_sets
-from walop_jax.fit.model_file import base_model, model_for
+from walop_jax.fit.base_model import base_model, model_for
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood

@@ -14,7 +14,7 @@ from outside.lossy_wedge import LossyWedge
 from outside.twilight import Twilight
 
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.model import light, materials, plates
 from walop_jax.model.effects import EFFECTS

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model.effects import effect_by_name

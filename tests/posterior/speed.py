@@ -43,7 +43,7 @@ def measure(path: Path, nuts_draws: int, plain_steps: int) -> dict[str, Any]:
     from oracle import forward
 
     from walop_jax.data.calset import read_calibration_set
-    from walop_jax.fit.model_file import base_model
+    from walop_jax.fit.base_model import base_model
     from walop_jax.fit.refit import fit
     from walop_jax.likelihood.likelihood import Likelihood
     from walop_jax.posterior.nuts import Nuts

@@ -13,7 +13,7 @@ from emcee.autocorr import integrated_time
 from south_sets import SouthSet
 
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.posterior.result import Options

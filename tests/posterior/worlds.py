@@ -14,7 +14,7 @@ from scipy import stats
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import Model

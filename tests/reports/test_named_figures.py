@@ -20,7 +20,7 @@ from walop_jax.commands.plot import plot
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.write import write_calibration_set
 from walop_jax.diagnosis.figure_data import write_figure_data
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.io.errors import DataError
 from walop_jax.model import mueller
@@ -75,6 +75,11 @@ def assert_fits_in_print(figure, millimetres):
     for axis in figure.axes:
         box = axis.get_tightbbox()
         assert min(box.x0 - canvas.x0, canvas.x1 - box.x1, box.y0 - canvas.y0, canvas.y1 - box.y1) > -2.0
+    maps = [axis for axis in figure.axes if axis.get_aspect() == 1.0]
+    numbers = [(axis, label.get_window_extent()) for axis in figure.axes for label in axis.get_yticklabels()]
+    for frame in maps:
+        inner = frame.get_window_extent().padded(-1.0)
+        assert not any(box.overlaps(inner) for axis, box in numbers if axis is not frame), frame.get_title()
     titles = [axis.title.get_window_extent() for axis in figure.axes if axis.get_title()]
     assert not any(a.overlaps(b) for i, a in enumerate(titles) for b in titles[:i])
 

@@ -73,7 +73,7 @@ def test_a_no_go_is_told_first(tmp_path):
     folder = handmade_run.make_refit(tmp_path / "run")
     row = ("NO", "p known to 0.050 % in 50 % of the field", "0.088 %")
     shown = Display(
-        "run/calibration.fits: NO GO", head=("", "asked", "found"), rows=(row,), notes=("more light",)
+        "run/calibration.fits: NO GO", head=("", "requirement", "result"), rows=(row,), notes=("more light",)
     )
     told = {"go": False, "requirements": [], "shown": shown.document()}
     (folder / "commissioning.json").write_text(json.dumps(told))

@@ -18,7 +18,7 @@ from walop_jax.calibration.certify import certify, validity
 from walop_jax.calibration.product import write_calibration
 from walop_jax.commands.program import app
 from walop_jax.data.write import write_calibration_set
-from walop_jax.fit.model_file import model_for
+from walop_jax.fit.base_model import model_for
 from walop_jax.fit.refit import fit, refit, with_honest_errors
 from walop_jax.fit.verdict import Doubt, Quality
 from walop_jax.likelihood.likelihood import Likelihood

@@ -19,7 +19,7 @@ from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.write import write_calibration_set
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.instruments.description import shipped
 from walop_jax.likelihood.likelihood import Likelihood

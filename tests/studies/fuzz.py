@@ -44,13 +44,10 @@ from walop_jax.calibration.calibration import Product  # noqa: E402
 from walop_jax.calibration.matrix import MatrixMaps  # noqa: E402
 from walop_jax.calibration.product import read_product, write_calibration  # noqa: E402
 from walop_jax.data.calset import read_calibration_set  # noqa: E402
-from walop_jax.data.frames import Grid  # noqa: E402
+from walop_jax.data.grid import Grid  # noqa: E402
 from walop_jax.data.user_tables import read_input_table  # noqa: E402
-from walop_jax.fit.model_file import (  # noqa: E402
-    base_model,
-    model_for,
-    render,
-)
+from walop_jax.fit.base_model import base_model, model_for  # noqa: E402
+from walop_jax.fit.model_file import render  # noqa: E402
 from walop_jax.fit.verdict import Verdict  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
 from walop_jax.model.instrument import nominal_instrument  # noqa: E402

@@ -36,12 +36,12 @@ from trust import with_block  # noqa: E402
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.calibration.matrix import sky_vectors  # noqa: E402
 from walop_jax.data.calset import read_calibration_set  # noqa: E402
-from walop_jax.data.frames import Grid  # noqa: E402
+from walop_jax.data.grid import Grid  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
 from walop_jax.data.settings import Settings  # noqa: E402
 from walop_jax.data.user_tables import in_memory  # noqa: E402
 from walop_jax.diagnosis.trust import examined, pixel_structure  # noqa: E402
-from walop_jax.fit.model_file import base_model  # noqa: E402
+from walop_jax.fit.base_model import base_model  # noqa: E402
 from walop_jax.fit.refit import FitResult, fit, refit, with_honest_errors  # noqa: E402
 from walop_jax.fit.stand_in import with_pixel_structure  # noqa: E402
 from walop_jax.fit.verdict import Quality  # noqa: E402

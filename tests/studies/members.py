@@ -22,7 +22,7 @@ from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import averaged
 from walop_jax.diagnosis.examination import examine
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, with_honest_errors
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described

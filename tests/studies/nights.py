@@ -38,7 +38,7 @@ from scipy import linalg, stats  # noqa: E402
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.calibration.product import read_calibration  # noqa: E402
 from walop_jax.data.write import write_calibration_set  # noqa: E402
-from walop_jax.fit.model_file import base_model  # noqa: E402
+from walop_jax.fit.base_model import base_model  # noqa: E402
 from walop_jax.fit.refit import fit  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
 from walop_jax.model.laws import YEAR, Law  # noqa: E402

@@ -37,7 +37,7 @@ from walop_jax.data.records import CalibrationSet  # noqa: E402
 from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
 from walop_jax.diagnosis import thresholds  # noqa: E402
 from walop_jax.diagnosis.exact import try_effect  # noqa: E402
-from walop_jax.fit.model_file import base_model  # noqa: E402
+from walop_jax.fit.base_model import base_model  # noqa: E402
 from walop_jax.fit.refit import refit  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
 from walop_jax.model.cameras import with_floor  # noqa: E402

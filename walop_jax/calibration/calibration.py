@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from walop_jax.calibration.accuracy import p_errors
-from walop_jax.calibration.could_hide import hidden_errors
 from walop_jax.calibration.matrix import (
     MatrixMaps,
     ResidualMap,
@@ -28,7 +27,7 @@ from walop_jax.calibration.matrix import (
     planned_matrices,
     slopes_over_field,
 )
-from walop_jax.data.frames import Grid
+from walop_jax.data.grid import Grid
 from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.data.records import Exposures, FilterCurve, InputFile, Site, Sources
 from walop_jax.data.schema import in_unit
@@ -339,21 +338,6 @@ class Calibration(Contents, Fitted):
         instrument = self.model.instrument(self.values)
         values, covariance = matrices(instrument, settings, filters, x, y, self.covariance)
         return values, covariance + of_structure(self.verdict.structure, values)
-
-    def protection(
-        self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings | None = None
-    ) -> tuple[Float[np.ndarray, " p"], str]:
-        """Largest error of q and u, at field positions (deg), of a mistake that would not have been found, and which.
-
-        For stars polarised by up to 5 %, in one setting (default: the usual one); NaN where u is hardly measured, and
-        where nobody asked.
-        """
-        if self.hidden is None or not len(self.hidden):
-            return np.full(len(x), np.nan if self.hidden is None else 0.0), ""
-        errors = hidden_errors(self, x, y, self.usual_settings() if settings is None else settings)
-        known = np.nan_to_num(errors)
-        largest = np.where(np.isnan(errors).all(axis=0), np.nan, known.max(axis=0))
-        return largest, self.hidden.names[int(np.argmax(known.max(axis=1)))]
 
     def over_field(
         self,

@@ -19,17 +19,16 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from walop_jax.data.frames import Grid
+from walop_jax.data.grid import Grid
 from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.fit.verdict import Structure
 from walop_jax.likelihood import limits, optics
 from walop_jax.likelihood.field_table import Vector, accurate_table
 from walop_jax.likelihood.optics import linearised, plain_positions, through_series
-from walop_jax.likelihood.runner import usual_threads
 from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
-from walop_jax.model.compiled import array, compiled
+from walop_jax.model.compiled import array, compiled, usual_threads
 from walop_jax.model.effects.base import Effect, with_amplitudes
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light_path import Scalar

@@ -21,14 +21,13 @@ from astropy.io import fits
 from walop_jax.calibration.calibration import UNCHECKED, Calibration, Product
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap, matrix_names, residual_names
 from walop_jax.data import schema
-from walop_jax.data.calset import empty_sources
 from walop_jax.data.checks import instrument_name, make_exposures, make_filters, make_sources
-from walop_jax.data.frames import Grid, read_grid
+from walop_jax.data.grid import Grid, grid_cards, read_grid
+from walop_jax.data.hdus import filter_columns, set_table_hdu, sign_and_write, table_hdu
 from walop_jax.data.kinds import CALIBRATION_PLATE, PREFIX
-from walop_jax.data.records import InputFile, Site
+from walop_jax.data.records import InputFile, Site, Sources
 from walop_jax.data.schema import Column, column_names, read_table, table_rules
 from walop_jax.data.units import Place
-from walop_jax.data.write import filter_columns, grid_cards, set_table_hdu, sign_and_write, table_hdu
 from walop_jax.fit.verdict import DATA, STATED, Hidden, Structure, Verdict
 from walop_jax.instruments.description import shipped
 from walop_jax.io.atomic import atomic_path
@@ -385,7 +384,7 @@ class _Reader:
             ),
             filters=filters,
             exposures=make_exposures(exposures, filters, site, place, kinds=None),
-            sources=make_sources(stars, Place(self.path, "SOURCES"), filters) if stars else empty_sources(),
+            sources=make_sources(stars, Place(self.path, "SOURCES"), filters) if stars else Sources.none(),
             site=site,
             origin=self.text("ORIGIN"),
             field=(low_x, high_x, low_y, high_y),

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import Effects, OptionalProduct, calibration_of, catalogue_of
+from walop_jax.commands.products import Effects, OptionalProduct, calibration_of, catalogue_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:

@@ -6,15 +6,8 @@ import dataclasses
 from typing import TYPE_CHECKING, Annotated
 
 from walop_jax.commands.command import Job, Option, Outcome, command
-from walop_jax.commands.inputs import (
-    IN_MEMORY,
-    Effects,
-    InstrumentLike,
-    ModelLike,
-    SetFile,
-    Sets,
-    set_and_model,
-)
+from walop_jax.commands.inputs import InstrumentLike, ModelLike, SetFile, Sets, set_and_model
+from walop_jax.commands.products import IN_MEMORY, Effects
 from walop_jax.io.errors import fail
 from walop_jax.io.progress import Stage
 

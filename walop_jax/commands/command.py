@@ -121,6 +121,11 @@ class Job:
             switch_on()
 
 
+def several(given: Any) -> list[Any]:
+    """Items that were given one by one or in a list."""
+    return list(given) if isinstance(given, list | tuple) else [given]
+
+
 def text_file(text: str) -> Callable[[Path], object]:
     """Writer of a text file."""
     return lambda path: path.write_text(text, encoding="utf-8")

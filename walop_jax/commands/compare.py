@@ -6,21 +6,15 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Job, Option, Outcome, command, figure_file
-from walop_jax.commands.inputs import (
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, figure_file
+from walop_jax.commands.inputs import Folder, InstrumentLike, ModelLike, Sets, set_and_model, set_of
+from walop_jax.commands.products import (
     NOT_CARRIED_OVER,
     Effects,
-    Folder,
-    InstrumentLike,
-    ModelLike,
     OptionalProduct,
-    PathLike,
-    Sets,
     calibration_of,
     left_out_cards,
     left_out_sentences,
-    set_and_model,
-    set_of,
 )
 
 if TYPE_CHECKING:

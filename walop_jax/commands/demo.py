@@ -7,8 +7,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Job, Option, Outcome, command, command_of
-from walop_jax.commands.inputs import PathLike
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, command_of
 from walop_jax.commands.refit import STAGES, refit
 from walop_jax.io.errors import fail
 

@@ -6,16 +6,9 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Job, Option, Outcome, UsageError, command, text_file
-from walop_jax.commands.inputs import (
-    Effects,
-    InstrumentLike,
-    ModelLike,
-    PathLike,
-    Sets,
-    paths_of,
-    set_and_model,
-)
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command, text_file
+from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, paths_of, set_and_model
+from walop_jax.commands.products import Effects
 from walop_jax.io.names import DIAGNOSIS, FIGURE_DATA, MODEL, PRODUCT, SUMMARY
 from walop_jax.io.text import json_text
 

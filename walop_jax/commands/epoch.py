@@ -6,8 +6,9 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import Effects, PathLike, Product, Sets, calibration_of, catalogue_of, set_of
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command
+from walop_jax.commands.inputs import Sets, set_of
+from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:

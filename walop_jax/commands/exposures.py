@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import PathLike, TableFile, several
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command, several
+from walop_jax.commands.inputs import TableFile
 
 FILES = Argument(
     "FITS files, a JSON export of a log, a table of words, or a schedule.", "FILE...", list[Path]

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import InstrumentLike, PathLike, TableFile, design_of, several
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command, several
+from walop_jax.commands.inputs import InstrumentLike, TableFile, design_of
 
 if TYPE_CHECKING:
     from walop_jax.data.camera_catalogues import CameraCatalogue

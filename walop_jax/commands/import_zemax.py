@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import PathLike, SetFile
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command
+from walop_jax.commands.inputs import SetFile
 from walop_jax.io.errors import nearest
 
 if TYPE_CHECKING:

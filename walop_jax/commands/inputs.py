@@ -8,50 +8,23 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import reprlib
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError
+from walop_jax.commands.command import Argument, Option, PathLike, UsageError
+from walop_jax.commands.products import Effects, calibration_of, catalogue_of, path_of
 from walop_jax.io.errors import DataError, errors_naming, fail
-from walop_jax.io.text import in_ascii, read_text
+from walop_jax.io.text import read_text
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, CalibrationSet, FitResult, Instrument, Model, Run
-    from walop_jax.data.user_tables import InputTable
-    from walop_jax.fit.verdict import Quality
-    from walop_jax.model.effects import EffectKind
-    from walop_jax.posterior.result import PosteriorSample
-
-
-class Diagnosed(Protocol):
-    """A result with a last fit: a diagnosis."""
-
-    @property
-    def after(self) -> FitResult:
-        """That fit, of which the calibration is that of the diagnosis."""
-        ...
 
 
 GIGABYTE = 1e9
-IN_MEMORY = "in memory"
-"""In place of the path of a file."""
-
-NOT_CARRIED_OVER = "not_carried_over"
-"""Key under which results in JSON list the effects of a model that had to be left out."""
-
 # --------------------------------------------------------------------------------------------------- options
 
-TEFF = Option("Colour temperature (K); without it, a flat spectrum.", kind=float)
-FILTER = Option("Filter of the calibration, or SDSS-r.", kind=str)
 SETS = Argument("Calibration sets (FITS), fitted as one.", metavar="CALSET...", kind=list[Path])
-EFFECTS = Option(
-    "Effects of your own beside those of the catalogue; see walop-jax docs adding-an-effect.",
-    "FILE.toml|.py",
-    Path,
-)
-
 Sets = Annotated["CalibrationSet | PathLike | Sequence[PathLike]", SETS]
 ModelLike = Annotated[
     "Model | PathLike | None",
@@ -65,28 +38,9 @@ InstrumentLike = Annotated[
         str,
     ),
 ]
-Effects = Annotated["PathLike | Sequence[EffectKind] | None", EFFECTS]
-Product = Annotated[
-    "Calibration | FitResult | Diagnosed | Run | PathLike",
-    Argument("Calibration product, or the folder of a run.", "RUN/calibration.fits", Path),
-]
-OptionalProduct = Annotated["Calibration | FitResult | Diagnosed | Run | PathLike | None", None]
-"""Of commands that do without one; each adds its own option."""
 DataOf = Annotated[
     "Sequence[PathLike] | None",
     Option("Calibration set of the fit, if it has moved; again for each.", "CALSET", list[Path]),
-]
-Posterior = Annotated[
-    "PosteriorSample | Any | PathLike | None",
-    Option("Use draws of walop-jax sample, not the covariance.", "posterior.nc", Path),
-]
-Angles = Annotated[
-    "Mapping[str, float] | Sequence[str] | None",
-    Option(
-        "Angle (deg) of a moving element in the beam, named like its columns: CHWP=45. May be repeated.",
-        "P=ANGLE",
-        list[str],
-    ),
 ]
 Goal = Annotated[
     "float | None",
@@ -141,22 +95,6 @@ def read(
     if len(paths) == 1 and "PRODVERS" in primary_keywords(first):
         return read_calibration(first, catalogue_of(effects))
     return read_calibration_set(*paths, kinds=kinds)
-
-
-def catalogue_of(effects: Effects) -> tuple[EffectKind, ...]:
-    """The effects that a model may have: those of the package, of the package and a file, or those given."""
-    from walop_jax.model.effects.catalogue import catalogue_with
-
-    if effects is None or isinstance(effects, str | os.PathLike):
-        return catalogue_with(effects)
-    return tuple(effects)
-
-
-def path_of(given: Any, what: str, advice: str) -> Path:
-    """A path. Raises TypeError, with `advice`, for anything else in place of `what`."""
-    if not isinstance(given, str | os.PathLike):
-        raise TypeError(f"{reprlib.repr(given)} is not {what}; give {advice}")
-    return Path(given)
 
 
 def design_of(instrument: InstrumentLike) -> Instrument | None:
@@ -219,7 +157,7 @@ def set_and_model(
     Raises `DataError` for files that cannot be read, ValueError, naming the file, for a model that does not fit.
     """
     from walop_jax import Instrument, Model
-    from walop_jax.fit.model_file import model_for
+    from walop_jax.fit.base_model import model_for
 
     text = ""
     if model is not None and not isinstance(model, Model):
@@ -242,29 +180,6 @@ def set_and_model(
         return calset, dataclasses.replace(model, catalogue=catalogue)
     with errors_naming(model):  # a path, or None
         return calset, model_for(calset, text, design, catalogue_of(effects))
-
-
-def fit_of(given: Any) -> Any:
-    """The last fit of a diagnosis, whose calibration is that of the diagnosis; anything else as it is."""
-    from walop_jax import FitResult
-
-    after = getattr(given, "after", None)
-    return after if isinstance(after, FitResult) else given
-
-
-def calibration_of(given: Product, effects: Effects = None) -> Calibration:
-    """A calibration: as given, that of a fit or a diagnosis, or that of a product or run, with what its file says.
-
-    Raises `DataError` for a file that cannot be read.
-    """
-    from walop_jax import Calibration, FitResult
-    from walop_jax.calibration.product import read_calibration
-
-    held: Any = fit_of(given)
-    if isinstance(held, Calibration | FitResult):
-        result = held if isinstance(held, Calibration) else Calibration.from_fit(held)
-        return result if result.path is not None else dataclasses.replace(result, path=Path(IN_MEMORY))
-    return read_calibration(folder_of(held), catalogue_of(effects))
 
 
 def save(
@@ -294,127 +209,8 @@ def save(
             (temporary / SUMMARY).write_text(json_text(content), encoding="utf-8")
 
 
-def folder_of(run: Run | PathLike) -> Path:
-    """The folder of a run, or whatever else a path names."""
-    from walop_jax import Run
-
-    if isinstance(run, Run):
-        return run.folder
-    return path_of(run, "a run or a calibration", "a fit, a Run, or the path of a folder or a product")
-
-
-def angles_of(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float]:
-    """Angles (deg) by column prefix, also of texts such as CHWP=45."""
-    if isinstance(at, Mapping):
-        return {name.upper(): value for name, value in at.items()}
-    angles = {}
-    for text in at or ():
-        prefix, _, angle = text.partition("=")
-        try:
-            angles[prefix.strip().upper()] = float(angle)
-        except ValueError:
-            raise UsageError(f"{text!r} is no P=ANGLE, such as CHWP=45", "at") from None
-    return angles
-
-
 def goal_of(percent: float | None) -> float | None:
     """A goal as a fraction. Raises `UsageError` for one that no calibration can have."""
     if percent is not None and not 0.0 < percent <= 100.0:
         raise UsageError(f"{percent:g} % is no error of p; give a number above 0, in per cent", "goal")
     return None if percent is None else percent / 100.0
-
-
-def table_of(given: Any, columns: Mapping[str, Any]) -> InputTable:
-    """A table: a file of one, an astropy table, or columns by name; `columns` are added, or stand in place of its."""
-    from walop_jax.data.user_tables import in_memory, read_input_table
-
-    named = {name.upper(): values for name, values in columns.items()}
-    if isinstance(given, Mapping):
-        return in_memory({key: given[key] for key in given if str(key).upper() not in named} | named)
-    read = read_input_table(given) if isinstance(given, str | os.PathLike) else in_memory(given)
-    if not named:
-        return read
-    remaining = {key: read.table[key] for key in read.table.colnames if str(key).upper() not in named}
-    table = in_memory(remaining | named, str(read.path))
-    table.table.meta.update(read.table.meta)
-    table.remarks.extend(read.remarks)
-    return table
-
-
-def several(given: Any) -> list[Any]:
-    """Items that were given one by one or in a list."""
-    return list(given) if isinstance(given, list | tuple) else [given]
-
-
-def named_tables(given: Any) -> list[tuple[str, InputTable]]:
-    """Tables, of files or in memory, with the names by which messages call them."""
-    if not several(given):
-        raise UsageError("give at least one table", "catalogues")
-    return [
-        (str(entry) if isinstance(entry, str | os.PathLike) else f"catalogue {number}", table_of(entry, {}))
-        for number, entry in enumerate(several(given), start=1)
-    ]
-
-
-def left_out_sentences(names: Sequence[str], source: PathLike | None = None) -> tuple[str, ...]:
-    """A sentence for every effect that cannot be carried over; `source` is the file that the model comes from."""
-    where = "" if source is None else f"{os.fspath(source)}: "
-    return tuple(
-        f"{where}{name} acts on single exposures of the calibration, which cannot be carried over; it is left out"
-        for name in names
-    )
-
-
-def left_out_cards(names: Sequence[str]) -> dict[str, str]:
-    """The card NOTCARR of a table, which lists the effects that cannot be carried over; none where all are in it."""
-    return {"NOTCARR": in_ascii(", ".join(names))} if names else {}
-
-
-def table_outcome(
-    job: Job,
-    held: Calibration,
-    table: InputTable,
-    columns: Mapping[str, tuple[Any, ...]],
-    cards: Mapping[str, Any],
-    output: PathLike | None,
-    *,
-    counted: Mapping[Quality, str],
-    warnings: Sequence[str] = (),
-    extra: Mapping[str, Any] | None = None,
-    remade: Callable[[Any], tuple[Any, Sequence[str]]] | None = None,
-) -> Outcome[Any]:
-    """A table with the columns of a calibration, written if it has an output.
-
-    The bits of FLAG that are `counted` have a warning each, unless it is empty; `extra` goes into the document. Columns
-    of the table that are not used or are replaced are named. `remade` makes another table of that, with remarks.
-    """
-    from walop_jax.data.user_tables import extended
-    from walop_jax.io.plain_tables import write_table
-
-    lost = held.left_behind
-    result = extended(table, columns, {**cards, **left_out_cards(lost)})
-    result, result_remarks = (result, ()) if remade is None else remade(result)
-    if output is not None:
-        write_table(output, result, overwrite=job.overwrite)
-    counts = {bit: int((columns["FLAG"][0] & bit > 0).sum()) for bit in sorted(counted)}
-    remarks = table.about(columns)
-    document = {
-        "output": output,
-        "rows": table.rows,
-        "trusted": held.verdict.trusted,
-        "flags": {str(int(bit)): count for bit, count in counts.items()},
-        "product": held.content_hash(),
-        NOT_CARRIED_OVER: list(lost),
-        "remarks": list(remarks),
-        **(extra or {}),
-    }
-    about = (f"{counts[bit]} {sentence}" for bit, sentence in counted.items() if sentence and counts[bit])
-    return Outcome(
-        result,
-        document,
-        warnings=(
-            *held.warnings,
-            *left_out_sentences(lost, held.path),
-            *(f"{table.path}: {sentence}" for sentence in (*remarks, *result_remarks, *warnings, *about)),
-        ),
-    )

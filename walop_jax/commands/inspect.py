@@ -6,7 +6,8 @@ import dataclasses
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Outcome, command
-from walop_jax.commands.inputs import IN_MEMORY, SETS, Sets, paths_of
+from walop_jax.commands.inputs import SETS, Sets, paths_of
+from walop_jax.commands.products import IN_MEMORY
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import PathLike
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command
 from walop_jax.io.errors import errors_naming
 
 SOURCE = Argument("A shipped instrument or a description file; none: list them.", "[NAME|FILE.toml]", str)

@@ -7,18 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command, figure_file
-from walop_jax.commands.inputs import (
-    Diagnosed,
-    Effects,
-    InstrumentLike,
-    ModelLike,
-    PathLike,
-    catalogue_of,
-    fit_of,
-    paths_of,
-    set_and_model,
-)
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command, figure_file
+from walop_jax.commands.inputs import InstrumentLike, ModelLike, paths_of, set_and_model
+from walop_jax.commands.products import Diagnosed, Effects, catalogue_of, fit_of
 
 if TYPE_CHECKING:
     from walop_jax import CalibrationSet, FitResult, ObservingPlan

@@ -6,13 +6,12 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any
 
-from walop_jax.commands.command import Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import (
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command
+from walop_jax.commands.products import (
     FILTER,
     TEFF,
     Angles,
     Effects,
-    PathLike,
     Posterior,
     Product,
     angles_of,

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import Effects, InstrumentLike, PathLike, catalogue_of, design_of, set_of
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command
+from walop_jax.commands.inputs import InstrumentLike, design_of, set_of
+from walop_jax.commands.products import Effects, catalogue_of
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:
@@ -67,7 +68,8 @@ def model(
 
     >>> text = walop.model(instrument="WALOP-NORTH")  # doctest: +SKIP
     """
-    from walop_jax.fit.model_file import effects_text, model_for, model_without_data, render
+    from walop_jax.fit.base_model import model_for
+    from walop_jax.fit.model_file import effects_text, model_without_data, render
     from walop_jax.io.atomic import atomic_path
     from walop_jax.model.instrument import nominal_instrument
 

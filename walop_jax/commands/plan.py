@@ -7,8 +7,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, Writers, command, text_file
-from walop_jax.commands.inputs import Effects, PathLike, calibration_of, catalogue_of
+from walop_jax.commands.command import (
+    Argument,
+    Job,
+    Option,
+    Outcome,
+    PathLike,
+    UsageError,
+    Writers,
+    command,
+    text_file,
+)
+from walop_jax.commands.products import Effects, calibration_of, catalogue_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
@@ -131,10 +141,11 @@ def plan(
         if Path(str(criterion)).suffix and Path(str(criterion)).exists()
         else criterion
     )
+    possible = Available.of(available)  # pyright: ignore[reportArgumentType]
     job.tell("information of exposures", "information")
     with job.repeated() as say:
         planned = plan_exposures(
-            Available.of(available),  # pyright: ignore[reportArgumentType]
+            possible if schedule is None else possible.in_whole_seconds(),
             minutes,
             criterion=chosen,
             known=prior,

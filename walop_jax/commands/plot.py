@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import DataOf, Effects, PathLike, catalogue_of
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command
+from walop_jax.commands.inputs import DataOf
+from walop_jax.commands.products import Effects, catalogue_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command
-from walop_jax.commands.inputs import Diagnosed, Effects, PathLike, calibration_of, several
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command, several
+from walop_jax.commands.products import Diagnosed, Effects, calibration_of
 from walop_jax.io.display import Display
 
 if TYPE_CHECKING:

@@ -7,19 +7,18 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, command_of
-from walop_jax.commands.inputs import (
-    DataOf,
-    Diagnosed,
-    Effects,
-    Goal,
+from walop_jax.commands.command import (
+    Argument,
+    Job,
+    Option,
+    Outcome,
     PathLike,
-    catalogue_of,
-    fit_of,
-    folder_of,
-    goal_of,
-    save,
+    UsageError,
+    command,
+    command_of,
 )
+from walop_jax.commands.inputs import DataOf, Goal, goal_of, save
+from walop_jax.commands.products import Diagnosed, Effects, catalogue_of, fit_of, folder_of
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:

@@ -8,17 +8,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command, text_file
-from walop_jax.commands.inputs import (
-    DataOf,
-    Diagnosed,
-    Effects,
-    ModelLike,
-    PathLike,
-    catalogue_of,
-    fit_of,
-    folder_of,
-)
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command, text_file
+from walop_jax.commands.inputs import DataOf, ModelLike
+from walop_jax.commands.products import Diagnosed, Effects, catalogue_of, fit_of, folder_of
 from walop_jax.io.errors import fail
 from walop_jax.io.text import read_text
 

@@ -8,18 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import (
-    Diagnosed,
-    Effects,
-    InstrumentLike,
-    PathLike,
-    SetFile,
-    calibration_of,
-    catalogue_of,
-    design_of,
-    left_out_sentences,
-)
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command
+from walop_jax.commands.inputs import InstrumentLike, SetFile, design_of
+from walop_jax.commands.products import Diagnosed, Effects, calibration_of, catalogue_of, left_out_sentences
 from walop_jax.io.text import date_of, json_text, parse_toml, read_text, rounded
 
 if TYPE_CHECKING:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import Effects, OptionalProduct, calibration_of, catalogue_of, fit_of, several
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, several
+from walop_jax.commands.products import Effects, OptionalProduct, calibration_of, catalogue_of, fit_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

@@ -6,19 +6,17 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command
-from walop_jax.commands.inputs import (
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command
+from walop_jax.commands.inputs import InstrumentLike, design_of
+from walop_jax.commands.products import (
     FILTER,
     NOT_CARRIED_OVER,
     TEFF,
     Angles,
     Diagnosed,
     Effects,
-    InstrumentLike,
-    PathLike,
     angles_of,
     calibration_of,
-    design_of,
     left_out_sentences,
 )
 

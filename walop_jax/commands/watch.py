@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command, figure_file
-from walop_jax.commands.inputs import Effects, PathLike, Product, calibration_of, named_tables
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command, figure_file
+from walop_jax.commands.products import Effects, Product, calibration_of, named_tables
 
 if TYPE_CHECKING:
     from walop_jax.science.watch import Watch

@@ -20,46 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from walop_jax.data.records import Block, DataFlag, Intensities, Points
+from walop_jax.data.grid import Grid, read_grid
+from walop_jax.data.records import Block, DataFlag, Intensities
 from walop_jax.data.table_intensities import empty_block, usable
 from walop_jax.data.units import Place, check_units, convert_unit
 from walop_jax.io.errors import fail
 
 _LONG = 1 << 28  # (exposure, pixel) pairs: gigabytes of frames, which are not counted without a word
 _SLAB = 1 << 19  # values of one camera that are looked at together when whole frames are gone through
-
-
-@dataclasses.dataclass(frozen=True)
-class Grid:
-    """The linear map from pixels to field coordinates (FITS standard, section 8.1).
-
-    (x, y) = `value` + `matrix` · (pixel − `reference`), in degrees, pixels counted from 1 as FITS does;
-    `width` pixels in a row, `height` rows. Points run along the rows.
-    """
-
-    width: int
-    height: int
-    reference: tuple[float, float]
-    value: tuple[float, float]
-    matrix: tuple[tuple[float, float], tuple[float, float]]
-
-    @property
-    def pixels(self) -> int:
-        """Number of pixels."""
-        return self.width * self.height
-
-    def xy(self, start: int, stop: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-        """Return the field coordinates (degrees) of the points `start:stop`."""
-        row, column = np.divmod(np.arange(start, stop), self.width)
-        i, j = column + (1.0 - self.reference[0]), row + (1.0 - self.reference[1])
-        (xi, xj), (yi, yj) = self.matrix
-        return self.value[0] + (xi * i + xj * j), self.value[1] + (yi * i + yj * j)
-
-    @functools.cached_property
-    def points(self) -> Points:
-        """All pixels as field points, numbered from 0."""
-        x, y = self.xy(0, self.pixels)
-        return Points(point=np.arange(len(x), dtype=np.int32), x=x, y=y)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,10 +74,10 @@ class Cube:
 
     def _check_stamp(self) -> None:
         try:
-            now = self.path.stat()
+            stat = self.path.stat()
         except OSError as error:
             raise self.place.fail(f"cannot be read: {error}") from error
-        if (now.st_size, now.st_mtime_ns) != self.stamp:
+        if (stat.st_size, stat.st_mtime_ns) != self.stamp:
             raise fail("the file has changed since it was opened", file=self.path, advice="read it again")
 
     def rows(self, start: int, stop: int) -> Float[np.ndarray, "e y x"]:
@@ -117,12 +85,12 @@ class Cube:
 
         Raises what `stored` raises.
         """
-        part = self.stored(start, stop)
-        values = part.astype(np.float64)
+        stored = self.stored(start, stop)
+        values = stored.astype(np.float64)
         if (self.scale, self.zero) != (1.0, 0.0):
             values = values * self.scale + self.zero
         if self.blank is not None:
-            values[part == self.blank] = np.nan
+            values[stored == self.blank] = np.nan
         return values
 
 
@@ -178,7 +146,7 @@ class FrameIntensities(Intensities):
         block = empty_block(*self.grid.xy(start, stop), self.exposures, self.cameras)
         first = 0
         for stack in self.stacks if stop > start else ():
-            here = slice(first, first + stack.exposures)
+            rows = slice(first, first + stack.exposures)
             counts, sigma, flag = self.read(stack, start, stop)
             used, _, impossible = usable(counts, sigma, flag)
             if np.any(impossible):
@@ -189,9 +157,9 @@ class FrameIntensities(Intensities):
                 what = f"is zero or negative in {where}, and {int(impossible.sum())} pixel(s) in all"
                 advice = "give the true error, or set the FLAG image"
                 raise stack.sigma[camera].place.fail(what, advice=advice)
-            block.used[:, here] = used
-            block.counts[:, here] = np.where(used[..., None], counts, 0.0)
-            block.sigma[:, here] = np.where(used[..., None], sigma, 1.0)
+            block.used[:, rows] = used
+            block.counts[:, rows] = np.where(used[..., None], counts, 0.0)
+            block.sigma[:, rows] = np.where(used[..., None], sigma, 1.0)
             first += stack.exposures
         return block
 
@@ -238,8 +206,10 @@ def frame_stack(images: Mapping[str, Any], exposures: int, path: Path) -> tuple[
             cubes[name] = dataclasses.replace(cube, scale=size * cube.scale, zero=size * cube.zero)
     check_units(units, "electron", Place(path, "BUNIT"))
     if len(grids) > 1:
-        one, other, *_ = grids.values()
-        raise fail(f"{one} and {other} do not lie on the same grid", file=path, advice="resample them first")
+        reference, second, *_ = grids.values()
+        raise fail(
+            f"{reference} and {second} do not lie on the same grid", file=path, advice="resample them first"
+        )
     grid = next(iter(grids))
     flag = cubes.get("FLAG")
     if flag is not None and flag.shape[1:] != (grid.height, grid.width):
@@ -281,41 +251,6 @@ def _cube(hdu: Any, exposures: int, place: Place) -> Cube:
     )
 
 
-def read_grid(header: Any, place: Place) -> Grid:
-    """Read the linear coordinates of the first two axes: CRPIX, CRVAL and CD, or CDELT with PC."""
-    for axis, name in ((1, "X"), (2, "Y")):
-        found = str(header.get(f"CTYPE{axis}", "")).strip().upper()
-        if found != name:
-            raise place.fail(
-                f"is {found!r} where {name!r} is needed", f"CTYPE{axis}", "field coordinates, linear"
-            )
-    if float(header.get("CROTA2", 0.0)) != 0.0:
-        raise place.fail("is an obsolete rotation", "CROTA2", "write PC or CD")
-
-    def matrix(i: int, j: int) -> float:
-        if any(f"CD{a}_{b}" in header for a in (1, 2) for b in (1, 2)):
-            return float(header.get(f"CD{i}_{j}", 0.0))
-        return float(header.get(f"CDELT{i}", 1.0)) * float(header.get(f"PC{i}_{j}", 1.0 if i == j else 0.0))
-
-    scale = [
-        float(convert_unit(np.ones(1), str(header.get(f"CUNIT{n}") or "deg"), "deg", f"CUNIT{n}", place)[0])
-        for n in (1, 2)
-    ]
-    grid = Grid(
-        width=int(header["NAXIS1"]),
-        height=int(header["NAXIS2"]),
-        reference=(float(header.get("CRPIX1", 0.0)), float(header.get("CRPIX2", 0.0))),
-        value=(scale[0] * float(header.get("CRVAL1", 0.0)), scale[1] * float(header.get("CRVAL2", 0.0))),
-        matrix=(
-            (scale[0] * matrix(1, 1), scale[0] * matrix(1, 2)),
-            (scale[1] * matrix(2, 1), scale[1] * matrix(2, 2)),
-        ),
-    )
-    if np.linalg.det(np.array(grid.matrix)) == 0 or not np.all(np.isfinite(grid.matrix)):
-        raise place.fail("the coordinates are singular", "CDELT, PC, CD", "write the pixel scale in degrees")
-    return grid
-
-
 # --------------------------------------------------------------------------------------- image rows as they lie on disk
 
 _ALIGNED = 64  # bytes: what JAX takes over without a copy
@@ -335,7 +270,7 @@ class RawRows(NamedTuple):
 
 
 def float64(values: Array) -> Float[Array, ...]:
-    """Numbers from the words of big-endian float32; what is float64 stays so."""
+    """Numbers from the words of big-endian float32; float64 stays as it is."""
     if values.dtype != jnp.uint32:
         return values
     swapped = ((values & 0xFF) << 24) | ((values & 0xFF00) << 8) | ((values >> 8) & 0xFF00) | (values >> 24)
@@ -345,7 +280,7 @@ def float64(values: Array) -> Float[Array, ...]:
 class RowReader:
     """Reads image rows of all frames into arrays of `height` × `width` pixels, which each thread uses again and again.
 
-    What was made of the rows must be finished before the next ones are read.
+    Computations on the rows must be finished before the next ones are read.
     """
 
     def __init__(self, intensities: FrameIntensities, height: int, width: int) -> None:
@@ -362,16 +297,16 @@ class RowReader:
         closed[:] = True
         first = 0
         for stack in self.intensities.stacks:
-            here = slice(first, first + stack.exposures)
-            for array, own in ((counts, stack.counts), (sigma, stack.sigma)):
-                for camera, cube in enumerate(own):
-                    _read(cube, start, stop, array[camera, here])
-            closed[(here, *inside)] = False if stack.flag is None else _is_set(stack.flag, start, stop)
+            rows = slice(first, first + stack.exposures)
+            for array, stored in ((counts, stack.counts), (sigma, stack.sigma)):
+                for camera, cube in enumerate(stored):
+                    _read(cube, start, stop, array[camera, rows])
+            closed[(rows, *inside)] = False if stack.flag is None else _is_set(stack.flag, start, stop)
             first += stack.exposures
         return RawRows(jax.device_put(counts), jax.device_put(sigma), ~closed)
 
     def _buffers(self) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, "e h w"]]:
-        """This thread's arrays. Closed pixels hold zeros or what was there before, and are never used."""
+        """This thread's arrays. Values of closed pixels are undefined and never used."""
         if not hasattr(self._own, "buffers"):
             frames = self.intensities
             cubes = [cube for stack in frames.stacks for cube in (*stack.counts, *stack.sigma)]

@@ -1,6 +1,6 @@
 """Writing calibration sets as tables.
 
-The extension COMPRESSION says of a calibration set that stands for the pixels of whole frames, what they were
+The extension COMPRESSION describes the whole frames for whose pixels a calibration set stands
 (docs: files).
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,8 @@ from astropy.io import fits
 
 from walop_jax.data import schema
 from walop_jax.data.checks import instrument_name
-from walop_jax.data.frames import Grid
-from walop_jax.data.records import CalibrationSet, Compression, FilterCurve, InputFile
+from walop_jax.data.hdus import check_ascii, filter_columns, set_table_hdu, sign_and_write, table_hdu
+from walop_jax.data.records import CalibrationSet, Compression, InputFile
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.units import Place
 from walop_jax.io.atomic import atomic_path
@@ -84,7 +84,7 @@ def _in_runs(numbers: Iterable[int]) -> str:
 
 
 def _of_runs(text: object, place: Place) -> tuple[int, ...]:
-    """The whole numbers of runs; `DataError` for what are none."""
+    """The whole numbers of runs; `DataError` for texts that are none."""
     runs = [re.fullmatch(r"(-?\d{1,18}):(-?\d{1,18})", run) for run in str(text).strip().split(",")]
     ends = [(int(run[1]), int(run[2])) for run in runs if run]
     if len(ends) < len(runs) or any(not 0 <= last - first < MOST_EXPOSURES for first, last in ends):
@@ -104,13 +104,11 @@ def remark(found: Compression, points: int) -> str:
     """Caution about a set that stands for pixels."""
     return (
         f"{points} field points stand for {found.pixels:,} pixels, of which χ²/dof was "
-        f"{found.chi2 / max(found.dof, 1):.5g}: what is smaller than a twentieth of the field is not seen here"
+        f"{found.chi2 / max(found.dof, 1):.5g}: structure below a twentieth of the field is not seen here"
     )
 
 
 # -------------------------------------------------------------------------------------------------- tables
-
-_CODES = {"int": "J", "float": "D", "bool": "L"}
 
 
 def write_calibration_set(
@@ -118,7 +116,7 @@ def write_calibration_set(
 ) -> None:
     """Write a calibration set as tables, with checksums; the file appears whole or not at all.
 
-    What was read comes back bit for bit, rows that are not used included; other intensities (frames, say)
+    Data that were read come back bit for bit, rows that are not used included; other intensities (frames, say)
     are written as their used rows. The bytes depend on the set alone, not on the day.
 
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only,
@@ -145,26 +143,20 @@ def set_tables(calset: CalibrationSet) -> dict[str, dict[str, np.ndarray]]:
         "INTENSITIES": {
             "EXPOSURE": calset.exposures.exposure[intensities.exposure],
             "POINT": points.point[intensities.point],
-            # The appended −1 is what a row without a source (−1, the last entry) becomes.
+            # The appended −1 is the entry of a row without a source (−1, the last entry).
             "SOURCE": np.append(sources.source, -1)[intensities.source],
             "N": intensities.counts,
             "N_ERR": intensities.sigma,
             "FLAG": intensities.flag,
         },
     }
+    if intensities.sky is not None:
+        tables["INTENSITIES"]["SKY"] = intensities.sky
     if len(sources):
         tables["SOURCES"] = sources.columns()
     if calset.filters:
         tables["FILTERS"] = filter_columns(calset.filters)
     return tables
-
-
-def sign_and_write(hdus: list[Any], path: Path) -> None:
-    """Add checksums to HDUs and write them to a file that may be there already (a temporary one)."""
-    for hdu in hdus:
-        # astropy would note the date in the comments: then equal sets would be unequal files.
-        hdu.add_checksum(when="FITS checksum of this extension")
-    fits.HDUList(hdus).writeto(path, overwrite=True, output_verify="exception")
 
 
 def _primary(calset: CalibrationSet, path: object) -> fits.PrimaryHDU:
@@ -181,64 +173,8 @@ def _primary(calset: CalibrationSet, path: object) -> fits.PrimaryHDU:
     }
     for name, (value, comment) in cards.items():
         if isinstance(value, str):
-            _ascii(value, name, place)
+            check_ascii(value, name, place)
         elif not np.isfinite(value):
             continue  # FITS headers know no NaN; a missing card is read as one
         primary.header[name] = (value, comment)
     return primary
-
-
-def set_table_hdu(name: str, columns: Mapping[str, np.ndarray], path: object) -> fits.BinTableHDU:
-    """A table of a calibration set."""
-    rules = schema.table_rules(name, list(columns), Place(path, name))
-    return table_hdu(name, columns, path, rules)
-
-
-def filter_columns(filters: Mapping[str, FilterCurve]) -> dict[str, np.ndarray]:
-    """The columns of a FILTERS table, padded with NaN."""
-    longest = max(len(curve.wavelength) for curve in filters.values())
-    columns = {name: np.full((len(filters), longest), np.nan) for name in ("WAVELENGTH", "THROUGHPUT")}
-    for row, curve in enumerate(filters.values()):
-        columns["WAVELENGTH"][row, : len(curve.wavelength)] = curve.wavelength
-        columns["THROUGHPUT"][row, : len(curve.throughput)] = curve.throughput
-    return {"FILTER": np.array(list(filters)), **columns}
-
-
-def table_hdu(
-    name: str, columns: Mapping[str, np.ndarray], path: object, rules: Mapping[str, schema.Column]
-) -> fits.BinTableHDU:
-    """A binary table by its rules; columns that have a default may be left out.
-
-    Raises `DataError`, naming `path`, for text that is not plain ASCII.
-    """
-    made = []
-    for column, rule in rules.items():
-        if column not in columns and rule.missing is not None:
-            continue
-        values = columns[column]
-        if rule.kind == "str":
-            for value in np.unique(values):
-                _ascii(str(value), column, Place(path, name))
-            code = f"{max(1, values.dtype.itemsize // 4)}A"
-        else:
-            width = 1 if values.ndim == 1 else values.shape[1]
-            code = f"{width if width > 1 else ''}{_CODES[rule.kind]}"
-            if rule.kind == "int" and np.any(np.abs(values) > 2**31 - 1):
-                code = "K"
-        made.append(fits.Column(name=column, format=code, unit=rule.unit or None, array=values))
-    return fits.BinTableHDU.from_columns(made, name=name)
-
-
-def _ascii(value: str, column: str, place: Place) -> None:
-    if not value.isascii() or not (value.isprintable() or not value):
-        raise place.fail(f"{value!r} is not plain ASCII", column, "FITS knows no other letters: rename it")
-
-
-def grid_cards(grid: Grid) -> dict[str, str | float]:
-    """The header cards of the linear field coordinates of an image."""
-    cards: dict[str, str | float] = {}
-    for n, axis in enumerate("XY"):
-        cards |= {f"CTYPE{n + 1}": axis, f"CUNIT{n + 1}": "deg"}
-        cards |= {f"CRPIX{n + 1}": grid.reference[n], f"CRVAL{n + 1}": grid.value[n]}
-        cards |= {f"CD{n + 1}_{m + 1}": grid.matrix[n][m] for m in range(2)}
-    return cards

@@ -23,10 +23,10 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Bool, Float, Shaped
 
+from walop_jax.data.hdus import sign_and_write, table_hdu
 from walop_jax.data.records import Exposures, Points
 from walop_jax.data.schema import Column, read_table
 from walop_jax.data.units import Place
-from walop_jax.data.write import sign_and_write, table_hdu
 from walop_jax.diagnosis.findings import HARMONICS, Cube, Diagnosis
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail

@@ -181,7 +181,7 @@ class DetectionLimits(Displayed):
         )
         return Display(
             title="What these data can show, with 99 % probability",
-            facts=(("could hide", self.protection_in_words() or NO_LEVEL),),
+            facts=(("undetectable", self.protection_in_words() or NO_LEVEL),),
             head=HEAD,
             rows=tuple(rows),
             notes=notes,

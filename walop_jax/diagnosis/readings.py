@@ -28,7 +28,7 @@ from walop_jax.data.kinds import POLARISER
 from walop_jax.data.records import CalibrationSet, Exposures, Points, Position
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
-from walop_jax.fit.model_file import base_model, model_like
+from walop_jax.fit.base_model import base_model, model_like
 from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.instruments.description import shipped

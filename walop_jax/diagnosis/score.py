@@ -392,8 +392,13 @@ def _log_of_chi2(statistic: Any, rank: int) -> Any:
 
 def _log_survival(statistic: np.ndarray, rank: int) -> np.ndarray:
     """ln of the χ² survival function by interpolation: millions of values, 10⁻⁴ is plenty."""
+    return np.interp(statistic, *_survival_grid(rank))
+
+
+@functools.cache
+def _survival_grid(rank: int) -> tuple[np.ndarray, np.ndarray]:
     grid = np.linspace(0.0, rank + 12.0 * np.sqrt(2.0 * rank) + 60.0, 2000)
-    return np.interp(statistic, grid, _log_of_chi2(grid, rank))
+    return grid, _log_of_chi2(grid, rank)
 
 
 def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, float]:

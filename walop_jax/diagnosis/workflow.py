@@ -36,7 +36,7 @@ from walop_jax.diagnosis.refits import Refits
 from walop_jax.diagnosis.search import State, search
 from walop_jax.diagnosis.stated_conditions import instead_of_names, rival_conditions
 from walop_jax.diagnosis.trust import examined, pixel_structure
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, with_honest_errors
 from walop_jax.fit.stand_in import in_field_points
 from walop_jax.fit.verdict import Quality

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood.forward import WHAT, Forward
 from walop_jax.model.compiled import need_float64
 from walop_jax.model.specification import Model

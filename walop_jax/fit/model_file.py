@@ -1,8 +1,4 @@
-"""Models from data, from a model file (TOML, docs: files), or from neither.
-
-The scale of the throughput is a gauge unless a flux is known: the constant of camera N0 is held then. Of two cameras,
-and where every arm has a flux of its own, the whole series of the first one is: only ratios can be known.
-"""
+"""Model files (TOML, docs: files): their text, and the model of an instrument that one describes."""
 
 from __future__ import annotations
 
@@ -15,12 +11,6 @@ from typing import Any
 
 import tomlkit
 
-from walop_jax.data.kinds import POLARISER
-from walop_jax.data.merge import parts_of
-from walop_jax.data.records import CalibrationSet
-from walop_jax.data.settings import Settings
-from walop_jax.instruments.description import shipped
-from walop_jax.io.errors import DataError
 from walop_jax.io.text import parse_toml
 from walop_jax.io.toml import Reader, Table
 from walop_jax.model.effects import EFFECTS, Context, EffectKind, effect_by_name
@@ -28,12 +18,8 @@ from walop_jax.model.effects.catalogue import entries, is_own
 from walop_jax.model.instrument import Instrument, adapted, as_designed, nominal_instrument
 from walop_jax.model.laws import laws_of
 from walop_jax.model.parameters import Parameter, check_names, unknown_name
-from walop_jax.model.sources import MoonSky, Standards
-from walop_jax.model.specification import THROUGHPUT, Model, effect_context, make_model, with_effects
-from walop_jax.model.standards import half_range, standards_of
-
-LEVEL_POINTS = 256
-"""Field points from which the start value of a throughput is taken: a start need not be exact."""
+from walop_jax.model.sources import Standards
+from walop_jax.model.specification import Model, make_model, with_effects
 
 TABLES = ("model", "effects", "catalogue", "parameters", "law")
 PARAMETER: Table = {
@@ -171,147 +157,6 @@ Catalogue = Sequence[EffectKind]
 
 
 GAUGE = "throughput.n0.p00"
-SKY_AND_STARS = (MoonSky.name, Standards.name)  # parts that are not the instrument's
-LEVEL = 0.5  # of a throughput whose scale is a gauge
-
-
-def base_model(
-    calset: CalibrationSet,
-    instrument: Instrument | None = None,
-    *,
-    plates: str | None = None,
-    throughput_degree: int | None = None,
-) -> Model:
-    """The base model (docs: model) for the instrument and standards of a calibration set.
-
-    `instrument` is the one as designed, needed where its name is not one that comes with the package; `plates` and
-    `throughput_degree` replace what it says. Raises `DataError` for an instrument that nobody knows, and ValueError
-    for one of another name than the set's, or without a moving element that the set has in the beam.
-
-    >>> walop.base_model(calset)["pupil.magnification"].prior
-    (15.63, 0.05)
-    """
-    sources, level = calset.sources, _level(calset)
-    standards = standards_of(sources, calset.exposures, calset.filters)
-    instrument = as_designed(instrument or instrument_of(calset))
-    if instrument.name != calset.instrument:
-        raise ValueError(
-            f"the data come from {calset.instrument}, the instrument described is {instrument.name}"
-        )
-    if len(instrument.cameras) != calset.cameras:
-        raise ValueError(
-            f"{instrument.name} has {len(instrument.cameras)} cameras, the data have {calset.cameras}"
-        )
-    present = Settings.of(calset.exposures, [p for p in calset.exposures.positions if p != POLARISER])
-    present.check_moving(instrument.patched().moving())
-    instrument = adapted(
-        instrument,
-        standards=standards,
-        plates=plates,
-        throughput_degree=throughput_degree,
-        throughput=level,
-    )
-    priors = {}
-    for i, name in enumerate(standards.names):
-        priors[f"standard.{name}.q"] = (float(sources.q[i]), float(sources.q_err[i]))
-        priors[f"standard.{name}.u"] = (float(sources.u[i]), float(sources.u_err[i]))
-    for i in standards.unknown:
-        wavelength, _ = standards.bands[i]
-        width = half_range(sources, i, calset.exposures, calset.filters)
-        priors[f"standard.{standards.names[i]}.wavelength"] = (wavelength, width)
-    model = make_model(calset.instrument, instrument, priors=priors)
-    for i in model.positions(THROUGHPUT):
-        p = model.parameters[i]
-        model = model.change(p.name, scale=p.scale * level / LEVEL, loose=level)
-    for name in gauges(model, has_known_flux(calset)):
-        model = model.change(name, free=False)
-    if not calset.exposures.direct("moon").any():
-        model = model.change("sky.depolarisation", free=False)
-    return model
-
-
-def _level(calset: CalibrationSet) -> float:
-    """Level of the throughput: that of the first field points with a known flux, `LEVEL` where there are none.
-
-    A camera gets half of the unpolarised light: N = T/2.
-    """
-    for subset, points, exposures in parts_of(calset):
-        stated = calset.exposures.flux_known[exposures]
-        for start in range(0, len(points) if stated.any() else 0, LEVEL_POINTS):
-            block = subset.block(start, min(start + LEVEL_POINTS, len(points)))
-            counts = block.counts[block.used & stated]
-            if counts.size:
-                return float(2.0 * counts.mean())
-    return LEVEL
-
-
-def gauges(model: Model, flux_known: bool) -> list[str]:
-    """Parameters that fluxes take up: the scale of the throughput, or all that the cameras of an arm have in common."""
-    cameras = model.template.cameras
-    if flux_known and not cameras.split:
-        return []
-    units = tuple(f"throughput.n{camera}." for camera in cameras.units)
-    return [name for name in model.names if name.startswith(units)] if units else [GAUGE]
-
-
-def instrument_of(calset: CalibrationSet) -> Instrument:
-    """The instrument of a set as designed, if it comes with the package; `DataError` with advice if not."""
-    if calset.instrument not in shipped():
-        raise DataError(
-            f"INSTRUME is {calset.instrument!r}, which does not come with the package ({', '.join(shipped())}): give "
-            "its description, --instrument FILE or instrument=Instrument.read(FILE)"
-        )
-    return nominal_instrument(calset.instrument)
-
-
-def has_known_flux(calset: CalibrationSet) -> bool:
-    """True if any exposure is of KIND `flux`, so that the overall scale of the throughput is measured."""
-    return bool(calset.exposures.flux_known.any())
-
-
-def model_for(
-    calset: CalibrationSet,
-    text: str = "",
-    instrument: Instrument | None = None,
-    catalogue: Catalogue = EFFECTS,
-) -> Model:
-    """The base model of a calibration set, changed as a model file (TOML text) says; `instrument` as for `base_model`.
-
-    `catalogue` are the effects that the file may name.
-    Raises ValueError for anything in the text that does not exist or does not fit the data.
-    """
-
-    def build(header: ModelTable) -> Model:
-        model = base_model(
-            calset, instrument, plates=header.plates, throughput_degree=header.throughput_degree
-        )
-        model = dataclasses.replace(model, catalogue=known_to(header, catalogue))
-        context = effect_context(model.template, calset.exposures)
-        return _with_effects(model, header, context)
-
-    return parse(text, build)
-
-
-def model_like(calset: CalibrationSet, old: Model) -> Model:
-    """The model `old` for another calibration set: its plates, effects, priors, ties and what it holds.
-
-    Sky and standards are those of the new set. Raises ValueError for a set of another instrument.
-    """
-    header = header_of(old)
-    model = base_model(calset, old.template, plates=header.plates, throughput_degree=header.throughput_degree)
-    own_kinds = dict.fromkeys((*(effect.kind for effect in old.template.effects), *old.catalogue))
-    model = dataclasses.replace(model, catalogue=tuple(own_kinds))
-    model = _with_effects(model, header, effect_context(model.template, calset.exposures))
-    unchanged = {p.name: p for p in old.parameters if p.name != GAUGE and p.part not in SKY_AND_STARS}
-    parameters = tuple(
-        dataclasses.replace(
-            p, free=unchanged[p.name].free, prior=unchanged[p.name].prior, tie=unchanged[p.name].tie
-        )
-        if p.name in unchanged
-        else p
-        for p in model.parameters
-    )
-    return dataclasses.replace(model, parameters=parameters, laws=old.laws)
 
 
 def model_without_data(
@@ -339,7 +184,7 @@ def model_without_data(
         conditions = context or Context(
             sources=nominal.standard.names, cameras=nominal.cameras.names, units=nominal.units
         )
-        return _with_effects(model, header, conditions)
+        return with_effects_of(model, header, conditions)
 
     return parse(text, build)
 
@@ -351,7 +196,8 @@ def known_to(header: ModelTable, catalogue: Catalogue) -> tuple[EffectKind, ...]
     return (*catalogue, *entries(stated))
 
 
-def _with_effects(model: Model, header: ModelTable, context: Context) -> Model:
+def with_effects_of(model: Model, header: ModelTable, context: Context) -> Model:
+    """The model with the effects of a [model] table, at its choices."""
     effects: list[Any] = []
     for name in header.effects:
         choices: Mapping[str, Any] = header.choices.get(name, {})

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 
 from walop_jax.data.records import CalibrationSet, DataFlag
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.likelihood.likelihood import Likelihood

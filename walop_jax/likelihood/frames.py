@@ -37,7 +37,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from walop_jax.data.frames import FrameIntensities, Grid, RawRows, RowReader, float64
+from walop_jax.data.frames import FrameIntensities, RawRows, RowReader, float64
+from walop_jax.data.grid import Grid
 from walop_jax.data.merge import frames_among, without_frames
 from walop_jax.data.records import Block
 from walop_jax.data.table_intensities import NEGATIVE

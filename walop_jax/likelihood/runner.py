@@ -17,8 +17,7 @@ from typing import TypeVar
 
 import jax
 
-from walop_jax.io.code import cores
-from walop_jax.model.compiled import float64
+from walop_jax.model.compiled import float64, usual_threads
 
 Progress = Callable[[str], None]
 """Is given a line about what is being done."""
@@ -26,14 +25,6 @@ Progress = Callable[[str], None]
 TOLD_EVERY = 1.0  # s
 
 T = TypeVar("T")
-
-
-def usual_threads() -> int:
-    """Number of slabs that are worked on at a time unless told otherwise."""
-    devices = len(jax.local_devices())
-    if devices > 1 or jax.default_backend() != "cpu":
-        return 2 * devices  # one computes while the next one is read
-    return cores()
 
 
 @dataclasses.dataclass(frozen=True)

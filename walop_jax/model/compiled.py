@@ -43,6 +43,8 @@ import jax
 import numpy as np
 from jax import export
 
+from walop_jax.io.code import cores
+
 FOLDER = "programs"
 CACHE_VARIABLE = "WALOP_JAX_CACHE"
 _DIGEST = hashlib.sha256().digest_size
@@ -293,6 +295,14 @@ def float64() -> contextlib.AbstractContextManager[Any]:
         return contextlib.nullcontext()
     here = jax if hasattr(jax, "enable_x64") else importlib.import_module("jax.experimental")  # jax < 0.8
     return here.enable_x64(True)
+
+
+def usual_threads() -> int:
+    """Number of pieces of work that are computed at a time by default."""
+    devices = len(jax.local_devices())
+    if devices > 1 or jax.default_backend() != "cpu":
+        return 2 * devices  # one computes while the next one is read
+    return cores()
 
 
 def cache_folder() -> Path | None:

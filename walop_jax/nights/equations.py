@@ -25,7 +25,8 @@ from jaxtyping import Bool, Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet, Exposures, Site
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.model_file import SKY_AND_STARS, gauges, header_of
+from walop_jax.fit.base_model import SKY_AND_STARS, gauges
+from walop_jax.fit.model_file import header_of
 from walop_jax.fit.search import nearer
 from walop_jax.io.errors import DataError, fail
 from walop_jax.likelihood import engine
@@ -137,6 +138,8 @@ def of_exposures(calset: CalibrationSet, keep: Bool[np.ndarray, " e"]) -> Calibr
         name: getattr(intensities, name)[rows]
         for name in ("point", "source", "counts", "sigma", "flag", "used")
     }
+    if intensities.sky is not None:
+        columns["sky"] = intensities.sky[rows]
     table = TableIntensities(
         int(keep.sum()), intensities.points, exposure=place[intensities.exposure[rows]], **columns
     )

@@ -26,7 +26,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.model_file import model_like
+from walop_jax.fit.base_model import model_like
 from walop_jax.io.code import files_of_users, run_file
 from walop_jax.io.errors import DataError, fail
 from walop_jax.model.specification import Model

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
+from walop_jax.data.hdus import sign_and_write, table_hdu
 from walop_jax.data.schema import Column, read_table
 from walop_jax.data.units import Place
-from walop_jax.data.write import sign_and_write, table_hdu
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
 from walop_jax.io.fits_reading import OpenFile, open_fits

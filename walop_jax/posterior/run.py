@@ -15,7 +15,7 @@ from walop_jax.calibration.calibration import Calibration, Matrix, Product
 from walop_jax.calibration.product import read_product
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.model_file import model_for
+from walop_jax.fit.base_model import model_for
 from walop_jax.fit.parameter_table import Fitted
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.verdict import STATED
@@ -35,7 +35,7 @@ SAME_FIT = 0.05  # standard errors
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """The folder of a run; everything in it is read when it is asked for. None stands for what is not there.
+    """The folder of a run; files are read when they are needed. None stands for files that are missing.
 
     `catalogue` are the effects that its model may have, `data` the sets of its fit (default: where they were, in the
     folder of the run, or beside it).
@@ -98,7 +98,7 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
     def calset(self) -> CalibrationSet:
         """The data of the fit.
 
-        Raises `DataError` where the run does not say what they were, and where they are not there or have changed.
+        Raises `DataError` where the run does not name them, and where they are missing or have changed.
         """
         inputs = () if self.product is None else self.product.inputs
         if not inputs:
@@ -112,9 +112,9 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
     def _located(self, path: Path) -> Path:
         beside = self.folder.resolve()
         for folder in (Path(), beside, *beside.parents):
-            for there in (folder / path, folder / path.name):
-                if there.exists():
-                    return there
+            for candidate in (folder / path, folder / path.name):
+                if candidate.exists():
+                    return candidate
         raise fail(
             f"cannot be found, neither from {Path.cwd()} nor beside {self.folder}",
             file=path,
@@ -167,19 +167,19 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
 
     def display(self) -> Display:
         """The files, and the calibration if there is one."""
-        found = self.documents
+        documents = self.documents
         files = {"calibration": PRODUCT, "posterior": POSTERIOR}
         held = [name for name, file in files.items() if file in self]
-        facts = [("holds", ", ".join([*held, *found]) or "nothing")]
-        known = found.get("summary", {}).get("accuracy_of_p")
-        if known and found["summary"].get("trusted"):
-            share = f"below 0.1 % over {100 * known['share_below_goal']:.0f} % of it"
+        facts = [("holds", ", ".join([*held, *documents]) or "nothing")]
+        accuracy = documents.get("summary", {}).get("accuracy_of_p")
+        if accuracy and documents["summary"].get("trusted"):
+            share = f"below 0.1 % over {100 * accuracy['share_below_goal']:.0f} % of it"
             facts.append(
-                ("p of a star", f"{two_digits(100 * known['median'])} % (median of the field), {share}")
+                ("p of a star", f"{two_digits(100 * accuracy['median'])} % (median of the field), {share}")
             )
         facts += [
             (name, document["shown"]["title"])
-            for name, document in found.items()
+            for name, document in documents.items()
             if "shown" in document and name != "summary"
         ]
         inner = Display("") if self.calibration is None else self.calibration.display()

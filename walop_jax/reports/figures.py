@@ -17,7 +17,7 @@ from scipy.ndimage import zoom
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap
 from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.model_file import instrument_of
+from walop_jax.fit.base_model import instrument_of
 from walop_jax.io.text import two_digits, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.reports.style import (

@@ -209,10 +209,8 @@ def _asked(run: RunContents) -> tuple[Display | None, bool]:
     checks = requirements(run.product.verdict, "", accuracy, None)
     all_met = all(check.met for check in checks)
     title = "No go" if not is_go(checks) else "Go: fit for use" if all_met else "Go, with reservations"
-    advice = requirement_advice(checks)
-    return Display(title, head=("", "asked", "found"), rows=requirement_rows(checks), notes=advice), is_go(
-        checks
-    )
+    rows, advice = requirement_rows(checks), requirement_advice(checks)
+    return Display(title, head=("", "requirement", "result"), rows=rows, notes=advice), is_go(checks)
 
 
 def _accuracy(run: RunContents) -> FieldAccuracy | None:

@@ -15,7 +15,7 @@ from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
-from walop_jax.fit.model_file import instrument_of
+from walop_jax.fit.base_model import instrument_of
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import with_minus_sign
 from walop_jax.model.instrument import Instrument

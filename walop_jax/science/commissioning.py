@@ -94,9 +94,9 @@ def is_go(asked: Sequence[Requirement]) -> bool:
 
 
 def requirement_rows(asked: Sequence[Requirement]) -> tuple[tuple[str, str, str], ...]:
-    """A row for each requirement: ok, NO where it is needed, no where it is advice; the requirement, the value."""
+    """A row for each requirement: ok, NO where it is needed, advice where it is not; the requirement, the result."""
     return tuple(
-        ("ok" if need.met else "NO" if need.needed else "no", need.what, need.found) for need in asked
+        ("ok" if need.met else "NO" if need.needed else "advice", need.what, need.found) for need in asked
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.fit.model_file import base_model
+from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Context, Effect, effect_by_name
 from walop_jax.model.specification import effect_context, with_effects

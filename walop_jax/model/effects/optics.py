@@ -22,8 +22,11 @@ from jaxtyping import Array, Float
 from walop_jax.model import mueller
 from walop_jax.model.effects.change import (
     KINDS,
+    SINGLE,
+    SLOW,
     AtPoint,
     Change,
+    Combinations,
     Grows,
     Kind,
     Scalar,
@@ -53,6 +56,14 @@ GENERATORS = tuple(
 """Kinds of which all others are sums."""
 ADDED = ("added polarisation q", "added polarisation u")
 DISPLACEMENTS = ("displacement x", "displacement y")
+GROUPS = (
+    *(tuple(f"{what} {axis}" for axis in "qu") for what in ("diattenuation", "retardance")),
+    ("diattenuation v",),
+    ("retardance v",),
+    ("depolarisation",),
+    *((f"{what} {axis}",) for what in ("diattenuation", "retardance") for axis in ("radial", "diagonal")),
+)
+"""Kinds that a diagnosis tries, those of one phenomenon together."""
 
 
 def generators_of(kind: str) -> tuple[tuple[str, float, tuple[str, ...]], ...]:
@@ -191,16 +202,34 @@ def _beside(instrument: Instrument, element: Element, change: Change) -> Instrum
     return instrument.inserted(element, **{"before" if change.where == "ahead of" else "after": change.place})
 
 
+_FIELD = ("even", "tilt", "r2", "astigmatic")
+_NOT_IN_OTHER_KINDS = {"q": _FIELD[:3], "u": _FIELD[:3], "radial": _FIELD[:1], "diagonal": _FIELD[:1]}
+_ANYTHING = Combinations(_FIELD[:3], ("steady", "hours", "kelvin"), ("anything",))
+_TURN = (
+    Combinations(_FIELD, ("steady", *SLOW)),
+    Combinations(along=("harmonics to 6", *SINGLE, "side", "night", "step", "spell", "exposure")),
+    Combinations(("tilt", "r2"), ("harmonics to 1",)),  # a beam that wanders over a film that is not uniform
+)
+
+
 def _grows(instrument: Instrument, change: Change) -> Grows:
     """Optics with what a ray knows, and with the angle of the element that they are of; the polariser by exposure."""
-    polariser = instrument.polariser
+    kind, polariser = change.kind, instrument.polariser
+    over = _NOT_IN_OTHER_KINDS.get(kind.rpartition(" ")[2], _FIELD)
+    always = Combinations(over, ("steady", *SLOW))
     if _is_ahead(instrument, change):
-        return Grows((FIELD, EXPOSURE), None)
+        return Grows((FIELD, EXPOSURE), None, (always, Combinations(along=(*SINGLE, "kind")), _ANYTHING))
     if change.where != "of":
-        return Grows((FIELD, WAVELENGTH, EXPOSURE))
+        more = Combinations(over, ("colour",)), Combinations(among=("all",)), _ANYTHING
+        return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=(always, *more))
     if polariser is not None and change.place == polariser.name:
-        return Grows((FIELD, EXPOSURE), None)
-    return Grows((FIELD, WAVELENGTH, EXPOSURE), instrument.element(change.place).moves or "")
+        film = always, Combinations(over, ("harmonics to 2",)), Combinations(along=(*SINGLE, "side"))
+        as_a_turn = {"turn": _TURN, "retardance v": ()}
+        return Grows((FIELD, EXPOSURE), None, as_a_turn.get(kind, film))
+    tried = (
+        Combinations(along=("step", "spell")) if kind == "turn" else Combinations(over, ("harmonics to 2",))
+    )
+    return Grows((FIELD, WAVELENGTH, EXPOSURE), instrument.element(change.place).moves or "", (tried,))
 
 
 def _is_ahead(instrument: Instrument, change: Change) -> bool:
@@ -253,7 +282,12 @@ def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 def _grows_added(instrument: Instrument, change: Change) -> Grows:
     """Anything where light from the sky has it alone, nothing behind."""
-    return Grows((FIELD, EXPOSURE), None) if _is_ahead(instrument, change) else Grows()
+    tried = (
+        Combinations(("tilt", "r2")),  # the same everywhere it is diattenuation
+        Combinations(("even", "tilt", "r2"), SLOW),
+        Combinations(along=(*SINGLE, "kind")),
+    )
+    return Grows((FIELD, EXPOSURE), None, tried) if _is_ahead(instrument, change) else Grows()
 
 
 def _displaced(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -285,12 +319,16 @@ KINDS |= {
         _displaced,
         lambda change: change.place,
         _OF_FIELD,
-        lambda *_: Grows((FIELD, EXPOSURE)),
+        lambda *_: Grows((FIELD, EXPOSURE), tried=(Combinations(("even", "tilt", "r2"), ("steady", *SLOW)),)),
         slots=itself("whole"),
     )
     for name in DISPLACEMENTS
 }
 _OF_FRINGES = "narrow bands a nanometre apart, or the same band at another temperature"
 KINDS["fringes"] = Kind(
-    "share", _fringes, test=_OF_FRINGES, grows=lambda *_: Grows((SHAPE,)), slots=_slots_of_fringes
+    "share",
+    _fringes,
+    test=_OF_FRINGES,
+    grows=lambda *_: Grows((SHAPE,), tried=(Combinations(among=("alone", "all")),)),
+    slots=_slots_of_fringes,
 )
