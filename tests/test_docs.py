@@ -105,7 +105,7 @@ def test_topics():
 
 
 @every_page
-def test_a_page_has_a_title_and_says_in_a_sentence_what_it_is_about(topic):
+def test_a_page_has_a_title_and_one_sentence_about_it(topic):
     lines = PAGES[topic].splitlines()
     assert re.fullmatch(r"# \S.*", lines[0])
     assert lines[1] == "" == lines[3]
@@ -150,7 +150,7 @@ def test_code_cites_pages_that_exist():
     assert [entry for entry in cited if entry[1] not in TOPICS] == []
 
 
-def test_every_command_is_told_of():
+def test_every_command_is_on_a_page():
     told = "\n".join([(ROOT / "README.md").read_text(encoding="utf-8"), *PAGES.values()])
     assert [name for name in COMMANDS if f"walop-jax {name}" not in told] == []
 
@@ -401,7 +401,7 @@ def test_choices_of_effects(effect, choice):
     assert f"choice: `{choice}`" in told[4]
 
 
-def test_what_looks_alike_has_names_that_exist():
+def test_effects_that_look_alike_exist():
     from walop_jax.model.effects import EFFECTS
 
     names = {kind.name for kind in EFFECTS}

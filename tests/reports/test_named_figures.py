@@ -85,7 +85,7 @@ def assert_fits_in_print(figure, millimetres):
 
 
 @pytest.mark.parametrize("name", WITHOUT)
-def test_what_a_run_lacks_is_said(source, name):
+def test_missing_parts_of_a_run_are_named(source, name):
     with pytest.raises(DataError, match=r"has no posterior|holds no (map|limits|diagnosis)"):
         draw(name, source)
 
@@ -123,7 +123,7 @@ def test_names_and_files(source, tmp_path):
         plot(source.folder, "matrix", output=path)
 
 
-def test_maps_say_their_scale(source):
+def test_titles_of_maps_give_their_range(source):
     maps = source.maps
     axis = draw("efficiency", source).axes[0]
     said = axis.get_title().splitlines()[1].removesuffix(" %").split(" to ")

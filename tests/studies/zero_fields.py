@@ -17,8 +17,11 @@ import numpy as np
 from matrix_at import matrix_at
 
 import walop_jax as walop
-from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import matrices
+from walop_jax.data.settings import Settings
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.observing_plan import polariser_turn
 from walop_jax.simulation.simulate import PhotonNoise, Simulated
 
@@ -29,13 +32,14 @@ BASE = walop.ObservingPlan(
 
 
 def shortened(run: Simulated, share: float, seed: int) -> walop.CalibrationSet:
-    """The set with a share of the time for all exposures of stars: fewer electrons, drawn anew."""
+    """The set with a share of the time for all exposures of stars: so many of the electrons, drawn from those there."""
     table = TableIntensities.of(run.calset.intensities, run.calset.points)
     star = run.calset.exposures.kind[table.exposure] == "standard"
     noise, rng = PhotonNoise(BASE.read_noise), np.random.default_rng(seed)
     counts, sigma = table.counts.copy(), table.sigma.copy()
-    # Measured counts for expected ones: their noise is a hundredth of what comes after it.
-    counts[star], sigma[star] = noise.draw(rng, share * np.maximum(counts[star], 0.0))
+    kept = rng.binomial(np.maximum(np.rint(counts[star]), 0.0).astype(int), share)
+    read = BASE.read_noise * np.sqrt(1.0 - share**2) * rng.standard_normal(kept.shape)
+    counts[star], sigma[star] = kept + read, noise.sigma(kept + read)
     return dataclasses.replace(run.calset, intensities=dataclasses.replace(table, counts=counts, sigma=sigma))
 
 
@@ -43,11 +47,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=10)
     parser.add_argument("--stars", type=int, default=100)
+    parser.add_argument("--exposures", type=int, nargs="+", default=[1, 4])
     given = parser.parse_args()
     side = round(given.stars**0.5)
     one = dataclasses.replace(BASE, standards=1, unpolarised=1, standard_grid=side)
     plans = {"one star stepped": (one, 1.0 / side**2)}
-    for exposures in (1, 4):
+    for exposures in given.exposures:
         for scatter in (0.0, 5e-4):
             field = dataclasses.replace(
                 BASE, zero_stars=given.stars, zero_exposures=exposures, zero_scatter=scatter
@@ -61,9 +66,11 @@ def main() -> None:
         for seed in range(given.sets):
             run = walop.simulate(plan, seed=seed)
             calset = run.calset if share == 1.0 else shortened(run, share, seed)
-            fit = walop.refit(calset)
-            ratio.append(fit.chi2 / fit.dof)
-            matrix, covariance = Calibration.from_fit(fit).matrix(x, y)
+            result = fit(Likelihood.of(calset, walop.base_model(calset, throughput_degree=2)))
+            ratio.append(result.chi2 / result.dof)
+            instrument = result.model.instrument(result.values)
+            settings = Settings.default(len(x), str(calset.exposures.filter[0]))
+            matrix, covariance = matrices(instrument, settings, calset.filters, x, y, result.covariance)
             error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[:, [0, 3]]
             errors.append(error)
             pulls.append((matrix - matrix_at(run.truth, calset, x, y))[:, [0, 3]] / error)

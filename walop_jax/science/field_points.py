@@ -72,17 +72,18 @@ def field_points(
     columns = {name: numeric_column(source, name, rule) for name, rule in POINT_COLUMNS.items()}
     check(columns, POINT_COLUMNS, place)
     x, y = columns["X"], columns["Y"]
+    moving = instrument.moving()
+    missing = [prefix for prefix in moving if prefix in always_in and f"{prefix}_ANGLE" not in source.names]
+    if missing:
+        options = " ".join(f"--at {prefix}=0" for prefix in missing)
+        raise place.fail(
+            f"the angle of {' and of '.join(missing)} is missing, in the beam in all exposures of the calibration",
+            ", ".join(f"{prefix}_ANGLE" for prefix in missing),
+            f"give the column (deg, NaN: out); the same for all points: walop-jax matrix {options}",
+        )
     positions, turns = {}, {}
-    for prefix in instrument.moving():
+    for prefix in moving:
         name = f"{prefix}_ANGLE"
-        if prefix in always_in and name not in source.names:
-            what = (
-                f"the angle of {prefix} is missing, which was in the beam in all exposures of the calibration"
-            )
-            advice = (
-                f"give the column {name} (deg, NaN: out); for all points of walop-jax matrix --at {prefix}=0"
-            )
-            raise place.fail(what, name, advice)
         angle = numeric_column(source, name, EXPOSURES["CLP_ANGLE"])
         doubt_radians(source, name, angle, place)
         inside, unstated = np.isfinite(angle), np.ones(source.rows, bool)
