@@ -36,7 +36,7 @@ def quality(
     """Add a row of quality numbers for each night to a table, and list those outside their limits.
 
     Angle and p of polarised standards and q, u of unpolarised ones against their catalogue (each as all other data see
-    it), χ², gains of the cameras, the accuracy of p and of mistakes that could hide. A night that is there already is
+    it), χ², gains of the cameras, the accuracy of p and undetectable errors. A night that is there already is
     replaced, the same calibration is not added twice; the table is whole whenever it is read.
 
     Exit code 3 if a number of these nights is outside its limits, or a fit is not trusted.
