@@ -47,6 +47,7 @@ def quality(
     """
     from walop_jax import Run
     from walop_jax.io.atomic import check_output
+    from walop_jax.io.plain_tables import table_format
     from walop_jax.io.run_folder import RunFolder
     from walop_jax.reports.posterior_figures import save_figure
     from walop_jax.reports.survey_figures import quality_figure
@@ -61,6 +62,9 @@ def quality(
     )
 
     allowed = read_limits(limits)
+    if output is not None:
+        check_output(output, overwrite=True)
+        table_format(output)
     if figure is not None:
         check_output(figure, overwrite=True)
     given: list[Any] = list(runs) if isinstance(runs, list | tuple) else [runs]

@@ -402,7 +402,7 @@ class Solution:
         return linalg.cho_solve(self.factor, np.eye(size)) if size else np.zeros((0, 0))
 
     @functools.cached_property
-    def _smoothed(self) -> list[tuple[Matrix, Matrix, Matrix]]:
+    def smoothed(self) -> list[tuple[Matrix, Matrix, Matrix]]:
         """Of every cell the covariance of its unknowns, that with the globals, and that with the next cell's."""
         found: list[tuple[Matrix, Matrix, Matrix]] = []
         later: tuple[Matrix, Matrix] | None = None
@@ -504,7 +504,7 @@ class Solution:
         joint = np.zeros((size + len(parts), size + len(parts)))
         joint[:size, :size] = self.covariance
         for a, (_, c, k, _) in enumerate(parts):
-            own, cross, after = self._smoothed[c]
+            own, cross, after = self.smoothed[c]
             joint[size + a, :size] = joint[:size, size + a] = cross[k]
             for b, (_, d, m, _) in enumerate(parts[: a + 1]):
                 if c == d:
@@ -512,7 +512,7 @@ class Solution:
                 elif d == c + 1:
                     value = after[k, m]
                 else:
-                    value = self._smoothed[d][2][m, k]
+                    value = self.smoothed[d][2][m, k]
                 joint[size + a, size + b] = joint[size + b, size + a] = value
         return joint
 
@@ -533,7 +533,7 @@ class Solution:
                 found[u] = np.einsum("ng,gh,nh->n", design, self.covariance, design, optimize=True)
         if local:
             for c, cell in enumerate(system.cells):
-                own, cross, _ = self._smoothed[c]
+                own, cross, _ = self.smoothed[c]
                 for k, i in enumerate(cell.parameter):
                     some = cell.units[cell.covers[k] > 0]
                     mine = np.flatnonzero(system.at == i)

@@ -27,9 +27,10 @@ from scipy import special
 
 from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.laws import YEAR, Law
+from walop_jax.model.parameters import Parameter
 from walop_jax.nights import changes
 from walop_jax.nights.algebra import Solution, System, UndeterminedError, solve
-from walop_jax.nights.equations import Together
+from walop_jax.nights.equations import EffectAmplitude, Together
 
 CHANCE = 0.005  # of any break in a series that has none: half of one in a hundred
 RIVAL = 2.0 * math.log(1000.0)  # z² behind the best at which another name is improbable
@@ -38,7 +39,7 @@ SURE = 5.0  # standard errors that keep one name from another
 MOST = 40  # breaks that are looked for
 ROUNDS = 3  # in which all are named again
 KINDS = ("step", "bad night", "drift")
-Carried = Callable[[str], bool]
+Carried = Callable[[Parameter], bool]
 """True for a candidate that stars can be corrected for."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 _FARTHEST = 40.0  # of the tail in units of 1/u, beyond which nothing is left of it
@@ -238,17 +239,17 @@ def with_breaks(data: Together, laws: Sequence[Law | None], found: Sequence[Brea
 
 def _other_shapes(data: Together, laws: Sequence[Law | None]) -> list[int]:
     """Candidates that are another shape of an effect that the model or a law has: a model holds one shape alone."""
-    taken: dict[str, str | None] = {}
-    beyond = data.has_value | data.gauge
-    for name, law, has in zip(data.names, laws, beyond, strict=True):
-        if has:
-            taken[part_of(name)] = None
+    taken: dict[str, tuple[int, int] | None] = {}
+    for p, law in zip(data.parameters, laws, strict=True):
+        if not isinstance(p, EffectAmplitude):
+            taken[p.part] = None
         elif law is not None:
-            taken.setdefault(part_of(name), shape_of(name))
+            taken.setdefault(p.part, p.shape)
     return [
-        i for i, (name, has) in enumerate(zip(data.names, beyond, strict=True))
-        if not has and taken.get(part_of(name), shape_of(name)) != shape_of(name)
-    ]  # fmt: skip
+        i
+        for i, p in enumerate(data.parameters)
+        if isinstance(p, EffectAmplitude) and taken.get(p.part, p.shape) != p.shape
+    ]
 
 
 def _largest(
@@ -268,13 +269,13 @@ def _largest(
     low = 0 if kind == 2 else max(cell - 1, 0)
     near = z[low : None if kind == 2 else cell + 2] ** 2
     alike = [int(j) for j in np.argsort(-near.max(axis=0)) if near[:, j].max() > z[cell, i] ** 2 - RIVAL]
-    chosen = next((j for j in alike if carried is None or carried(data.names[j])), i)
+    chosen = next((j for j in alike if carried is None or carried(data.parameters[j])), i)
     if chosen != i:
         i, cell = chosen, low + int(near[:, chosen].argmax())
     at, rivals = (kind, cell, i), [j for j in alike if j != i]
     best, p, scale = float(z[cell, i] ** 2), data.parameters[i], float(data.equations.scale[i])
     first, span, before, after = _dates(data, solution, kind, cell, z[:, i] ** 2 > best - DATES)
-    members = {part_of(data.names[j]) for j in (i, *rivals)}
+    members = {data.parameters[j].part for j in (i, *rivals)}
     said = [effect.separated_by for effect in catalogue if effect.name in members and effect.separated_by]
     information = float(tried.information[kind][cell, i])
     return Break(
@@ -293,18 +294,6 @@ def _largest(
         separated_by=tuple(dict.fromkeys(said)) if rivals else (),
         nights_needed=_nights_needed(solution, at, rivals, best) if rivals else 0.0,
     )
-
-
-def shape_of(name: str) -> str:
-    """The shape of its effect that a candidate stands for, GROUP#MEMBER of its probes; "" where it has one alone."""
-    head, _, leaf = name.partition(".")
-    group, member = head.partition("#")[2], leaf.partition("#")[2]
-    return f"{group or 0}#{member or 0}" if group or member else ""
-
-
-def part_of(name: str) -> str:
-    """The part or effect that a parameter or candidate belongs to."""
-    return name.split(".")[0].split("#")[0]
 
 
 def _dates(

@@ -154,6 +154,39 @@ def split(calset: CalibrationSet) -> Iterator[tuple[int, CalibrationSet]]:
 # ------------------------------------------------------------------------------------------------------ candidates
 
 Change = tuple[tuple[float, Any], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class EffectAmplitude(Parameter):
+    """An amplitude of an effect (`part`) that a model lacks, of one `shape`: the group of its probes and the member.
+
+    `in_model` is its name in a model that has the effect. In files the name holds all of it: EFFECT#GROUP.LEAF#MEMBER,
+    without what is 0.
+    """
+
+    shape: tuple[int, int] = (0, 0)
+    in_model: str = ""
+
+    @classmethod
+    def of(cls, leaf: Parameter, effect: str, group: int | None, member: int) -> EffectAmplitude:
+        """That of a leaf of a probe; `group` is None where the effect has a single one."""
+        of_group, of_member = f"#{group}" * (group is not None), f"#{member}" * bool(member)
+        fields: dict[str, Any] = vars(leaf) | {
+            "name": f"{effect}{of_group}.{leaf.name}{of_member}",
+            "part": effect,
+            "start": 0.0,
+        }
+        return cls(**fields, shape=(group or 0, member), in_model=f"{effect}.{leaf.name}")
+
+    @classmethod
+    def read(cls, parameter: Parameter) -> EffectAmplitude:
+        """That of a parameter of a file."""
+        head, _, leaf = parameter.name.partition(".")
+        (part, _, group), (leaf, _, member) = head.partition("#"), leaf.partition("#")
+        fields: dict[str, Any] = vars(parameter) | {"part": part}
+        return cls(**fields, shape=(int(group or 0), int(member or 0)), in_model=f"{part}.{leaf}")
+
+
 Candidates = dict[str, tuple[Parameter, Change]]
 """Amplitudes beyond a model by name, each with the change that it is to first order; a gauge has none."""
 
@@ -176,10 +209,8 @@ def candidates_of(
                 if not each or not all(each) or len(each) != len(of):
                     continue
                 for leaf, change in zip(of, each, strict=True):
-                    name = f"{kind.name}{f'#{g}' if len(groups) > 1 else ''}.{leaf.name}" + (
-                        f"#{m}" if m else ""
-                    )
-                    found[name] = dataclasses.replace(leaf, name=name, part=kind.name, start=0.0), change
+                    one = EffectAmplitude.of(leaf, kind.name, g if len(groups) > 1 else None, m)
+                    found[one.name] = one, change
     held = [model[name] for name in gauges(model, flux_known=False) if not model[name].free]
     return found | {p.name: (p, ()) for p in held}
 

@@ -21,7 +21,7 @@ from walop_jax.io.fits_reading import OpenFile, open_fits
 from walop_jax.io.names import NIGHTS
 from walop_jax.io.text import in_ascii
 from walop_jax.model.parameters import Parameter
-from walop_jax.nights.equations import Night
+from walop_jax.nights.equations import EffectAmplitude, Night
 
 NIGHTVER = 1
 _NAN = float("nan")
@@ -144,8 +144,13 @@ def _nights(opened: OpenFile) -> list[Night]:
             prior=None if np.isnan(priors[k][1]) else (priors[k][0], priors[k][1]),
             scale=float(table["SCALE"][k]),
             loose=None if np.isnan(table["LOOSE"][k]) else float(table["LOOSE"][k]),
+            part=str(table["NAME"][k]).partition(".")[0],
         )
         for k in range(n)
+    )
+    parameters = tuple(
+        EffectAmplitude.read(p) if beyond and p.start == 0.0 else p  # others are gauges of the model
+        for p, beyond in zip(parameters, table["CANDIDATE"], strict=True)
     )
     lower, found = np.tril_indices(n), []
     for k in range(len(rows["NIGHT"])):

@@ -33,9 +33,10 @@ from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import check_input, parse_toml, read_text
 from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.laws import Law, laws_of, resolved
+from walop_jax.model.parameters import Parameter
 from walop_jax.model.specification import effect_context
 from walop_jax.nights.algebra import Solution, UndeterminedError
-from walop_jax.nights.breaks import Break, at_solution, part_of, solved
+from walop_jax.nights.breaks import Break, at_solution, solved
 from walop_jax.nights.breaks import find as breaks_of
 from walop_jax.nights.equations import (
     Night,
@@ -313,12 +314,12 @@ def _in_units(
     return data.origin + solution.values * scale, np.maximum(solution.errors() * scale, 1e-12 * scale)
 
 
-def _carried(like: Calibration, catalogue: Sequence[EffectKind], name: str) -> bool:
+def _carried(like: Calibration, catalogue: Sequence[EffectKind], candidate: Parameter) -> bool:
     """True unless a candidate is an effect of which a star at another time and flux says nothing.
 
     Such are the median counts of a field, the exposure before, the time since the first exposure of a night.
     """
-    kind = next((one for one in catalogue if one.name == part_of(name)), None)
+    kind = next((one for one in catalogue if one.name == candidate.part), None)
     if kind is None:
         return True
     template = like.model.template

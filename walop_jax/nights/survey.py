@@ -15,7 +15,6 @@ import dataclasses
 import functools
 import itertools
 import math
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -34,9 +33,9 @@ from walop_jax.model.effects import EffectKind
 from walop_jax.model.laws import Law
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights.algebra import Solution
-from walop_jax.nights.breaks import Break, part_of, shape_of
+from walop_jax.nights.breaks import Break
 from walop_jax.nights.changes import scan
-from walop_jax.nights.equations import Together, night_numbers
+from walop_jax.nights.equations import EffectAmplitude, Together, night_numbers
 from walop_jax.science.field_accuracy import NODES, SIZE, TOLERANCE, judged, reached
 
 Vector = Float[np.ndarray, " _"]
@@ -76,26 +75,33 @@ class Survey(Displayed):
     def _counts(self) -> tuple[float, int]:
         """χ² of data and of what is known beforehand, and its degrees of freedom.
 
-        These are data less fluxes, plus what is known, less unknowns. Loose widths only keep the search inside: they
-        are no knowledge, and what they add to χ² is left out as in a fit.
+        These are data less fluxes, plus priors, less the unknowns that these determine. Loose widths only keep the
+        search inside: they are no knowledge, what they add to χ² is left out, and an unknown that nothing else
+        determines counts as none, as in a fit (`likelihood.inverses.determined`).
         """
         system, chi2 = self.solution.system, self.solution.chi2 + self.solution.penalty
         prior = np.array([p.prior is not None for p in self.data.parameters])
-        known, walks = 0, set()
-        for entry, value in zip(system.globals, self.solution.shared, strict=True):
+        known, walks, weak = 0, set(), 0.0
+        variances = np.diag(self.solution.covariance)
+        for entry, value, variance in zip(system.globals, self.solution.shared, variances, strict=True):
             if prior[entry.parameter]:
                 known += entry.precision > 0
             else:
                 chi2 -= entry.precision * (value - entry.mean) ** 2
-        for cell, local in zip(system.cells, self.solution.local, strict=True):
+                weak += entry.precision * variance
+        for cell, local, (spread, *_) in zip(
+            system.cells, self.solution.local, self.solution.smoothed, strict=True
+        ):
             states = cell.parameter[np.isfinite(cell.mjd)].tolist()
             stated = prior[cell.parameter] | np.isfinite(system.spread[cell.parameter])
             # A step of a walk is known beforehand to be about 0: one for every state but the first.
             known += int(((cell.precision > 0) & stated).sum()) + len(states) - len(set(states) - walks)
-            chi2 -= float(np.where(stated, 0.0, cell.precision) @ (local - cell.mean) ** 2)
+            loose = np.where(stated, 0.0, cell.precision)
+            chi2 -= float(loose @ (local - cell.mean) ** 2)
+            weak += float(loose @ np.diag(spread))
             walks |= set(states)
         unknown = len(system.globals) + sum(len(cell.parameter) for cell in system.cells)
-        return float(chi2), int(sum(night.dof for night in self.data.nights) + known - unknown)
+        return float(chi2), int(sum(night.dof for night in self.data.nights) + known - unknown + round(weak))
 
     @functools.cached_property
     def verdict(self) -> Verdict:
@@ -240,7 +246,8 @@ class Survey(Displayed):
     def _product(self, mjd: float) -> Calibration:
         """The calibration of a moment, whether it is valid or not."""
         full, (value, covariance) = self._full, self.values_at(mjd)
-        model, names = full.model, [_in_model(name) for name in self.data.names]
+        model, every = full.model, self.data.parameters
+        names = [p.in_model if isinstance(p, EffectAmplitude) else p.name for p in every]
         there = [k for k, name in enumerate(names) if name in model.names and self.laws[k] is not None]
         select = np.zeros((len(model.names), len(there)))
         select[[model.index(names[k]) for k in there], np.arange(len(there))] = 1.0
@@ -262,12 +269,11 @@ class Survey(Displayed):
         context = effect_context(model.template, like.exposures)
         candidates = [
             p for p, law, has in zip(self.data.parameters, self.laws, self.data.has_value, strict=True)
-            if law is not None and not has and p.name not in model.names
+            if law is not None and not has and p.name not in model.names and isinstance(p, EffectAmplitude)
         ]  # fmt: skip
-        taken: dict[str, str] = {}
+        taken: dict[str, tuple[int, int]] = {}
         for p in candidates:
-            # Names of parts, not `Parameter.part`, which files of nights do not hold.
-            part, shape = part_of(p.name), shape_of(p.name)
+            part, (group, member) = p.part, (shape := p.shape)
             if taken.setdefault(part, shape) != shape or part in self.reference.model.effect_names:
                 raise fail(
                     f"{p.name} is one shape of its effect, and the model has another",
@@ -275,11 +281,7 @@ class Survey(Displayed):
                 )
             kind: EffectKind = next(one for one in model.catalogue if one.name == part)
             if part not in model.effect_names:
-                group, _, member = shape.partition("#")
-                chosen = (
-                    kind.probes(context)[int(group)][int(member or 0)] if shape else kind.neutral(context)
-                )
-                model = with_effects(model, [chosen], context)
+                model = with_effects(model, [kind.probes(context)[group][member]], context)
         values, old = model.start, [model.index(name) for name in like.model.names]
         values[old] = like.values
         return dataclasses.replace(like, model=model, values=values, covariance=np.zeros((len(values),) * 2))
@@ -408,8 +410,3 @@ class Survey(Displayed):
             rows,
             tuple(dict.fromkeys((*verdict.warnings, *self.advice))),
         )
-
-
-def _in_model(name: str) -> str:
-    """The name that a parameter or candidate has in a model."""
-    return re.sub("#[0-9]+", "", name)

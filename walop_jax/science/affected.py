@@ -32,6 +32,7 @@ MOST = 0.95  # share of the stars of a night that may shift by no more than the 
 class NightShift(NamedTuple):
     """Stars of a night in one catalogue: their shift (standard errors), and the mean shift of q and u themselves.
 
+    The mean is weighted by the old errors: where q or u is hardly measured, shifts are large and mean nothing.
     `night` is the MJD of the evening, NaN where the catalogue has no times. `lost` stars have a result by the old
     calibration alone, `gained` ones by the new one alone, `beyond` ones have settings that the new one does not cover.
     """
@@ -132,7 +133,8 @@ def _night(
     there, then = (~np.isnan(one.qu).any(axis=1) & here for one in (before, after))
     both = there & then
     z = shift(before, after)[both]
-    mean = (after.qu - before.qu)[both].mean(axis=0) if both.any() else np.zeros(2)
+    weight = 1.0 / np.diagonal(before.covariance[both], axis1=1, axis2=2)
+    mean = np.average((after.qu - before.qu)[both], axis=0, weights=weight) if both.any() else np.zeros(2)
     median, most, largest = np.quantile(z, [0.5, MOST, 1.0]) if z.size else np.zeros(3)
     lost, gained = int((there & ~then).sum()), int((then & ~there).sum())
     return NightShift(

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.camera_catalogues import CameraCatalogue
+from walop_jax.data.camera_catalogues import CameraCatalogue, sky_positions
 from walop_jax.data.schema import Column
-from walop_jax.data.user_tables import OF_STARS, in_memory, numeric_column, read_input_table, sky_positions
+from walop_jax.data.user_tables import OF_STARS, in_memory, numeric_column, read_input_table
 from walop_jax.io.errors import fail
 from walop_jax.sky.directions import NOT_MOVED, REACH, Pointing, Registration, mutual, registered
 

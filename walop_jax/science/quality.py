@@ -22,6 +22,7 @@ from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.table_files import read_table_file
+from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.folder import locked
 from walop_jax.io.plain_tables import astropy_table, stacked, table_format, write_table
@@ -290,9 +291,7 @@ def append(path: str | os.PathLike[str], new: Any, limits: Limits) -> tuple[Any,
     Nothing is lost where it is killed, and of two processes the second one is told of the first.
     """
     table_format(path)
-    there = Path(path)
-    if not there.parent.is_dir():
-        raise fail(f"the folder {there.parent} does not exist", file=path, advice="create it first")
+    there = check_output(path, overwrite=True)
     with locked(there.parent / f".walop-quality-{there.name}-lock", path):
         table, remarks = joined(read_nights(there), new) if there.exists() else joined(new[:0], new)
         table = judge(table, limits)
