@@ -18,6 +18,7 @@ import jsonschema
 import pytest
 from small_run import small_fit
 
+import walop_jax as walop
 from walop_jax.calibration.summary import summary
 from walop_jax.commands import COMMANDS
 from walop_jax.commands.docs import about, pages
@@ -37,7 +38,9 @@ TOPICS = (
     "large-sets",
     "model",
     "nights",
+    "observer",
     "organisation",
+    "reading",
     "recipes",
     "sources",
     "validation",
@@ -102,7 +105,7 @@ def test_topics():
 
 
 @every_page
-def test_a_page_has_a_title_and_says_in_a_sentence_what_it_is_about(topic):
+def test_a_page_has_a_title_and_one_sentence_about_it(topic):
     lines = PAGES[topic].splitlines()
     assert re.fullmatch(r"# \S.*", lines[0])
     assert lines[1] == "" == lines[3]
@@ -147,14 +150,14 @@ def test_code_cites_pages_that_exist():
     assert [entry for entry in cited if entry[1] not in TOPICS] == []
 
 
-def test_every_command_is_told_of():
+def test_every_command_is_on_a_page():
     told = "\n".join([(ROOT / "README.md").read_text(encoding="utf-8"), *PAGES.values()])
     assert [name for name in COMMANDS if f"walop-jax {name}" not in told] == []
 
 
 @every_page
 def test_commands_of_a_page_exist(topic):
-    named = set(re.findall(r"(?:`|^    )walop-jax ([a-z][a-z-]*)", PAGES[topic], re.MULTILINE))
+    named = set(re.findall(r"(?:`|^    (?:\$ )?)walop-jax ([a-z][a-z-]*)", PAGES[topic], re.MULTILINE))
     assert named <= {*COMMANDS, "instrument"}  # the last one comes with description files
 
 
@@ -163,10 +166,11 @@ def test_commands_of_a_page_exist(topic):
 
 def test_columns_of_a_calibration_set():
     """Every table of the schema with the columns, types, units and defaults of the page, and none besides."""
-    from walop_jax.data.schema import TABLES
+    from walop_jax.data.schema import SKY, TABLES
 
     widths = {1: "", None: " (any number)"}
     for name, columns in TABLES.items():
+        columns = {**columns, "SKY": SKY} if name == "INTENSITIES" else columns
         told = {row[0]: tuple(row[1:4]) for row in rows(section("files", name)) if len(row) == 5}
         expected = {
             column: (
@@ -318,7 +322,7 @@ def catalogue_tables() -> str:
     for effect in EFFECTS:
         if part := entries[effect.name].get("part"):
             lines += ["", f"### {part}", ""]
-            lines += ["| effect | parameter | unit | width | what it is |", "| --- | --- | --- | --- | --- |"]
+            lines += ["| effect | parameter | unit | width | meaning |", "| --- | --- | --- | --- | --- |"]
         choices = effect.neutral(Context()).choices()
         equation = re.split(r"\n(?=Symbols|Source)", effect.head().partition("Equation")[2])[0]
         told = [
@@ -397,7 +401,7 @@ def test_choices_of_effects(effect, choice):
     assert f"choice: `{choice}`" in told[4]
 
 
-def test_what_looks_alike_has_names_that_exist():
+def test_effects_that_look_alike_exist():
     from walop_jax.model.effects import EFFECTS
 
     names = {kind.name for kind in EFFECTS}
@@ -413,6 +417,32 @@ def test_verdicts():
 
     told = [row[0] for row in rows(section("effects", "How a diagnosis reports"))]
     assert set(told) == set(get_args(Outcome))
+
+
+def test_files_of_a_days_reading_exist():
+    named = re.findall(r"`((?:\w+/)+[\w.-]*)`", PAGES["reading"])
+    assert len(named) > 30
+    assert [name for name in named if not (ROOT / "walop_jax" / name).exists()] == []
+
+
+def glossary() -> list[list[str]]:
+    """Rows of the vocabulary: term, meaning, synonyms that are not used."""
+    return [row for row in rows(PAGES["vocabulary"]) if len(row) == 3]
+
+
+def test_a_concept_has_one_term():
+    terms = [term for row in glossary() for term in row[0].split(", ")]
+    assert len(glossary()) <= 80
+    assert len(terms) == len(set(terms))
+
+
+@pytest.mark.parametrize("synonym", [word for row in glossary() for word in row[2].split(", ") if word])
+def test_pages_and_help_use_the_terms_of_the_glossary(synonym):
+    texts = {name: text for name, text in PAGES.items() if name != "vocabulary"}
+    texts |= {name: (ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "CHANGELOG.md")}
+    texts |= {name: inspect.getdoc(getattr(walop, name.replace("-", "_"))) or "" for name in COMMANDS}
+    word = re.compile(rf"(?<![\w-]){re.escape(synonym)}s?\b", re.IGNORECASE)
+    assert [name for name, text in texts.items() if word.search(text)] == []
 
 
 def test_no_page_of_others_is_cited():

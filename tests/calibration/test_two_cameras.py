@@ -373,7 +373,8 @@ def test_a_table_must_say_where_an_element_stands_that_was_never_out(calibration
     table, _ = star_rows(np.random.default_rng(4), 2)
     del table["HWP_ANGLE"]
     with pytest.raises(
-        DataError, match=r"HWP_ANGLE: the angle of HWP is missing.* give the column HWP_ANGLE"
+        DataError,
+        match=r"HWP_ANGLE: the angle of HWP is missing.*--at HWP=0",
     ):
         read(table, calibration, tmp_path)
 

@@ -16,6 +16,7 @@ import walop_jax as walop
 from walop_jax.calibration.accuracy import p_errors, sample_stars
 from walop_jax.calibration.product import read_calibration, read_product
 from walop_jax.data.settings import Settings
+from walop_jax.fit.misfit import Misfit
 
 SUMMARY_KEYS = (
     "chi2", "dof", "n_data", "parameters", "converged", "message", "seconds", "versions", "inputs",
@@ -69,13 +70,24 @@ def test_refit_leaves_results_alone(call, calset_file, run):
     assert (run / "calibration.fits").read_bytes() == before
 
 
+def test_three_reasons_against_a_fit_are_printed_and_where_the_others_are():
+    misfit = Misfit({"O1": 3.0}, {"clp": 3.0}, {}, {}, {}, (3, 9.0), (4, 0.1, 0.2, 8.0), outliers=0.02)
+    *reasons, rest = misfit.reasons(["residuals repeat", "errors differ", "a third"], "RUN")
+    assert "walop-jax clip" in reasons[0]
+    assert reasons[1:] == ["residuals repeat", "errors differ"]
+    # The third warning, cameras, kinds, matrix, the worst exposure.
+    assert rest == "5 more, with the misfit by camera and exposure: walop-jax report RUN"
+
+
 @pytest.mark.long
 def test_a_misfit_is_written_but_not_trusted(call, spoilt_file, tmp_path):
     result = call("refit", spoilt_file, "-o", tmp_path / "run")
     assert result.exit_code == 3
     assert "not trusted\n" in result.stdout
     assert "does not explain the data" in result.stderr
-    assert "disagreement in the matrix" in result.stderr
+    assert result.stderr.count("warning") == 4
+    assert f"walop-jax report {tmp_path / 'run'}" in result.stderr
+    assert "prior only" not in result.stdout
     product = read_product(tmp_path / "run" / "calibration.fits")
     assert not product.verdict.trusted
     assert product.verdict.converged

@@ -32,6 +32,7 @@ def test_epochs_of_one_and_the_same_set(fitted: FittedSet, tmp_path: Path):
     # The same data: the same minimum.
     assert found.fits
     assert max(abs(entry.new - entry.old) / entry.error for entry in found.moved) < 1e-3
+    assert found.display().facts == (("old and new", "the same data: nothing can have changed"),)
     document = json.loads((tmp_path / "EPOCH" / "epoch.json").read_text())
     assert document["fits"] is True
     assert document["new"] == [entry.sha256 for entry in fitted.calibration.inputs]

@@ -53,7 +53,7 @@ def test_sources_print_as_lines(fitted):
     assert len(lines) == len(walop.cite(fitted.run))
 
 
-def test_what_was_measured_stands_first(fitted):
+def test_measured_parameters_stand_first(fitted):
     states = [row[-1] for row in walop.read(fitted.run).display().rows if not row[0].startswith("standard.")]
     assert states == sorted(states, key=lambda state: state == "prior only")
 

@@ -46,7 +46,7 @@ def test_every_command_takes_a_seed(call):
     assert call("cite", "--seed", "one").exit_code == 2
 
 
-def test_help_tells_exit_codes_and_completion(call):
+def test_help_lists_exit_codes_and_completion(call):
     shown = call("-h").output
     assert "Exit codes: 0 done" in shown
     assert "--install-completion" in shown
@@ -94,7 +94,7 @@ def test_a_wrong_effect_is_named(call, tmp_path, effect, words):
     assert all(word in refused.output for word in words), refused.output
 
 
-def test_matrix_says_where_it_comes_from(call, run, tmp_path):
+def test_matrix_gives_its_provenance(call, run, tmp_path):
     from astropy.table import Table
 
     from walop_jax.calibration.product import read_product

@@ -176,5 +176,5 @@ def test_files_of_words_that_cannot_be_meant_are_told(words: Path, tmp_path: Pat
 
 
 def test_nothing_says_what_was_observed(tmp_path: Path):
-    with pytest.raises(DataError, match="KIND: nothing says what was observed"):
+    with pytest.raises(DataError, match="KIND: the kind of the exposures is not known"):
         exposures_table(headers(tmp_path), words_of({"EXPTIME": {"word": "EXPMIN", "unit": "min"}}))

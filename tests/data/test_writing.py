@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 import walop_jax.data.write
 from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.write import write_calibration_set
 from walop_jax.io.atomic import atomic_path
@@ -53,6 +54,33 @@ def test_round_trip_is_exact(handmade):
     second = handmade.folder / "third.fits"
     write_calibration_set(second, calset)
     assert path.read_bytes() == second.read_bytes()
+
+
+def test_the_level_of_the_sky_is_read_written_and_joined(handmade):
+    rows = len(handmade.values("INTENSITIES", "N"))
+    sky = np.arange(4.0 * rows).reshape(rows, 4)
+    sky[3] = np.nan  # not known
+    other = read_calibration_set(handmade.write("plain.fits"))
+    assert other.intensities.sky is None
+    handmade["INTENSITIES"]["SKY"] = ["4D", "electron", sky]
+    calset = read_calibration_set(handmade.write())
+    known = np.nan_to_num(sky)
+    np.testing.assert_array_equal(calset.intensities.sky, known)
+    assert not any("SKY" in remark for remark in calset.remarks)
+    write_calibration_set(handmade.folder / "again.fits", calset)
+    again = read_calibration_set(handmade.folder / "again.fits")
+    np.testing.assert_array_equal(again.intensities.sky, known)
+    joined = merge_calibration_sets(calset, dataclasses.replace(other, exposures=_later(other.exposures)))
+    np.testing.assert_array_equal(joined.intensities.sky, np.concatenate([known, np.zeros_like(known)]))
+    sky[5, 1] = -1.0
+    handmade["INTENSITIES"]["SKY"] = ["4D", "electron", sky]
+    handmade.refused("INTENSITIES", "SKY", "below 0", "row 5")
+    handmade["INTENSITIES"]["SKY"] = ["2D", "electron", np.ones((rows, 2))]
+    handmade.refused("INTENSITIES", "SKY", "2 value(s)", "every camera")
+
+
+def _later(exposures):
+    return dataclasses.replace(exposures, mjd=exposures.mjd + 1.0)
 
 
 @settings(

@@ -1,14 +1,19 @@
 """The sentences of an instrument: their columns, and the names that are sentences with a history."""
 
+import dataclasses
+
 import builders
 import numpy as np
 import pytest
 import scenes
 from own_instrument import OWN
+from scipy import stats
 
 from walop_jax.data.records import Position
-from walop_jax.diagnosis import dependences, grammar
-from walop_jax.diagnosis.hypotheses import all_candidates, applicable, probes
+from walop_jax.diagnosis import dependences, grammar, thresholds
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.hypotheses import all_candidates, applicable, probes, said_by
+from walop_jax.diagnosis.score import ScoreSpace, ScoreTable
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.instruments.description import parsed
@@ -18,6 +23,7 @@ from walop_jax.model.effects import EFFECTS
 from walop_jax.model.effects.change import Change
 from walop_jax.model.instrument import build, nominal_instrument
 from walop_jax.model.specification import effect_context
+from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate
 
 LISTED = (
@@ -40,6 +46,29 @@ LISTED = (
 QUICK = (
     LISTED[:5] + LISTED[7:9] + LISTED[11:12]
 )  # without derivatives of crystals and ghosts, which take half a minute
+TURNING = ObservingPlan(
+    grid=4, standard_grid=2, polariser_angles=(0.0, 72.0, 144.0, 36.0, 108.0, 18.0),
+    plate=(None, 0.0, 45.0, 20.0, 60.0, 30.0), moon_patches=4, standards=4,
+)  # fmt: skip
+COMBINED = (  # a pattern over the field with a dependence of the exposures, by kinds and places
+    "retardance radial behind collimator * kelvin",
+    "diattenuation diagonal ahead of polariser * hours",
+    "retardance q behind half1.plate * kelvin * x; retardance q behind half1.plate * kelvin * y; "
+    "retardance u behind half1.plate * kelvin * x; retardance u behind half1.plate * kelvin * y",
+    "retardance radial of polariser * cos 1 CLP; retardance radial of polariser * sin 1 CLP",
+    "depolarisation of chwp * cos 2 CHWP * r2; depolarisation of chwp * sin 2 CHWP * r2",
+    "diattenuation radial of chwp * cos 1 CHWP; diattenuation radial of chwp * sin 1 CHWP",
+    "added polarisation q ahead of polariser * hours * r2; added polarisation u ahead of polariser * hours * r2",
+    "light in O1 * per EXPTIME",
+    "light in E2 * kind moon",
+    "gain of O2 * side CHWP",
+    "gain of E1 * side CHWP * x; gain of E1 * side CHWP * y",
+    "turn of polariser * kelvin * r2",
+    "displacement x ahead of pupil * kelvin * r2; displacement y ahead of pupil * kelvin * r2",
+    "axis of half2.plate * kelvin * x; axis of half2.plate * kelvin * y",
+    "thickness of half1.plate.quartz * r2; thickness of half1.plate.mgf2 * r2",
+)
+RATIO = 15.0  # of what is hidden to the noise, behind the base
 HELD = 0.999  # share of the square of what an effect does that its sentences hold
 
 
@@ -135,6 +164,47 @@ def test_grammar_of_another_instrument():
     assert not any("half1" in name or "O1" in name or "ahead of" in name for name in said)
 
 
+@pytest.mark.parametrize("name", ["WALOP-SOUTH", "WALOP-NORTH"])
+def test_every_description_can_be_made(name):
+    """Factors that are tried of a kind are among those that it may have at that place (`Change.check_factors`)."""
+    instrument = nominal_instrument(name)
+    exposures = dataclasses.replace(TURNING, instrument=name).exposures()
+    for probe in grammar.sentences(instrument, exposures, 20):
+        for text in said_by(probe):
+            Change.parsed(text).check_factors(instrument)
+
+
+@pytest.fixture(scope="module")
+def turning():
+    """A fit whose residuals are noise, columns of all descriptions, and their space."""
+    calset = simulate(TURNING, seed=5).calset
+    design = Design.of(fit(Likelihood.of(calset, base_model(calset))))
+    every = grammar.sentences(design.fit.model.template, calset.exposures, len(calset.points))
+    made = all_candidates(design.columns, (), every)[1].values()
+    columns = [candidate.columns for candidate in made]
+    names, widths = [candidate.name for candidate in made], [candidate.widths for candidate in made]
+    return design, columns, ScoreSpace.projected(design.projector, names, widths, columns, exact=0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("hidden", COMBINED)
+def test_a_pattern_that_grows_is_found(turning, hidden):
+    """What is hidden is the first of all descriptions, or none is much more probable."""
+    design, columns, space = turning
+    at = space.places()[hidden]
+    amplitudes = np.random.default_rng(2).normal(size=at.stop - at.start) * space.widths[at]
+    amplitudes *= RATIO / np.sqrt(amplitudes @ space.gram[at, at] @ amplitudes)
+    change = design.stacked([columns[space.names.index(hidden)]]) @ amplitudes
+    residual = design.projector(design.residual + change)
+    scores = design.products(columns, residual)
+    table = space.table_after(ScoreTable((), 1.0, 1.0, len(space.names)), scores)
+    best = max(table.scores, key=lambda score: score.log_bayes)
+    print(hidden, "|", best.name, best.log_bayes, table[hidden].log_bayes)
+    assert table[hidden].log_bayes > best.log_bayes - thresholds.IMPROBABLE
+    error = table[hidden].amplitudes + amplitudes  # those of the residuals, with the other sign
+    assert error @ space.gram[at, at] @ error < stats.chi2.isf(1e-6, len(error))
+
+
 def test_steps_part_the_exposures_evenly_and_are_dated_between():
     """Midway between exposures; of many exposures every fourth time at first, then all times of the neighbourhood."""
     few = builders.exposures(*({"mjd": 61000.0 + hour / 24.0} for hour in (0, 1, 3, 4)))
@@ -145,13 +215,14 @@ def test_steps_part_the_exposures_evenly_and_are_dated_between():
         *({"mjd": 61000.0 + hour / 24.0, "clp_angle": 3.0 * hour} for hour in range(65))
     )
     said = [p.group[0].sentences[0] for p in grammar.sentences(instrument, many, 25)]
-    steps = [text for text in said if text.startswith("axis of half1.plate * hours ")]
+    steps = [text for text in said if text.startswith("axis of half1.plate * hours ") and " to " in text]
     assert len(steps) == 16
     assert (steps[0], steps[-1]) == (
         "axis of half1.plate * hours 2.5 to 64.5",
         "axis of half1.plate * hours 61.5 to 64.5",
     )
-    spells = [text for text in said if text.startswith("turn of polariser * hours ") and "64.5" not in text]
+    spells = [text for text in said if text.startswith("turn of polariser * hours ") and " to " in text]
+    spells = [text for text in spells if "64.5" not in text]
     assert len(spells) == 14 + 12 + 8
     assert spells[0] == "turn of polariser * hours 2.5 to 10.5"
     assert spells[-1] == "turn of polariser * hours 30.5 to 62.5"

@@ -22,7 +22,7 @@ def test_every_command_states_the_largest_of_one_table():
     facts = dict(fitted.display().facts)
     level = re.sub("p ≤ 5 %", "", limits.protection_in_words())
     (check,) = [one for one in walop.certify(fitted).checks if one.name == "protection"]
-    assert percent(facts["could hide"]) == percent(level) == percent(check.found)
+    assert percent(facts["undetectable"]) == percent(level) == percent(check.found)
     worst = limits.mistakes[0]
     assert worst.name in facts["from"]
     assert worst.name in level
@@ -31,7 +31,7 @@ def test_every_command_states_the_largest_of_one_table():
     document = limits.document()["could_hide"]
     assert document[0]["name"] == worst.name
     rows = limits.display().rows
-    titles = [i for i, row in enumerate(rows) if row[0] in ("EFFECTS", "MISTAKES IN THE DATA")]
+    titles = [i for i, row in enumerate(rows) if row[0] in ("EFFECTS", "ERRORS IN THE DATA")]
     assert len(titles) == 2
     assert {one.kind for one in limits.mistakes} == {EFFECT, DATA}
     for first, last in ((titles[0] + 1, titles[1]), (titles[1] + 1, len(rows))):

@@ -105,6 +105,33 @@ def test_one_number_is_among_those_that_are_told(change, what, size):
     assert abs(off) < 4 * float(error) + (2.0 if size > 0 else 0.0)  # terms beyond the first, in years
 
 
+def under_sky(calset: CalibrationSet, left: float) -> CalibrationSet:
+    """Faint standards: under a sky of one to six times their light, polarised by 10 %, of which a share is left."""
+    table, e, rng = calset.intensities, calset.exposures, np.random.default_rng(1)
+    level, angle = rng.uniform(1.0, 6.0, len(e)), rng.uniform(0.0, 2.0 * np.pi, len(e))
+    pattern = 1 + 0.1 * np.stack([np.cos(angle), -np.cos(angle), np.sin(angle), -np.sin(angle)], axis=1)
+    of_sky = np.where(e.direct("standard"), level, 0.0)[:, None] * pattern
+    sky = of_sky[table.exposure] * table.counts.mean(axis=1, keepdims=True)
+    table = dataclasses.replace(table, counts=table.counts + left * sky, sky=sky)
+    return dataclasses.replace(calset, intensities=table)
+
+
+def test_a_share_of_the_sky_that_is_left_is_told_with_its_size():
+    plain = simulate(SMALL, seed=SEED).calset
+    result = examined(refit(under_sky(plain, 0.01)))
+    assert not result.trusted
+    (told,) = [text for text in result.verdict.doubts if "residuals ask for the light of the sky" in text]
+    value, error = re.search(r"in units of SKY, ([\d.]+) ± ([\d.]+), not 0 \(subtract", told).groups()  # type: ignore[union-attr]
+    assert float(value) == pytest.approx(0.01, abs=4 * float(error))
+    assert float(error) < 0.001
+    sound = refit(under_sky(plain, 0.0))
+    (score,) = [
+        one.score for one in condition_scores(Design.of(sound)) if "light of the sky" in one.stated.what
+    ]
+    assert abs(score.amplitudes[0]) < 3 * np.sqrt(score.covariance[0, 0])
+    assert examined(sound).trusted
+
+
 @pytest.mark.parametrize(
     ("change", "what", "size"),
     [

@@ -78,7 +78,9 @@ def test_fit_says_what_it_does_not_show_and_what_the_data_do_not_constrain():
     text = repr(small_fit())
     assert "throughput.n1" not in text
     assert "60 throughput terms not shown" in text
-    assert "set by their priors alone: chwp.quartz, chwp.mgf2" in text  # the plate was never in the beam
+    assert (
+        "constrained only by their priors: chwp.quartz, chwp.mgf2" in text
+    )  # the plate was never in the beam
 
 
 def test_table_of_a_fit():

@@ -85,8 +85,9 @@ def equal(one, other):
 
 
 def test_what_is_read_is_what_is_kept(calset, streaming):
-    layout = Likelihood.of(streaming, base_model(calset, throughput_degree=2), batch=16).layout
-    reader = PointReader(calset, layout.plan)
+    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), batch=16)
+    layout = likelihood.layout
+    reader = PointReader(calset, layout.plan, likelihood.model.template)
     kept, read = (MeasuredPoints(reader, dataclasses.replace(layout, kept=kept)) for kept in (True, False))
     assert (len(kept), len(read), layout.slabs) == (6, 6, 3)
     for one, other in zip(read, kept, strict=True):
@@ -136,7 +137,8 @@ def test_refit_of_frames_that_do_not_fit_into_memory(calset, streaming):
 def test_moon_sky_is_that_of_the_ephemeris(calset):
     e = calset.exposures
     moon = np.flatnonzero(e.kind == "moon")
-    read = PointReader(calset, Likelihood.of(calset, base_model(calset, throughput_degree=2)).plan)
+    likelihood = Likelihood.of(calset, base_model(calset, throughput_degree=2))
+    read = PointReader(calset, likelihood.plan, likelihood.model.template)
     x, y = GRID.xy(0, 5)
     sky = read.sky_polarisation(x, y)
     expected = moon_sky(e.mjd[moon], e.ra[moon], e.dec[moon], e.rotator[moon], calset.site, x, y)

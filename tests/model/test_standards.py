@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import optimize
 
 from walop_jax.data.checks import make_sources
 from walop_jax.data.merge import merge_calibration_sets
@@ -13,16 +14,17 @@ from walop_jax.data.settings import builtin_filter
 from walop_jax.data.units import Place
 from walop_jax.fit.base_model import base_model
 from walop_jax.io.errors import DataError
+from walop_jax.likelihood import engine
 from walop_jax.likelihood.columns import columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import light
 from walop_jax.model.effects import effect_by_name
-from walop_jax.model.instrument import nominal_instrument
+from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.planning import plan_for
 from walop_jax.model.sources import Sight, Standards, mean_over_band
 from walop_jax.model.specification import effect_context
 from walop_jax.simulation.observing_plan import ObservingPlan
-from walop_jax.simulation.simulate import simulate
+from walop_jax.simulation.simulate import simulate, truth_values
 
 BOTH = ObservingPlan(
     grid=3, standard_grid=2, polariser_angles=(0.0, 60.0, 120.0), moon_patches=0, standards=3, unpolarised=1,
@@ -212,20 +214,89 @@ def test_the_stars_of_a_field_are_in_every_exposure_of_it():
     assert np.abs(FIELD.points().x[5:]).max() <= 0.9 * FIELD.field
 
 
-def test_scatter_of_a_field_counts_once_for_each_star():
-    """σ² = σ₀² + n · 2 s² N², so that q = (N0 − N1)/(N0 + N1) of a star in n exposures is known to s at best."""
-    run = simulate(FIELD, seed=1)
-    assert run.calset.sources.scatter.tolist() == [0.0, 1e-3]
-    likelihood = Likelihood.of(run.calset, base_model(run.calset, throughput_degree=0))
-    weight, counts = (likelihood.points.gathered(name) for name in ("weight", "counts"))
-    block = run.calset.intensities.block(0, len(run.calset.points))
-    expected = np.where(block.used[..., None], block.sigma, np.inf)
-    expected[5:, 3:] = np.sqrt(block.sigma[5:, 3:] ** 2 + 2 * 2.0 * 1e-6 * counts[5:, 3:] ** 2)
-    np.testing.assert_allclose(np.where(weight > 0, weight, 0.0), 1.0 / expected)
-    # q of one star from both exposures: no better than its own scatter.
-    both = 1.0 / weight[5:, 3:, :2]
-    of_q = np.hypot(both[..., 0], both[..., 1]) / counts[5:, 3:, :2].sum(axis=-1)
-    assert np.all(1.0 / np.sum(of_q**-2, axis=1) > 0.99e-6)
+def at_truth(likelihood: Likelihood, truth: Instrument) -> np.ndarray:
+    """The true values of the parameters of a model."""
+    named = truth_values(truth)
+    return np.array([named[name] for name in likelihood.model.names])
+
+
+def turned_field(seed: int) -> tuple[Likelihood, np.ndarray]:
+    """The field, its two exposures at rotators that differ, and values a little off those of its model."""
+    run = simulate(FIELD, seed=seed, instrument=nominal_instrument())
+    calset = run.calset
+    rotator = np.array([0.0, 0.0, 0.0, 0.1, 0.6])
+    calset = dataclasses.replace(calset, exposures=dataclasses.replace(calset.exposures, rotator=rotator))
+    likelihood = Likelihood.of(calset, base_model(calset, throughput_degree=0))
+    values = at_truth(likelihood, run.truth)
+    values[likelihood.model.index("standard.ZERO.q")] += 5e-4
+    return likelihood, values
+
+
+def test_q_and_u_of_each_star_of_a_field_are_free_within_its_scatter():
+    """χ² beside that of scipy with the fluxes and q, u of every star as parameters, the scatter as their prior."""
+    likelihood, values = turned_field(1)
+    model, data, e = likelihood.model, likelihood.points.gathered, slice(3, 5)
+    counts, weight = data("counts")[5:, e], data("weight")[5:, e]
+    block = likelihood.calset.intensities.block(5, 12)
+    np.testing.assert_allclose(weight, 1.0 / block.sigma[:, e])
+    instrument, (batch,) = model.instrument(values), likelihood.points
+    row = np.arange(len(likelihood.calset.sources)) == 1
+
+    def unit(q: float, u: float) -> np.ndarray:
+        standard = instrument.standard
+        moved = instrument.changed("standard", q=standard.q + q * row, u=standard.u + u * row)
+        return np.asarray(engine.prediction(moved, likelihood.plan, batch))[5:12, e]
+
+    neutral, probe = unit(0.0, 0.0), 1e-2  # counts are linear in q and u
+    by_q, by_u = ((unit(*off) - neutral) / probe for off in ((probe, 0.0), (0.0, probe)))
+    _, residual = likelihood.residuals(values)
+    for star in range(7):
+
+        def left(x: np.ndarray, star: int = star) -> np.ndarray:
+            light = neutral[star] + 1e-3 * (x[2] * by_q[star] + x[3] * by_u[star])
+            model_counts = 1e6 * x[:2, None] * light
+            return np.append(((counts[star] - model_counts) * weight[star]).ravel(), x[2:])
+
+        best = optimize.least_squares(left, [2.0, 2.0, 0.0, 0.0], x_scale="jac", xtol=1e-12, ftol=1e-12)
+        assert np.sum(residual[5 + star, e] ** 2) == pytest.approx(2.0 * best.cost, rel=5e-3)
+
+
+def test_a_field_in_several_exposures_has_its_degrees_of_freedom():
+    """χ² of truths: 3 for each row whatever the stars are like; with weights for the scatter it was a third less."""
+    square = []
+    for seed in range(12):
+        run = simulate(FIELD, seed=seed)
+        likelihood = Likelihood.of(run.calset, base_model(run.calset, throughput_degree=0))
+        residual = likelihood.residuals(at_truth(likelihood, run.truth))[1]
+        square.append(np.sum(residual[5:, 3:] ** 2))
+    rows = 12 * 7 * 2
+    assert np.sum(square) / (3 * rows) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (3 * rows)))
+
+
+def test_slopes_of_a_field_are_those_of_its_residuals():
+    """Jacobian, columns of the score test and χ² of the expansion against differences of the residuals."""
+    likelihood, values = turned_field(2)
+    used = likelihood.used
+    i = likelihood.model.free.tolist().index(likelihood.model.index("standard.ZERO.q"))
+    step = np.zeros_like(values)
+    step[likelihood.model.free[i]] = 1e-6
+    up, down = (likelihood.residuals(values + sign * step)[1][used].ravel() for sign in (1, -1))
+    slope, residual = likelihood.jacobian(values)[:, i], likelihood.residuals(values)[1]
+    # The Jacobian leaves out what the residuals turn the flux by, which is of no consequence for the gradient.
+    np.testing.assert_allclose(slope, (up - down) / 2e-6, atol=0.01 * np.abs(slope).max())
+    assert slope @ residual[used].ravel() == pytest.approx((up @ up - down @ down) / 4e-6, rel=1e-3)
+    posterior = likelihood.expand(values)
+    assert posterior.data == pytest.approx(np.sum(residual**2), rel=1e-12)
+    half = slope @ residual[used].ravel()
+    rows = likelihood.priors
+    half += rows.jacobian(likelihood.model.selection())[:, i] @ rows.residuals(values)
+    assert posterior.gradient[i] == pytest.approx(half, rel=1e-9)
+    (effect,), *_ = effect_by_name("standard_outlier").probes(
+        effect_context(likelihood.model.template, likelihood.calset.exposures)
+    )
+    by_slots = columns(likelihood, values, effect.first_order(likelihood.model.template))
+    exact = own_columns(likelihood, values, (effect,))
+    np.testing.assert_allclose(by_slots, exact, atol=2e-3 * np.abs(exact).max())
 
 
 def test_stars_of_a_field_differ_by_their_scatter():

@@ -98,6 +98,21 @@ def test_a_plan_is_proven_and_reads_back(planned, tmp_path):
     assert "no plan of this time gets below" in repr(planned)
 
 
+def test_exposures_that_come_when_the_night_is_over_are_told():
+    """Exposures are 5.8 minutes apart: 150 of them take 14 hours."""
+    moon = tuple(Stop(None, kind="moon", number=k % 3) for k in range(150))
+    (doubt,) = Available(SMALL).doubts(dataclasses.replace(SMALL, stops=moon, patches=(), stars=()))
+    assert doubt.endswith("of 150 exposures of the sky come too late in this order: it is not dark")
+    assert int(doubt.split()[0]) > 50
+    for few in (moon[:6], (Stop(0.0),) * 150):  # the polariser does not need the night
+        assert Available(SMALL).doubts(dataclasses.replace(SMALL, stops=few, patches=(), stars=())) == ()
+
+
+def test_a_schedule_is_planned_in_whole_seconds():
+    available = Available(SMALL, seconds={"clp": (0.4, 12.6, 13.2), "moon": (60.0,)})
+    assert available.in_whole_seconds().seconds == {"clp": (1.0, 13.0), "moon": (60.0,)}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -77,7 +77,7 @@ def test_two_cameras_fill_two_columns():
     data = handmade_run.figure_data()
     one = data.comparisons[1]
     figure = figures.residual_maps(data.points, {"before": one.before[:, :2]}, ("ordinary", "extraordinary"))
-    assert [axis.get_title() for axis in figure.axes[:2]] == ["camera ordinary", "camera extraordinary"]
+    assert [axis.get_title() for axis in figure.axes[:2]] == ["ordinary", "extraordinary"]
     assert len(tiles(figure)) == 2
     assert len(figures.signature_figure(one, data.exposures, data.cameras[:2]).axes) == 4
 

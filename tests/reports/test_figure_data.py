@@ -103,7 +103,7 @@ def test_they_come_back_from_their_file(tmp_path):
         assert "standard deviations" in header[f"TCOMM{columns.names.index('BEFORE') + 1}"]
 
 
-def test_what_is_not_such_a_file_is_refused(tmp_path):
+def test_other_files_are_refused(tmp_path):
     path = tmp_path / "other.fits"
     fits.PrimaryHDU().writeto(path)
     with pytest.raises(DataError, match="DIAGVERS: is missing; run walop-jax diagnose again"):

@@ -75,12 +75,17 @@ def assert_fits_in_print(figure, millimetres):
     for axis in figure.axes:
         box = axis.get_tightbbox()
         assert min(box.x0 - canvas.x0, canvas.x1 - box.x1, box.y0 - canvas.y0, canvas.y1 - box.y1) > -2.0
+    maps = [axis for axis in figure.axes if axis.get_aspect() == 1.0]
+    numbers = [(axis, label.get_window_extent()) for axis in figure.axes for label in axis.get_yticklabels()]
+    for frame in maps:
+        inner = frame.get_window_extent().padded(-1.0)
+        assert not any(box.overlaps(inner) for axis, box in numbers if axis is not frame), frame.get_title()
     titles = [axis.title.get_window_extent() for axis in figure.axes if axis.get_title()]
     assert not any(a.overlaps(b) for i, a in enumerate(titles) for b in titles[:i])
 
 
 @pytest.mark.parametrize("name", WITHOUT)
-def test_what_a_run_lacks_is_said(source, name):
+def test_missing_parts_of_a_run_are_named(source, name):
     with pytest.raises(DataError, match=r"has no posterior|holds no (map|limits|diagnosis)"):
         draw(name, source)
 
@@ -118,7 +123,7 @@ def test_names_and_files(source, tmp_path):
         plot(source.folder, "matrix", output=path)
 
 
-def test_maps_say_their_scale(source):
+def test_titles_of_maps_give_their_range(source):
     maps = source.maps
     axis = draw("efficiency", source).axes[0]
     said = axis.get_title().splitlines()[1].removesuffix(" %").split(" to ")

@@ -50,7 +50,7 @@ DOCUMENTS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("kind", DOCUMENTS)
-def test_what_was_displayed_is_on_the_page(tmp_path: Path, kind: str):
+def test_displayed_text_is_on_the_page(tmp_path: Path, kind: str):
     html, _ = written(tmp_path, kind, **DOCUMENTS[kind])
     page = Page(html)
     assert 'class="verdict good"' in html

@@ -69,11 +69,11 @@ def test_the_answer_comes_first(diagnosed, refitted):
         assert shown.facts[0][1] in head.replace("\N{NO-BREAK SPACE}", " ")
 
 
-def test_a_no_go_is_told_first(tmp_path):
+def test_a_no_go_stands_first(tmp_path):
     folder = handmade_run.make_refit(tmp_path / "run")
     row = ("NO", "p known to 0.050 % in 50 % of the field", "0.088 %")
     shown = Display(
-        "run/calibration.fits: NO GO", head=("", "asked", "found"), rows=(row,), notes=("more light",)
+        "run/calibration.fits: NO GO", head=("", "requirement", "result"), rows=(row,), notes=("more light",)
     )
     told = {"go": False, "requirements": [], "shown": shown.document()}
     (folder / "commissioning.json").write_text(json.dumps(told))
@@ -95,7 +95,7 @@ def test_every_section_is_there(diagnosed, refitted):
         "Inputs and versions",
     ]
     page = Page(refitted)
-    assert page.headings == ["The data", *both, "What this page lacks"]  # the data of a run made by hand
+    assert page.headings == ["The data", *both, "Missing from this page"]  # the data of a run made by hand
     assert len(page.images) == 2
     page = Page(diagnosed)
     assert [heading for heading in page.headings if heading in both] == both
@@ -174,7 +174,7 @@ def test_patterns_without_a_name(tmp_path):
     assert "walop-jax apply" not in page.text
 
 
-def test_a_fit_that_is_not_trusted_says_so(tmp_path):
+def test_page_of_an_untrusted_fit(tmp_path):
     misfit = {"sentences": ["mean squared residual by camera: O1 3.25"]}
     run = handmade_run.make_refit(tmp_path / "run", trusted=False, quality=8192, misfit=misfit)
     html = render(read_run(run))[0]
@@ -198,7 +198,7 @@ def test_a_fit_that_is_not_trusted_says_so(tmp_path):
         (lambda run: (run / "summary.json").write_text("[1]"), "summary.json: is no document of a run"),
     ],
 )
-def test_what_is_no_run_is_refused(tmp_path, spoil, said):
+def test_other_folders_are_refused(tmp_path, spoil, said):
     run = handmade_run.make_refit(tmp_path / "run")
     spoil(run)
     with pytest.raises(DataError, match=re.escape(said)):
@@ -281,7 +281,7 @@ def test_error_that_rounds_up_to_the_next_decade_keeps_two_digits():
     assert with_error(123456.0, 1234.0) == "123500 ± 1200"
 
 
-def test_the_data_are_told_of(tmp_path):
+def test_data_are_listed(tmp_path):
     text = " ".join(page_of(handmade_run.make_refit(tmp_path / "run")).text.split())
     assert "Exposures2 (2 through the polariser)" in text
     assert "Polariser angles2 modulo 180°, widest gap 135°" in text

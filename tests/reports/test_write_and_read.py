@@ -32,7 +32,7 @@ RECORDS: Mapping[str, tuple[Any, Callable[[Path, Any], None], Callable[[Path], A
 
 
 @pytest.mark.parametrize("name", RECORDS)
-def test_what_is_read_is_what_was_written(tmp_path: Path, name: str):
+def test_a_run_is_read_as_written(tmp_path: Path, name: str):
     record, write, read = RECORDS[name]
     write(tmp_path / name, record)
     again = read(tmp_path / name)

@@ -64,7 +64,7 @@ def test_good_enough_for_a_goal():
     assert dict(known.facts())["good for 0.1 %"] == "yes: 0.020 % in 95 % of the field"
     strict = dataclasses.replace(known, goal=2e-4)
     what = ["0.020 % in 95 % of the field, 0.010 % allowed"]
-    what += ["a systematic error of 0.030 % of q or u could hide"]
+    what += ["a systematic error of 0.030 % of q or u would go undetected"]
     assert [one.what for one in strict.shortfalls] == what
     # Errors fall with the square root of the light.
     assert strict.shortfalls[0].advice.startswith("4.0 times the light")
@@ -95,5 +95,5 @@ def test_what_limits_it_is_what_alone_is_uncertain():
     # A diattenuation of the light ahead of everything is an offset of q: 0.002, but for what p does to second order.
     np.testing.assert_allclose(found.hidden, 0.002, rtol=0.1)
     told = dict(found.facts())
-    assert told["from"] == "the scale of X and Y (if wrong by 2 %)"
-    assert told["to see that"] == check
+    assert told["caused by"] == "the scale of X and Y (an error of 2 %)"
+    assert told["remedy"] == check

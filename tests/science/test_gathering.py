@@ -141,6 +141,83 @@ def test_right_ascensions_in_hours_are_converted_once(tmp_path):
     assert read_camera_catalogue(tmp_path / "O1.ecsv").ra == pytest.approx([15.0, 16.5])
 
 
+def _hours(tmp_path, ra, unit=None, count=40):
+    rng = np.random.default_rng(3)
+    columns = {
+        "RAJ2000": ra(6.5 + rng.uniform(-0.02, 0.02, count)), "DEJ2000": rng.uniform(-44.3, -43.7, count),
+        "FLUX_AUTO": np.full(count, 1e5), "FLUXERR_AUTO": np.full(count, 300.0), "FLAGS": np.zeros(count, int),
+    }  # fmt: skip
+    table = Table(columns)
+    table["RAJ2000"].unit = unit
+    names = tmp_path / "names.toml"
+    names.write_text(
+        'program = "mine"\nflux = [["FLUX_AUTO", "FLUXERR_AUTO"]]\nsky = [["RAJ2000", "DEJ2000"]]\n'
+        'flag = ["FLAGS"]\n'
+    )
+    table.write(tmp_path / "O1.ecsv", overwrite=True)
+    return table, lambda: read_camera_catalogue(tmp_path / "O1.ecsv", names)
+
+
+def test_right_ascensions_in_hours_without_a_unit_are_refused(tmp_path):
+    """A field of half a degree at 6.5 h is 0.04 h wide: read as degrees it would be a strip."""
+    _, read = _hours(tmp_path, lambda hours: hours)
+    with pytest.raises(DataError, match=r"RAJ2000: lies between 6.48.* looks like hours; .*multiply by 15"):
+        read()
+    table, read = _hours(tmp_path, lambda hours: hours, "hourangle")
+    assert read().ra == pytest.approx(15.0 * np.asarray(table["RAJ2000"]))
+    table, read = _hours(tmp_path, lambda hours: 15.0 * (hours - 6.0))  # at 7.5 deg: a field, not a strip
+    assert read().ra == pytest.approx(np.asarray(table["RAJ2000"]))
+    _, read = _hours(tmp_path, lambda hours: hours, count=4)
+    assert "RAJ2000 has no unit: taken as degrees" in "; ".join(read().remarks)
+
+
+def test_sexagesimal_right_ascensions_are_hours_and_declinations_degrees(tmp_path):
+    columns = {
+        "ra": ["06:30:00", "06 30 36.0", "6h31m12s"], "dec": ["-44:00:00", "-00:30:00", "-44d06m00s"],
+        "FLUX_AUTO": [1e5] * 3, "FLUXERR_AUTO": [300.0] * 3, "FLAGS": [0] * 3,
+    }  # fmt: skip
+    Table(columns).write(tmp_path / "O1.ecsv")
+    made = read_camera_catalogue(tmp_path / "O1.ecsv")
+    np.testing.assert_allclose(made.ra, [97.5, 97.65, 97.8], atol=1e-9)
+    np.testing.assert_allclose(made.dec, [-44.0, -0.5, -44.1], atol=1e-9)
+    columns["ra"][1] = "06:75:00"
+    Table(columns).write(tmp_path / "O1.ecsv", overwrite=True)
+    with pytest.raises(DataError, match=r"RA: .*write hh:mm:ss"):
+        read_camera_catalogue(tmp_path / "O1.ecsv")
+
+
+# PSF_FLAGS of photutils 3.0; with them bits of FLAG: 2 a bad pixel, 4 the edge.
+PSF_FLAGS = {
+    "n_pixels_fit_partial": (1, 2), "outside_bounds": (2, 4), "negative_flux": (4, 2), "no_convergence": (8, 2),
+    "no_covariance": (16, 2), "near_bound": (32, 2), "no_overlap": (64, 4), "fully_masked": (128, 2),
+    "too_few_pixels": (256, 2), "non_finite_position": (512, 2), "non_finite_flux": (1024, 2),
+    "non_finite_localbkg": (2048, 2),
+}  # fmt: skip
+
+
+def test_flags_of_point_spread_functions_of_photutils(tmp_path):
+    given, meaning = np.array([*PSF_FLAGS.values(), (0, 0), (64 + 1024, 6)]).T
+    count = len(given)
+    columns = {
+        "ra": np.linspace(97.4, 97.6, count), "dec": np.linspace(-44.1, -43.9, count), "flags": given,
+        "flux_fit": np.full(count, 1e5), "flux_err": np.full(count, 300.0),
+    }  # fmt: skip
+    Table(columns).write(tmp_path / "a.ecsv")
+    assert read_camera_catalogue(tmp_path / "a.ecsv").flag.tolist() == meaning.tolist()
+    columns["flags"] = given * 4096
+    Table(columns).write(tmp_path / "b.ecsv")
+    with pytest.raises(DataError, match="no flag of photutils"):
+        read_camera_catalogue(tmp_path / "b.ecsv")
+
+
+@pytest.mark.parametrize("error", ["kron_flux_err", "kron_fluxerr"])  # photutils 3.0, and before
+def test_fluxes_of_the_source_catalogue_of_photutils(error, tmp_path):
+    columns = {"ra": [97.5, 97.6], "dec": [-44.0, -44.1], "kron_flux": [1e5, 2e5], error: [3e2, 4e2]}
+    Table(columns).write(tmp_path / "a.ecsv")
+    made = read_camera_catalogue(tmp_path / "a.ecsv")
+    assert (made.flux.tolist(), made.error.tolist()) == ([1e5, 2e5], [3e2, 4e2])
+
+
 def test_magnitudes_are_refused_whatever_their_name(tmp_path):
     columns = of_camera(STARS, 0, np.random.default_rng(0))
     columns["MAG_AUTO"] = 25.0 - 2.5 * np.log10(columns.pop("FLUX_AUTO"))

@@ -81,7 +81,7 @@ def test_a_step_that_stars_of_a_night_share_is_no_noise_of_theirs(stars):
 def test_scatter_beyond_n_err_is_no_change_and_says_nothing_for_the_calibration():
     found = [study.watched(120, seed, plates=(None,), scatter=3.0) for seed in range(8)]
     assert not any(watch.changes or watch.holds for watch in found)
-    assert "CANNOT SAY" in found[0].display().text()
+    assert "DO NOT SHOW" in found[0].display().text()
 
 
 def test_a_camera_that_drifts_is_told_as_that():
@@ -113,7 +113,7 @@ def test_records_of_a_watch():
     assert document["holds"] is False
     assert document["changes"][0]["time"] == 60006.0
     assert len(document["groups"]) == len(watch.time) == len(watch.to_table())
-    assert "HAS CEASED TO HOLD" in watch.display().text()
+    assert "IS NO LONGER VALID" in watch.display().text()
     assert len(watch_figure(watch).axes) == 4
     assert document["smallest_step_seen"] == pytest.approx(watch.smallest.min())
 

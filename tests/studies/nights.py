@@ -19,6 +19,7 @@ import functools
 import os
 import resource
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -55,7 +56,7 @@ NIGHTS = Path(tempfile.gettempdir()) / "walop-nights-of-the-study.fits"
 RATE = 1e-4  # of throughputs, per √day
 LAWS = {"throughput.n?.p00": Law(("walk",), rate=RATE)}
 START = 61000.85
-KILLS = 20
+KILLS = 10
 CHANGING = (
     "half1.plate.mgf2", "half2.plate.quartz", "half2.wedge", "half1.wedge", "collimator.q", "collimator.u",
     "collimator.diattenuation", "throughput.n2.p10", "throughput.n3.p01",
@@ -423,7 +424,9 @@ def command(*arguments: object, kill_after: float | None = None) -> tuple[float,
     child = subprocess.Popen(
         [sys.executable, "-m", "walop_jax", *map(str, arguments), "--quiet"], start_new_session=True
     )
-    watch = None if kill_after is None else threading.Timer(kill_after, child.kill)
+    watch = (
+        None if kill_after is None else threading.Timer(kill_after, os.killpg, (child.pid, signal.SIGKILL))
+    )
     if watch is not None:
         watch.start()
     _, status, used = os.wait4(child.pid, 0)
@@ -476,16 +479,28 @@ def passes(count: int, start: int = 0) -> None:
     (folder / "laws.toml").write_text(f'[law."throughput.n?.p00"]\nper = "walk"\nrate = {RATE}\n')
     command("refit", files[0], "-o", folder / "RUN")
 
-    def stacked(output: str, nights: int = count, **more: float) -> tuple[float, float, float]:
+    def stacked(output: str, *words: str, nights: int = count, **more: float) -> tuple[float, float, float]:
         like, laws = folder / "RUN", folder / "laws.toml"
         return command(
-            "stack", *files[:nights], "--like", like, "--laws", laws, "-o", folder / output, **more
+            "stack", *files[:nights], "--like", like, "--laws", laws, "-o", folder / output, *words, **more
         )
 
-    stacked("COLD", 2)
+    def apart(output: str) -> str:
+        ends = [read_calibration(folder / name / "calibration.fits") for name in ("WHOLE", output)]
+        shift = np.abs(ends[0].values - ends[1].values) / np.where(ends[0].sigma > 0.0, ends[0].sigma, np.inf)
+        same = np.array_equal(ends[0].covariance, ends[1].covariance) and not shift.any()
+        return "the same to the last digit" if same else f"parameters differ by {shift.max():.1e} σ at most"
+
+    stacked("COLD", nights=2)
     used, memory, wall = stacked("WHOLE")
     print(
         f"  {count} nights: {used:.1f} s of CPU ({used / count:.2f} a night), {memory:.2f} GB, {wall:.1f} s",
+        flush=True,
+    )
+    shared = stacked("WORKERS", "--workers", "2")
+    print(
+        f"  two workers: {shared[0]:.1f} s of CPU, {shared[2]:.1f} s, {wall / shared[2]:.2f} times as fast; "
+        f"{apart('WORKERS')}; load {os.getloadavg()[0]:.0f}",
         flush=True,
     )
     one = dataclasses.replace(ObservingPlan(), grid=round(12 * count**0.5))
@@ -494,14 +509,12 @@ def passes(count: int, start: int = 0) -> None:
     alike, size, _ = command("refit", folder / "one.fits", "-o", folder / "ONE")
     print(f"  one set as large: {alike:.1f} s of CPU, {size:.2f} GB: ratio {used / alike:.2f}", flush=True)
     rng = np.random.default_rng(start)
-    for _ in range(KILLS):
-        stacked("KILLED", kill_after=float(rng.uniform(0.3, 1.5) * wall / KILLS) + 3.0)
+    for kill in range(KILLS):  # by turns one process, and two workers whose parent dies
+        after = float(rng.uniform(0.3, 1.5) * wall / KILLS) + 3.0
+        stacked("KILLED", *(("--workers", "2") if kill % 2 else ()), kill_after=after)
     more, _, _ = stacked("KILLED")
-    ends = [read_calibration(folder / name / "calibration.fits") for name in ("WHOLE", "KILLED")]
-    apart = np.abs(ends[0].values - ends[1].values) / np.where(ends[0].sigma > 0.0, ends[0].sigma, np.inf)
     print(
-        f"  killed {KILLS} times: the last run took {more:.1f} s of CPU; parameters differ by "
-        f"{apart.max():.1e} σ at most",
+        f"  killed {KILLS} times: the last run took {more:.1f} s of CPU; {apart('KILLED')}",
         flush=True,
     )
     whole = read_nights(folder / "WHOLE" / "nights.fits")

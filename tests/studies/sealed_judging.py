@@ -12,7 +12,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import matrix_slopes
 from walop_jax.data.settings import Settings
 from walop_jax.diagnosis.findings import Diagnosis
-from walop_jax.model.effects import EFFECTS
+from walop_jax.model.effects import EFFECTS, Described, FreeForm, OtherDescription
 from walop_jax.model.effects.change import Change
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import effect_context
@@ -27,7 +27,8 @@ TEFF, STAR_P, DRAWS = 5772.0, 0.02, 400
 class Judged(NamedTuple):
     """A product held against the truth: error of stars, pulls of stars (place, q or u) and of elements.
 
-    `chance` is the probability that a product with this covariance is `wrong` though the covariance is exact.
+    `stated` is the error that the covariance gives, rms over the stars; `chance` is the probability that a product with
+    this covariance is `wrong` though the covariance is exact.
     """
 
     trusted: bool
@@ -35,6 +36,7 @@ class Judged(NamedTuple):
     stars: np.ndarray
     elements: np.ndarray
     chance: float = np.nan
+    stated: float = np.nan
 
     @property
     def beyond(self) -> float:
@@ -85,7 +87,8 @@ def judged(calibration: Calibration, trusted: bool, one: Sealed) -> Judged:
     slope = np.einsum("pij,pk->pijk", inverse, star).reshape(len(star), 2, 6)
     stated = np.sqrt(np.einsum("pia,pab,pib->pi", slope, covariance, slope))
     chance = _chance(calibration, one, setting, known, slope) if trusted else np.nan
-    return Judged(trusted, float(np.sqrt(np.mean(error**2))), error / stated, pulls, chance)
+    rms = (float(np.sqrt(np.mean(errors**2))) for errors in (error, stated))
+    return Judged(trusted, next(rms), error / stated, pulls, chance, next(rms))
 
 
 def homes_of(where: str, law: str) -> set[str]:
@@ -95,6 +98,7 @@ def homes_of(where: str, law: str) -> set[str]:
             "catalogue": "standards",
             "band": "band",
             "angle": "polariser",
+            "rotator": "ahead of polariser",
             "pair": "polariser",
             "sky": "moon",
         }
@@ -147,7 +151,10 @@ def right_of(one: Sealed, diagnosis: Diagnosis) -> str:
         texts = []
         for name in names:
             effect = next((kind for kind in EFFECTS if kind.name == name), None)
-            texts += name.split("; ") if effect is None else effect.neutral(context).in_sentences(bare)
+            if effect is not None:
+                texts += effect.neutral(context).in_sentences(bare)
+            elif name not in (Described.name, FreeForm.name, OtherDescription.name):
+                texts += name.split("; ")
         return {home_of(text, bare) for text in texts}
 
     told, classes = [], []

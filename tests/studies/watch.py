@@ -1,12 +1,13 @@
 """Do the stars of many nights see a camera that changes, and nothing where nothing has changed?
 
-    python tests/studies/watch.py [--quiet 500] [--each 100]
+    python tests/studies/watch.py [--quiet 500] [--each 100] [--overlaps 200]
 
 Every catalogue is of ten nights, each of its stars seen with the calibration plate out and at 22.5°, 10⁶ electrons a
 camera give or take a factor of three, through an instrument that differs from the calibration by errors drawn from its
 covariance. Printed are: false alarms in quiet catalogues; for 100, 600 and 5000 stars and steps of one camera from
 0.01 to 1 %, how many are found, how many at the right night, and how many name the camera (a wrong one apart); the
 same at the size that the bound promises for 99 %; and what is said of a camera that drifts and of a plate that turns.
+Before these: false alarms of the comparison of stars at two places of the field.
 """
 
 from __future__ import annotations
@@ -31,8 +32,10 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors  # noqa: E402
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.data.settings import Settings  # noqa: E402
 from walop_jax.data.user_tables import in_memory  # noqa: E402
+from walop_jax.science import apply as application  # noqa: E402
 from walop_jax.science.apply import residuals_of  # noqa: E402
 from walop_jax.science.catalogue import read_catalogue  # noqa: E402
+from walop_jax.science.overlaps import Overlap, overlap  # noqa: E402
 from walop_jax.science.star_residuals import StarResiduals  # noqa: E402
 from walop_jax.science.watch import Watching, with_rivals  # noqa: E402
 from walop_jax.science.watch_found import Watch  # noqa: E402
@@ -114,6 +117,26 @@ def watched(*given: Any, **options: Any) -> Watch:
     return watching(*given, **options).watch()
 
 
+def overlapping(stars: int, seed: int) -> Overlap | None:
+    """The comparison of sound stars that are seen in two fields 0.2 deg apart."""
+    rng, v = np.random.default_rng([stars, seed, 2]), vectors()
+    off = v.root @ rng.standard_normal(v.root.shape[1])
+    x, y = rng.uniform(-0.28, 0.08, stars), rng.uniform(-0.28, 0.28, stars)
+    s = np.column_stack([np.ones(stars), rng.normal(0.0, 0.02, (stars, 2))])
+    flux, rows = 4e6 * 10 ** rng.uniform(-0.5, 0.5, stars)[:, None], []
+    for field, shift in enumerate((0.0, 0.2)):
+        counts = flux * np.einsum("pks,ps->pk", _true_vectors(x + shift, y, None, off), s)
+        error = np.sqrt(counts + 100.0)
+        there = {"RA": 50.0 + np.arange(stars) / 100, "DEC": np.zeros(stars), "X": x + shift, "Y": y}
+        there |= {"N": counts + error * rng.standard_normal(counts.shape), "N_ERR": error}
+        there |= {"ROTATOR": np.zeros(stars), "TEFF": np.full(stars, 5500.0)}
+        rows.append(there | {"MJD": np.full(stars, 60000.0 + field)})
+    table = in_memory({name: np.concatenate([r[name] for r in rows]) for name in rows[0]})
+    calibration = v.calibration
+    catalogue = read_catalogue(table, calibration.model.template.patched(), always_in=calibration.always_in)
+    return overlap(calibration, catalogue)
+
+
 def _of(cameras: int | tuple[int, ...], change: np.ndarray) -> np.ndarray:
     return change[:, None] * np.isin(np.arange(4), cameras)
 
@@ -184,7 +207,17 @@ def main() -> None:
     )
     parser.add_argument("--quiet", type=int, default=500)
     parser.add_argument("--each", type=int, default=100)
+    parser.add_argument("--overlaps", type=int, default=200)
     given = parser.parse_args()
+    application.AnalysisVectors = lambda calibration: vectors()  # those of the one calibration, made once
+    for stars in STARS[:2]:
+        seen = [overlapping(stars, seed) for seed in range(given.overlaps // 2)]
+        ratio = [one.chi2 / one.dof for one in seen if one is not None]
+        alarms = sum(one is not None and one.differs for one in seen)
+        print(
+            f"overlaps, {stars} stars at two places: {alarms} false alarms in {len(seen)}; χ²/dof "
+            f"{np.mean(ratio):.3f} on average, {max(ratio):.3f} at most", flush=True,
+        )  # fmt: skip
     share = {100: 0.6, 600: 0.3, 5000: 0.1}
     for stars in STARS:
         count = round(given.quiet * share[stars])

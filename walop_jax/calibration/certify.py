@@ -174,7 +174,7 @@ def _protection(calibration: Calibration) -> Iterator[Check]:
     It may do no more to stars than `UNMEASURED`.
     """
     if calibration.hidden is None:
-        yield Check("protection", True, "nobody asked what could hide")
+        yield Check("protection", True, "undetectable errors were not computed")
         return
     mistakes = could_hide(calibration)
     stated = "no single mistake would move q and u by more than their errors"

@@ -66,7 +66,7 @@ class CouldHide(NamedTuple):
             if self.unit
             else f"{rounded(100 * self.size, '.2g')} %"
         )
-        return f"{self.name} ({'if wrong by' if self.measured else 'not measured; usual size'} {size})"
+        return f"{self.name} ({'an error of' if self.measured else 'not measured; usual size'} {size})"
 
 
 def unmeasured(mistakes: Iterable[CouldHide]) -> dict[str, CouldHide]:

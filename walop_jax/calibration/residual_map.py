@@ -68,9 +68,9 @@ def _point_sums(
     stokes = light.stokes(instrument, point.sight(plan))
     weight = point.weight * chosen[:, None]
     change = _changes(vectors, stokes, unit, instrument.cameras.pairs) * (flux * weight)[:, None]
-    known = plan.exposures.flux_known
+    known, shared = plan.exposures.flux_known, engine.sharing(instrument, plan, point)
     change = jnp.moveaxis(change, 1, 0)  # exposures next to cameras
-    change = jnp.moveaxis(project_flux(change, unit * weight, known, engine.sharing(instrument, plan)), 0, 1)
+    change = jnp.moveaxis(project_flux(change, unit * weight, known, shared), 0, 1)
     seen = (point.weight[:, 0] > 0) & chosen
     freedom = jnp.sum(jnp.where(seen, unit.shape[-1] - jnp.where(known, 0.0, instrument.cameras.fluxes), 0.0))
     chi2 = jnp.sum(jnp.where(chosen[:, None], residual, 0.0) ** 2)

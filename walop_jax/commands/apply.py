@@ -69,9 +69,9 @@ def apply(
     at one RA and DEC: they are combined, wherever the moving elements stand, and all hold the same result. With ROTATOR
     the results are on the sky. Two cameras see one combination of q and u: a star needs several settings.
 
-    Errors hold photon noise and calibration; Q_COLOUR and U_COLOUR say what ignoring TEFF does, Q_HIDDEN and U_HIDDEN
-    what a single mistake would do that the data of the calibration could not show (beside Q_ERR and U_ERR). FLAG: 16 a
-    direction of (q, u) is hardly measured, 32 beyond the calibrated field (no result a quarter beyond), 64
+    Errors hold photon noise and calibration; Q_COLOUR and U_COLOUR are the errors if TEFF were ignored, Q_HIDDEN and
+    U_HIDDEN the largest shift by an error that the calibration data could not reveal (beside Q_ERR and U_ERR). FLAG: 16
+    a direction of (q, u) is hardly measured, 32 beyond the calibrated field (no result a quarter beyond), 64
     filter, temperature or colour that the calibration has not seen, 128 a camera is missing, 256 flagged or
     saturated counts, 2048 used with --force, 16384 no result, 131072 intensities that disagree with the
     calibration by more than noise and half a per cent, 1048576 a place in the field where stars disagree together,

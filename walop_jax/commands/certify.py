@@ -79,7 +79,7 @@ class Certificate(Displayed):
         rows = [("ok" if check.passed else "FAILED", check.name, check.found) for check in self.checks]
         rows += requirement_rows(self.requirements)
         title = f"{self.path}: {'go' if self.go else 'NO GO'}"
-        return Display(title, head=("", "asked", "found"), rows=tuple(rows), notes=self.missing)
+        return Display(title, head=("", "requirement", "result"), rows=tuple(rows), notes=self.missing)
 
 
 @command(writes=(DOCUMENT,))
@@ -97,8 +97,8 @@ def certify(
     code 1 if any of these does not hold.
 
     A go needs a fit that converged and explains the data, exposures that are enough for a fit, and p of stars (p ≤ 5 %)
-    known to 0.05 % in half of the field by the calibration alone; else it is a no-go, exit code 3. How well p is known
-    in 95 % of the field, what else the exposures lack, and mistakes that they would not show, are told with what to do.
+    known to 0.05 % in half of the field by the calibration alone; else it is a no-go, exit code 3. The accuracy of p
+    in 95 % of the field, further missing exposures and undetectable errors are reported with a remedy.
     To rehearse a night, give the fit of a set of walop-jax simulate PLAN.
 
     In Python: a `Certificate`. Raises `DataError` for a file that cannot be read, has been changed, or is of another

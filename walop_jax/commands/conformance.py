@@ -26,7 +26,7 @@ def conformance(
     """Put another program to the test: 43 small questions on signs, frames, order of cameras, errors and bias.
 
     --make writes cases.csv (the questions), given.csv (their numbers), answers.csv and results.csv, whose column VALUE
-    the other program fills in. --check holds that against the answers and names the usual mistakes; exit code 1 if
+    the other program fills in. --check compares that with the answers and names the usual errors; exit code 1 if
     anything differs.
 
     In Python: the number of questions, or a `Conformance`.

@@ -141,10 +141,11 @@ def plan(
         if Path(str(criterion)).suffix and Path(str(criterion)).exists()
         else criterion
     )
+    possible = Available.of(available)  # pyright: ignore[reportArgumentType]
     job.tell("information of exposures", "information")
     with job.repeated() as say:
         found = plan_exposures(
-            Available.of(available),  # pyright: ignore[reportArgumentType]
+            possible if schedule is None else possible.in_whole_seconds(),
             minutes,
             criterion=chosen,
             known=known,

@@ -240,17 +240,18 @@ def _next_steps(command: Command[Any], given: dict[str, Any]) -> tuple[str, ...]
 
 def _show(found: Outcome[Any], quiet: bool, json: bool) -> None:
     """Print an outcome, and end with its exit code."""
-    for sentence in found.warnings:
-        warn(sentence)
+    text = "" if quiet or json else found.printed()
     if json:
         from walop_jax.io.text import json_text
 
         typer.echo(json_text(found.content), nl=False)
-    elif not quiet and (text := found.printed()):
+    elif text:
         _print(text, found.markdown)
-        if found.next and not found.failure:
-            # On stderr: what is on stdout may be redirected into a file.
-            typer.echo(f"Done in {seconds_since_start():.0f} s. Next: {' or '.join(found.next)}", err=True)
+    for sentence in found.warnings:
+        warn(sentence)
+    if text and found.next and not found.failure:
+        # On stderr: what is on stdout may be redirected into a file.
+        typer.echo(f"Done in {seconds_since_start():.0f} s. Next: {' or '.join(found.next)}", err=True)
     if found.failure:
         sys.stdout.flush()
         complain(found.failure)

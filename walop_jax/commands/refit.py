@@ -25,7 +25,7 @@ from walop_jax.io.errors import fail
 if TYPE_CHECKING:
     from walop_jax import CalibrationSet, FitResult
 
-COMPRESS = Option("Write whole frames as a small set that says the same.", "SET.fits", Path)
+COMPRESS = Option("Write whole frames as a small set with the same information.", "SET.fits", Path)
 STAGES = ("reading", "fitting", "examining", "mapping")
 """Of the progress, also of the commands that fit and do more."""
 
@@ -98,18 +98,21 @@ def refit(
         mapped = wanted and result.likelihood.layout.large and result.converged
         residuals = residual_map(result) if mapped else None
         misfit = describe(result) if wanted and not result.explains_data else None
+        brief = dataclasses.replace(result.display(), rows=(), notes=())
+        judged = f"The calibration can{'' if result.trusted else 'not'} be trusted; written to {output}."
         outcome = Outcome(
             result,
             summary(result, seconds=job.seconds, misfit=misfit, residuals=residuals),
             extra={"seed": job.seed},
             display=dataclasses.replace(result.display(), notes=result.notes),
-            below=f"The calibration can{'' if result.trusted else 'not'} be trusted; written to {output}.",
+            text=None if result.trusted else f"{brief.text()}\n{judged}",
+            below=judged,
             files=lambda: {
                 PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result, residuals))
             },
             saved_as=SUMMARY,
             next=next_steps(result.trusted, output, data, instrument=instrument, effects=effects),
-            warnings=(*result.warnings, *(() if misfit is None else misfit.sentences())),
+            warnings=result.warnings if misfit is None else misfit.reasons(result.warnings, output),
             trusted=result.trusted,
         )
         if not result.converged:

@@ -33,21 +33,25 @@ def standards(
     import numpy as np
 
     from walop_jax.data.records import Site
-    from walop_jax.data.standards import distances, in_degrees, shipped_standards
+    from walop_jax.data.standards import shipped_standards
     from walop_jax.instruments.description import default_name, read_description
+    from walop_jax.sky.directions import separation
     from walop_jax.sky.moon import altitude
 
     table = shipped_standards()
+    ra, dec = (np.asarray(table[name].to_value("deg"), float) for name in ("RA", "DEC"))
     if near is not None:
-        away = distances(table, *_direction(near))
-        table = in_degrees(table, "DISTANCE", away)[np.argsort(away, kind="stable")]
+        away = separation(ra, dec, *_direction(near))
+        table["DISTANCE"] = away * table["RA"].unit
+        nearest = np.argsort(away, kind="stable")
+        table, ra, dec = table[nearest], ra[nearest], dec[nearest]
     if up is not None:
         given: Any = default_name() if instrument is None else instrument
         place: Any = given.site if hasattr(given, "site") else read_description(given).place
-        ra, dec = (np.asarray(table[name].to_value("deg"), float) for name in ("RA", "DEC"))
         height = altitude(np.full(len(ra), up), ra, dec, Site(*place[:4]))
         order = np.arange(len(ra)) if near is not None else np.argsort(-height, kind="stable")
-        table = in_degrees(table, "ALTITUDE", height)[order[height[order] >= LOWEST]]
+        table["ALTITUDE"] = height * table["RA"].unit
+        table = table[order[height[order] >= LOWEST]]
     rows = [{name: _plain(row[name]) for name in table.colnames} for row in table]
     return Outcome(table, {**table.meta, "standards": rows}, _lines(table))
 

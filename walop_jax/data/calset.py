@@ -67,7 +67,7 @@ _SAMPLE = 8  # image rows looked at when frames are opened; every block is check
 def read_calibration_set(*paths: str | os.PathLike[str], kinds: Collection[str] = ()) -> CalibrationSet:
     """Read and check one calibration set, merging several files into one.
 
-    Whole frames are not read, only described; their blocks are checked as they are read. What was odd but
+    Whole frames are not read, only described; their blocks are checked as they are read. Oddities that are
     harmless (unknown columns, masked rows, …) stands in `remarks`. `kinds` are kinds of exposures beyond `KINDS`,
     for sources of the caller's own.
 
@@ -77,15 +77,15 @@ def read_calibration_set(*paths: str | os.PathLike[str], kinds: Collection[str] 
         raise fail("no file was given", advice="name at least one calibration set")
     sets: list[CalibrationSet] = []
     for path in paths:
-        one = _read_one(Path(path), kinds)
-        known = {entry.inputs[0].sha256: entry.inputs[0].path for entry in sets}
-        if one.inputs[0].sha256 in known:
+        calset = _read_one(Path(path), kinds)
+        path_of = {entry.inputs[0].sha256: entry.inputs[0].path for entry in sets}
+        if calset.inputs[0].sha256 in path_of:
             raise fail(
-                f"has the same bytes as {known[one.inputs[0].sha256]}",
+                f"has the same bytes as {path_of[calset.inputs[0].sha256]}",
                 file=path,
                 advice="name each file once: repeated data would shrink the errors",
             )
-        sets.append(one)
+        sets.append(calset)
     return sets[0] if len(sets) == 1 else merge_calibration_sets(*sets)
 
 
@@ -96,8 +96,8 @@ def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
         advice = "a calibration set is a FITS file (walop-jax docs files); walop_jax.from_arrays makes one of arrays"
         raise fail("is not a calibration set", file=path, advice=advice)
     with open_fits(path, "write the file again") as opened:
-        found = _from_hdus(opened, (*KINDS, *kinds))
-    return dataclasses.replace(found, inputs=(InputFile(path, opened.sha256),))
+        calset = _from_hdus(opened, (*KINDS, *kinds))
+    return dataclasses.replace(calset, inputs=(InputFile(path, opened.sha256),))
 
 
 def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
@@ -114,12 +114,14 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         place = Place(path, name)
         if name in hdus:
             columns = column_names(hdus[name], place)
-            if primary["CALVERS"] == 1:  # CLP and CHWP alone move there, whatever other columns are called
-                own = {*schema.TABLES[name], *(f"{prefix}_TURN" for prefix in (POLARISER, CALIBRATION_PLATE))}
-                columns = [column for column in columns if column in own]
+            if (
+                primary["CALVERS"] == 1 and name == "EXPOSURES"
+            ):  # CLP and CHWP alone move, whatever else is there
+                turns = [f"{prefix}_TURN" for prefix in (POLARISER, CALIBRATION_PLATE)]
+                columns = [column for column in columns if column in {*schema.EXPOSURES, *turns}]
             rules = table_rules(name, columns, place)
-            tables[name], more = read_table(hdus[name], rules, place)
-            remarks += more
+            tables[name], odd = read_table(hdus[name], rules, place)
+            remarks += odd
         elif name not in ("FILTERS", "SOURCES"):
             raise place.fail("the extension is missing", advice="see the file format")
     return assembled(
@@ -169,9 +171,9 @@ def assembled(
         points = make_points(tables["POINTS"], instrument, Place(path, "POINTS"))
         place = Place(path, "INTENSITIES")
         check_cameras(instrument, tables["INTENSITIES"]["N"].shape[1], place, "N")
-        intensities, more = table_intensities(tables["INTENSITIES"], exposures, points, sources, place)
+        intensities, odd = table_intensities(tables["INTENSITIES"], exposures, points, sources, place)
         intensities, repeated = mask_repeats(intensities, exposures, path)
-        remarks += more + repeated + _idle(intensities, exposures, path)
+        remarks += odd + repeated + _idle(intensities, exposures, path)
     remarks += repeated_counts(intensities, exposures, points, path, compression)
     if compression is not None:
         remarks.append(remark(compression, len(points)))
@@ -225,8 +227,8 @@ def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], d
         image = name == "FLAG" or _IMAGE.fullmatch(name)
         kind = tables if name in (*schema.TABLES, EXTENSION) else images if image else None
         if kind is None:
-            known = (*schema.TABLES, EXTENSION, *four)
-            remarks.append(f"{opened.path} [{name or number}]: unknown extension ({nearest(name, known)})")
+            expected = (*schema.TABLES, EXTENSION, *four)
+            remarks.append(f"{opened.path} [{name or number}]: unknown extension ({nearest(name, expected)})")
         elif name in kind:
             raise fail("is there twice", file=opened.path, extension=name, advice="remove one")
         else:
@@ -252,7 +254,7 @@ def _idle(intensities: TableIntensities, exposures: Exposures, path: Path) -> li
 def _frames(
     images: Mapping[str, Any], exposures: Exposures, instrument: str, path: Path
 ) -> tuple[Intensities, Points]:
-    """Describe frames, and look at a few rows of pixels for what is wrong everywhere."""
+    """Describe frames, and check a few rows of pixels for faults of the whole."""
     if np.any(bad := exposures.direct("standard")):
         what = f"EXPOSURE {exposures.exposure[bad][0]} is a standard, and a pixel of a frame has no SOURCE"
         advice = "give standards in a table, in another file"
@@ -261,7 +263,9 @@ def _frames(
     check_cameras(instrument, len(stack.counts), Place(path, "N0"), "")
     width, total = grid.width, grid.pixels
     corners = (0, width - 1, total - width, total - 1)
-    x, y = (np.concatenate(parts) for parts in zip(*(grid.xy(n, n + 1) for n in corners), strict=True))
+    x, y = (
+        np.concatenate(coordinates) for coordinates in zip(*(grid.xy(n, n + 1) for n in corners), strict=True)
+    )
     make_points({"POINT": np.arange(4), "X": x, "Y": y}, instrument, Place(path, "N0"))
     intensities = FrameIntensities(grid, (stack,))
     place, last = Place(path, "N0"), intensities.cameras - 1
@@ -306,6 +310,7 @@ def from_arrays(
     filters: Mapping[str, Any] | None = None,
     sources: Mapping[str, Any] | None = None,
     source: Any = None,
+    sky: Any = None,
     origin: str = "",
     **exposures: Any,
 ) -> CalibrationSet:
@@ -316,9 +321,10 @@ def from_arrays(
     exposure in degrees, NaN where it is out. `kinds` is the KIND of every exposure, or one for all.
 
     Any other column of EXPOSURES goes by its name in small letters, one value or one for each exposure: `mjd`,
-    `filter`, `teff`, `temp`, `ha`, `ra`, `dec`, `rotator`, `chwp_in`, `chwp_angle`, … (docs: files). `sources` are
-    the columns of SOURCES, `source` (point, exposure) the SOURCE of every intensity, −1 for none; `filters` are
-    `FilterCurve`s by name. Quantities are converted.
+    `filter`, `teff`, `temp`, `ha`, `ra`, `dec`, `rotator`, `chwp_in`, `chwp_angle`, … (docs: files). `sources` are the
+    columns of SOURCES, `source` (point, exposure) the SOURCE of every intensity, −1 for none; `sky` the level of the
+    sky that was subtracted from the counts, in their shape; `filters` are `FilterCurve`s by name. Quantities are
+    converted.
 
     Raises `DataError`, naming column and row, for whatever a file would be refused for.
 
@@ -367,17 +373,20 @@ def from_arrays(
             "N_ERR": errors[point, exposure],
         },
     }
+    if sky is not None:
+        level = np.broadcast_to(in_unit(sky, "electron", "sky"), counts.shape)
+        tables["INTENSITIES"] = {**tables["INTENSITIES"], "SKY": level[point, exposure]}
     if sources is not None:
         tables["SOURCES"] = _sources(sources)
     if filters:
         tables["FILTERS"] = filter_columns(filters)
-    found = _in_memory(
+    calset = _in_memory(
         tables,
         instrument=instrument,
         site=Site("", _NAN, _NAN, _NAN) if site is None else site,
         origin=origin,
     )
-    return dataclasses.replace(found, remarks=(*found.remarks, *_spoilt(counts)))
+    return dataclasses.replace(calset, remarks=(*calset.remarks, *_spoilt(counts)))
 
 
 def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationSet:
@@ -402,11 +411,11 @@ def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationS
 
 def _in_memory(tables: Mapping[str, Mapping[str, Any]], **said: Any) -> CalibrationSet:
     """A checked set of columns in memory; `said` as for `assembled`."""
-    made = {}
+    filled = {}
     for name, columns in tables.items():
         place = Place(NAME, name)
-        made[name] = table_of(columns, table_rules(name, list(columns), place), place)
-    return assembled(made, Path(NAME), **said)
+        filled[name] = table_of(columns, table_rules(name, list(columns), place), place)
+    return assembled(filled, Path(NAME), **said)
 
 
 def _spoilt(counts: np.ndarray) -> Iterator[str]:
@@ -418,8 +427,8 @@ def _spoilt(counts: np.ndarray) -> Iterator[str]:
             f"counts[{p}, {e}] (camera {' and '.join(str(k) for k in np.flatnonzero(~finite[p, e]))})"
             for p, e in places[:_SHOWN].tolist()
         )
-        more = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
-        yield f"{NAME}: not finite in {shown}{more}: not used in any camera"
+        suffix = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
+        yield f"{NAME}: not finite in {shown}{suffix}: not used in any camera"
 
 
 def _spread(name: str, values: Any, number: int) -> Any:

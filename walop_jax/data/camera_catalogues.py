@@ -1,8 +1,8 @@
 """Catalogues of single cameras as programs of photometry write them, by a map of the names of their columns.
 
 A map is a small TOML file: those of SExtractor and photutils stand beside this file, others are the user's. It says
-which columns are fluxes with their errors, positions on the sky or in pixels, and flags, and what the bits of the flags
-mean here. What a catalogue has under several names is read from the first that is there.
+which columns are fluxes with their errors, positions on the sky or in pixels, and flags, and the meaning of the bits
+of the flags. A quantity with several columns is read from the first one that the catalogue has.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from jaxtyping import Float, Int
 from walop_jax.data.schema import Column
 from walop_jax.data.table_files import read_table_file
 from walop_jax.data.units import Place, unit_of
-from walop_jax.data.user_tables import OF_STARS, InputTable, hints, in_memory, numeric_column
+from walop_jax.data.user_tables import OF_STARS, InputTable, hints, in_memory, numeric_column, sky_positions
 from walop_jax.io.errors import DataError, rows_text
 from walop_jax.io.fits_reading import open_fits
 from walop_jax.io.text import parse_toml, read_text, some
@@ -34,7 +34,7 @@ SHIPPED = ("sextractor", "photutils")
 BITS = (1, 2, 4, 8, 16)
 """Bits of FLAG that a catalogue may set."""
 BAD_PIXEL = 2
-OF_EXPOSURES = ("FILTER", "MJD", "TEMP", "HA", "CHWP_ANGLE", "CHWP_IN")
+OF_EXPOSURES = ("FILTER", "MJD", "TEMP", "HA", "CHWP_ANGLE", "CHWP_IN", "CHWP_TURN")
 """Columns, or words of a header, about the exposure: they go with its stars."""
 _LDAC, _HEADER = "LDAC_OBJECTS", "LDAC_IMHEAD"
 _FAINTEST_MAGNITUDE = 40.0
@@ -66,7 +66,7 @@ class ColumnMap:
 class CameraCatalogue:
     """The stars of one camera: positions (deg), fluxes with errors (counts), and bits of FLAG.
 
-    `of_stars` are columns that go with the stars, `of_exposure` what is the same for all of them; `header` is that of
+    `of_stars` are columns that go with the stars, `of_exposure` the values that all of them share; `header` is that of
     the image, empty where the file has none. Fluxes that were not measured are NaN.
     """
 
@@ -130,12 +130,12 @@ def read_camera_catalogue(
     source, header = _table(Path(path))
     place = Place(source.path, "")
     maps = [read_map(columns)] if columns is not None else [read_map(name) for name in SHIPPED]
-    known = next((one for one in maps if _pair(source, one.flux)), None)
-    if known is None:
+    column_map = next((candidate for candidate in maps if _pair(source, candidate.flux)), None)
+    if column_map is None:
         raise _no_flux(source, maps, place)
-    flux, error = _fluxes(source, known, gain, place)
-    ra, dec = _positions(source, known, header, place)
-    flag, remark = _flags(source, known, place)
+    flux, error = _fluxes(source, column_map, gain, place)
+    ra, dec = _positions(source, column_map, header, place)
+    flag, remark = _flags(source, column_map, place)
     bad = ~(np.isfinite(flux) & np.isfinite(error) & (error > 0))
     of_stars = {}
     for name, (unit, _) in OF_STARS.items():
@@ -180,23 +180,23 @@ def _table(path: Path) -> tuple[InputTable, Any]:
     except DataError:
         if path.suffix.lower() in (".fits", ".fit", ".ldac"):
             raise
-    there, table, how = read_table_file(path, ())
+    table_path, table, how = read_table_file(path, ())
     remarks.extend(how)
-    read = in_memory(table, str(there))
+    read = in_memory(table, str(table_path))
     read.remarks.extend(remarks)
     return read, header or {str(key).upper(): value for key, value in read.table.meta.items()}
 
 
 def _pair(source: InputTable, pairs: Sequence[Sequence[str]]) -> Sequence[str]:
     """The first of pairs of columns that are both there; none: ()."""
-    there = set(source.names)
-    return next((pair for pair in pairs if {_plain(name)[0] for name in pair} <= there), ())
+    names = set(source.names)
+    return next((pair for pair in pairs if {_plain(name)[0] for name in pair} <= names), ())
 
 
 def _plain(name: str) -> tuple[str, int]:
     """A name in capitals, and which of the values in a row is meant, from 1: FLUX_APER[2]; 0: not said."""
-    parts = re.fullmatch(r"(.+)\[(\d+)\]", name)
-    return (parts[1].upper(), int(parts[2])) if parts else (name.upper(), 0)
+    match = re.fullmatch(r"(.+)\[(\d+)\]", name)
+    return (match[1].upper(), int(match[2])) if match else (name.upper(), 0)
 
 
 def _one(source: InputTable, name: str, place: Place) -> Any:
@@ -214,23 +214,29 @@ def _one(source: InputTable, name: str, place: Place) -> Any:
 
 def _no_flux(source: InputTable, maps: Sequence[ColumnMap], place: Place) -> Exception:
     """The error for a catalogue without fluxes: magnitudes, or names that no map has."""
-    given = [name for name in source.names if any(name in map(str.upper, one.magnitude) for one in maps)]
-    if given or any(unit_of(source.table[name]) == "mag" for name in source.table.colnames):
-        listed = some(given or list(source.names), 4)
+    magnitudes = [
+        name
+        for name in source.names
+        if any(name in map(str.upper, column_map.magnitude) for column_map in maps)
+    ]
+    if magnitudes or any(unit_of(source.table[name]) == "mag" for name in source.table.colnames):
+        listed = some(magnitudes or list(source.names), 4)
         advice = f"write {maps[0].flux[0][0]} and {maps[0].flux[0][1]} as well: intensities add up, magnitudes do not"
         return place.fail(f"has magnitudes and no fluxes with errors ({listed})", "", advice)
-    wanted = " or ".join(f"{one.flux[0][0]}, {one.flux[0][1]} of {one.program}" for one in maps)
-    lone = [pair[0] for one in maps for pair in one.flux if pair[0].upper() in source.names]
-    what = f"has {lone[0]} without its error" if lone else f"has no fluxes with errors, such as {wanted}"
+    expected = " or ".join(
+        f"{column_map.flux[0][0]}, {column_map.flux[0][1]} of {column_map.program}" for column_map in maps
+    )
+    lone = [pair[0] for column_map in maps for pair in column_map.flux if pair[0].upper() in source.names]
+    what = f"has {lone[0]} without its error" if lone else f"has no fluxes with errors, such as {expected}"
     advice = "name the columns of another program in a TOML file: --columns FILE.toml (walop-jax docs files)"
     return place.fail(f"{what}; it has {some(list(source.names), 8)}", "", advice)
 
 
 def _fluxes(
-    source: InputTable, known: ColumnMap, gain: float | None, place: Place
+    source: InputTable, column_map: ColumnMap, gain: float | None, place: Place
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    names = _pair(source, known.flux)
-    others = [pair[0] for pair in known.flux if pair != names and pair[0].upper() in source.names]
+    names = _pair(source, column_map.flux)
+    unused = [pair[0] for pair in column_map.flux if pair != names and pair[0].upper() in source.names]
     values = []
     for name in names:
         column = _one(source, name, place)
@@ -242,76 +248,75 @@ def _fluxes(
             )
             raise place.fail(f"has the unit {unit}", _plain(name)[0], advice)
         plain = Column("float", missing=np.nan)
-        one = in_memory({name: np.ma.asarray(column)}, str(source.path))  # without its unit
-        values.append(numeric_column(one, name.upper(), plain))
+        unitless = in_memory({name: np.ma.asarray(column)}, str(source.path))  # without its unit
+        values.append(numeric_column(unitless, name.upper(), plain))
     flux, error = values
-    unit = unit_of(_one(source, names[0], place)).strip().lower() or known.unit
-    seen = np.isfinite(flux) & np.isfinite(error) & (error > 0)
+    unit = unit_of(_one(source, names[0], place)).strip().lower() or column_map.unit
+    measured = np.isfinite(flux) & np.isfinite(error) & (error > 0)
     if (
-        seen.any()
-        and np.abs(flux[seen]).max() < _FAINTEST_MAGNITUDE
-        and np.median(error[seen] / np.abs(flux[seen])) < 0.1
+        measured.any()
+        and np.abs(flux[measured]).max() < _FAINTEST_MAGNITUDE
+        and np.median(error[measured] / np.abs(flux[measured])) < 0.1
     ):
-        low, high, typical = flux[seen].min(), flux[seen].max(), np.median(error[seen])
+        low, high, typical = flux[measured].min(), flux[measured].max(), np.median(error[measured])
         what = f"lies between {low:.3g} and {high:.3g} with errors of {typical:.2g}: these are magnitudes"
         raise place.fail(what, _plain(names[0])[0], "name a column of fluxes")
     if gain is None and unit != "electron":
         source.remarks.append(
             f"{names[0]} is in counts: taken as electrons; --gain gives electrons per count"
         )
-    if others:
-        source.remarks.append(f"fluxes are {names[0]}, not {some(others, 3)}")
+    if unused:
+        source.remarks.append(f"fluxes are {names[0]}, not {some(unused, 3)}")
     factor = 1.0 if gain is None or unit == "electron" else gain
     return factor * flux, factor * error
 
 
 def _positions(
-    source: InputTable, known: ColumnMap, header: Mapping[str, Any], place: Place
+    source: InputTable, column_map: ColumnMap, header: Mapping[str, Any], place: Place
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Right ascension and declination (deg): from the sky, or from pixels by the WCS of the header."""
-    names = _pair(source, (*known.sky, ("RA", "DEC")))
+    names = _pair(source, (*column_map.sky, ("RA", "DEC")))
     if len(names) == 1:
         directions = source.column(_plain(names[0])[0])
         if hasattr(directions, "icrs"):
             return np.asarray(directions.icrs.ra.deg, float), np.asarray(directions.icrs.dec.deg, float)
         raise place.fail("holds no coordinates of astropy", names[0], "name two columns, in degrees")
     if names:
-        rule = Column("float", "deg", missing=np.nan)
-        ra, dec = (numeric_column(source, _plain(name)[0], rule) for name in names)
+        ra, dec = sky_positions(source, [_plain(name)[0] for name in names])
         place.refuse(
             ~(np.isfinite(ra) & np.isfinite(dec)), "is not finite", ", ".join(names), "remove these rows"
         )
         place.refuse(np.abs(dec) > 90.0, "is beyond ±90°", names[1], "declinations in degrees are needed")
         return ra, dec
-    pixels = _pair(source, known.pixel)
+    pixels = _pair(source, column_map.pixel)
     if not pixels or "CRVAL1" not in header:
-        wanted = known.sky[0] if known.sky else ("RA", "DEC")
-        what = f"has neither {' and '.join(wanted)} nor pixels with the WCS of their image"
+        expected = column_map.sky[0] if column_map.sky else ("RA", "DEC")
+        what = f"has neither {' and '.join(expected)} nor pixels with the WCS of their image"
         raise place.fail(
             what, "", "write the positions on the sky, or a catalogue with the header (FITS_LDAC)"
         )
     plane = WCS(fits.Header(header) if not isinstance(header, fits.Header) else header)
     x, y = (numeric_column(source, _plain(name)[0], Column("float", missing=np.nan)) for name in pixels)
-    ra, dec = plane.celestial.all_pix2world(x, y, known.first_pixel)
+    ra, dec = plane.celestial.all_pix2world(x, y, column_map.first_pixel)
     return np.mod(np.asarray(ra, float), 360.0), np.asarray(dec, float)
 
 
 def _flags(
-    source: InputTable, known: ColumnMap, place: Place
+    source: InputTable, column_map: ColumnMap, place: Place
 ) -> tuple[Int[np.ndarray, " n"], tuple[str, ...]]:
     """Bits of FLAG, and remarks."""
-    name = next((name.upper() for name in known.flag if name.upper() in source.names), None)
+    name = next((name.upper() for name in column_map.flag if name.upper() in source.names), None)
     flag = np.zeros(source.rows, np.int64)
     if name is None:
         return flag, ("no flags of the stars: blends and saturated ones are not known",)
     values = numeric_column(source, name, Column("int", missing=0)).astype(np.int64)
-    rest = values.copy()
-    for bit, meaning in known.bits.items():
+    undefined = values.copy()
+    for bit, meaning in column_map.bits.items():
         flag |= np.where(values & int(bit) > 0, meaning, 0)
-        rest &= ~int(bit)
-    odd = np.flatnonzero((rest != 0) | (values < 0))
+        undefined &= ~int(bit)
+    odd = np.flatnonzero((undefined != 0) | (values < 0))
     if odd.size:
-        what = f"is {values[odd[0]]} in {rows_text(odd)}, which is no flag of {known.program}"
+        what = f"is {values[odd[0]]} in {rows_text(odd)}, which is no flag of {column_map.program}"
         raise place.fail(
             what, name, "say what its bits mean in a map of columns: --columns FILE.toml, table [bits]"
         )
@@ -335,8 +340,8 @@ def centre_of(header: Mapping[str, Any]) -> dict[str, float] | None:
         return None
     plane = WCS(fits.Header(header) if not isinstance(header, fits.Header) else header).celestial
     middle = [0.5 * (float(header[f"NAXIS{k}"]) + 1.0) for k in (1, 2)]
-    here: Any = plane.pixel_to_world(middle[0] - 1.0, middle[1] - 1.0)
+    centre_pixel: Any = plane.pixel_to_world(middle[0] - 1.0, middle[1] - 1.0)
     beside: Any = plane.pixel_to_world(middle[0], middle[1] - 1.0)
-    centre = here.icrs
+    centre = centre_pixel.icrs
     angle = float(centre.position_angle(beside.icrs).deg)
     return {"RA": float(centre.ra.deg), "DEC": float(centre.dec.deg), "ROTATOR": angle}

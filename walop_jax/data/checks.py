@@ -47,7 +47,7 @@ def instrument_name(value: object, place: Place) -> str:
         raise place.fail(f"is {value!r}, not a name", "INSTRUME", advice)
     if name.upper() in shipped():
         return name.upper()
-    if any(_letters(name) == _letters(known) for known in shipped()):
+    if any(_letters(name) == _letters(shipped_name) for shipped_name in shipped()):
         raise place.fail(f"is {name!r}", "INSTRUME", nearest(name, shipped()))
     return name
 
@@ -99,11 +99,11 @@ def checked_curve(
         if bad:
             raise place.fail(f"{name!r} {what}{where}", column, advice)
 
-    given = np.isfinite(wavelength)
-    gap = not np.any(given) or not np.all(np.isfinite(throughput[given]))
+    finite = np.isfinite(wavelength)
+    gap = not np.any(finite) or not np.all(np.isfinite(throughput[finite]))
     advice = "pad both columns with NaN in the same places"
     refuse(gap, "has no value where WAVELENGTH has one,", "THROUGHPUT", advice)
-    wavelength, throughput = wavelength[given], throughput[given]
+    wavelength, throughput = wavelength[finite], throughput[finite]
     (low, high), (first, last) = WAVELENGTHS, (wavelength.min(), wavelength.max())
     what = f"reaches from {first:g} to {last:g} µm, outside {low:g} … {high:g},"
     advice = "wavelengths are in µm: are these nm or Angstrom?"
@@ -125,11 +125,11 @@ def make_sources(
     """
     check(table, SOURCES, place)
     sources = Sources(**{name.lower(): table[name] for name in SOURCES})
-    known = {*(filters or ()), *BUILTIN_FILTERS, *PHOTOMETRIC_BANDS}
-    for name in set(sources.filter.tolist()) - known - {""}:
+    bands = {*(filters or ()), *BUILTIN_FILTERS, *PHOTOMETRIC_BANDS}
+    for name in set(sources.filter.tolist()) - bands - {""}:
         if single_wavelength(name) is None:
             what = f"{name!r} is neither a row of FILTERS nor a band that is known,"
-            place.refuse(sources.filter == name, what, "FILTER", nearest(name, known))
+            place.refuse(sources.filter == name, what, "FILTER", nearest(name, bands))
     several = np.bincount(sources.stars, minlength=len(sources))[sources.stars] > 1
     advice = "number the stars; rows of one star need FILTER, each another one"
     place.refuse(several & (sources.filter == ""), "the identifier is not unique", "SOURCE", advice)
@@ -150,7 +150,7 @@ def make_exposures(
     place: Place,
     kinds: Collection[str] | None = KINDS.keys(),
 ) -> Exposures:
-    """Check the EXPOSURES table (degrees, days, kelvin, …) for what every KIND needs.
+    """Check the EXPOSURES table (degrees, days, kelvin, …) for the columns that every KIND needs.
 
     `kinds` are those that KIND may have, None: any.
     """
@@ -158,10 +158,10 @@ def make_exposures(
     for name in np.unique(kind).tolist():
         if kinds is not None and name not in kinds:
             place.refuse(kind == name, f"{name!r} is not a kind,", "KIND", nearest(name, kinds))
-    known = {*filters, *BUILTIN_FILTERS}
+    filter_names = {*filters, *BUILTIN_FILTERS}
     for name in np.unique(table["FILTER"]).tolist():
-        if name not in known:
-            what, advice = f"{name!r} is neither a row of FILTERS nor built in,", nearest(name, known)
+        if name not in filter_names:
+            what, advice = f"{name!r} is neither a row of FILTERS nor built in,", nearest(name, filter_names)
             place.refuse(table["FILTER"] == name, what, "FILTER", advice)
     clp_in = table["CLP_IN"]
     place.refuse((kind == "clp") & ~clp_in, "is false", "CLP_IN", "KIND clp needs the polariser in")
@@ -194,7 +194,7 @@ def make_exposures(
     moon, standard = (kind == "moon") & ~clp_in, (kind == "standard") & ~clp_in
     for name in ("MJD", "RA", "DEC", "ROTATOR"):
         bad = moon & ~np.isfinite(table[name])
-        place.refuse(bad, "is not finite", name, "the Moon sky needs time and pointing")
+        place.refuse(bad, "is not finite", name, "the moonlit sky needs time and pointing")
     bad = standard & ~np.isfinite(table["ROTATOR"])
     place.refuse(bad, "is not finite", "ROTATOR", "a standard needs it")
     low, high = EPHEMERIS_MJD
@@ -247,32 +247,32 @@ def doubts_about(instrument: str, site: Site, exposures: Exposures, place: Place
     elif like := difflib.get_close_matches(instrument.upper(), shipped(), 1, _LIKE):
         yield f"{place.file} [PRIMARY] INSTRUME: is {instrument!r}, not shipped; did you mean {like[0]!r}?"
     where = f"{place.file} [EXPOSURES] MJD"
-    given = np.flatnonzero(np.isfinite(exposures.mjd))
-    if not len(given):
+    dated = np.flatnonzero(np.isfinite(exposures.mjd))
+    if not len(dated):
         return
-    mjd = exposures.mjd[given]
+    mjd = exposures.mjd[dated]
     if np.any(old := mjd < _OLDEST):
-        yield f"{where}: is before 1990 in {rows_text(given[old])}; write NaN where the time is not known"
+        yield f"{where}: is before 1990 in {rows_text(dated[old])}; write NaN where the time is not known"
     middle = np.median(mjd)
     if np.any(far := np.abs(mjd - middle) > _CAMPAIGN):
         yield (
-            f"{where}: is more than {_CAMPAIGN:g} days from the median, {middle:.1f}, in {rows_text(given[far])}; "
+            f"{where}: is more than {_CAMPAIGN:g} days from the median, {middle:.1f}, in {rows_text(dated[far])}; "
             "correct it, or calibrate the epochs one by one"
         )
 
 
 def _about_site(instrument: str, site: Site, place: Place) -> Iterator[str]:
     _, latitude, longitude, elevation, _ = described(instrument).place
-    for card, value, known, near, unit in (
+    for card, value, described_value, near, unit in (
         ("SITELAT", site.latitude, latitude, _NEAR, "°"),
         ("SITELONG", site.longitude, longitude, _NEAR, "°"),
         ("SITEELEV", site.elevation, elevation, _LEVEL, " m"),
     ):
-        away = abs(value - known)
+        away = abs(value - described_value)
         if card == "SITELONG":
             away = abs((away + 180.0) % 360.0 - 180.0)
         if np.isfinite(away) and away > near:
             yield (
-                f"{place.file} [PRIMARY] {card}: is {value:g}{unit}, {instrument} stands at {known:g}{unit}; "
+                f"{place.file} [PRIMARY] {card}: is {value:g}{unit}, {instrument} stands at {described_value:g}{unit}; "
                 "correct the card if the instrument has not been moved"
             )

@@ -74,10 +74,10 @@ class Cube:
 
     def _check_stamp(self) -> None:
         try:
-            now = self.path.stat()
+            stat = self.path.stat()
         except OSError as error:
             raise self.place.fail(f"cannot be read: {error}") from error
-        if (now.st_size, now.st_mtime_ns) != self.stamp:
+        if (stat.st_size, stat.st_mtime_ns) != self.stamp:
             raise fail("the file has changed since it was opened", file=self.path, advice="read it again")
 
     def rows(self, start: int, stop: int) -> Float[np.ndarray, "e y x"]:
@@ -85,12 +85,12 @@ class Cube:
 
         Raises what `stored` raises.
         """
-        part = self.stored(start, stop)
-        values = part.astype(np.float64)
+        stored = self.stored(start, stop)
+        values = stored.astype(np.float64)
         if (self.scale, self.zero) != (1.0, 0.0):
             values = values * self.scale + self.zero
         if self.blank is not None:
-            values[part == self.blank] = np.nan
+            values[stored == self.blank] = np.nan
         return values
 
 
@@ -146,7 +146,7 @@ class FrameIntensities(Intensities):
         block = empty_block(*self.grid.xy(start, stop), self.exposures, self.cameras)
         first = 0
         for stack in self.stacks if stop > start else ():
-            here = slice(first, first + stack.exposures)
+            rows = slice(first, first + stack.exposures)
             counts, sigma, flag = self.read(stack, start, stop)
             used, _, impossible = usable(counts, sigma, flag)
             if np.any(impossible):
@@ -157,9 +157,9 @@ class FrameIntensities(Intensities):
                 what = f"is zero or negative in {where}, and {int(impossible.sum())} pixel(s) in all"
                 advice = "give the true error, or set the FLAG image"
                 raise stack.sigma[camera].place.fail(what, advice=advice)
-            block.used[:, here] = used
-            block.counts[:, here] = np.where(used[..., None], counts, 0.0)
-            block.sigma[:, here] = np.where(used[..., None], sigma, 1.0)
+            block.used[:, rows] = used
+            block.counts[:, rows] = np.where(used[..., None], counts, 0.0)
+            block.sigma[:, rows] = np.where(used[..., None], sigma, 1.0)
             first += stack.exposures
         return block
 
@@ -206,8 +206,10 @@ def frame_stack(images: Mapping[str, Any], exposures: int, path: Path) -> tuple[
             cubes[name] = dataclasses.replace(cube, scale=size * cube.scale, zero=size * cube.zero)
     check_units(units, "electron", Place(path, "BUNIT"))
     if len(grids) > 1:
-        one, other, *_ = grids.values()
-        raise fail(f"{one} and {other} do not lie on the same grid", file=path, advice="resample them first")
+        reference, second, *_ = grids.values()
+        raise fail(
+            f"{reference} and {second} do not lie on the same grid", file=path, advice="resample them first"
+        )
     grid = next(iter(grids))
     flag = cubes.get("FLAG")
     if flag is not None and flag.shape[1:] != (grid.height, grid.width):
@@ -268,7 +270,7 @@ class RawRows(NamedTuple):
 
 
 def float64(values: Array) -> Float[Array, ...]:
-    """Numbers from the words of big-endian float32; what is float64 stays so."""
+    """Numbers from the words of big-endian float32; float64 stays as it is."""
     if values.dtype != jnp.uint32:
         return values
     swapped = ((values & 0xFF) << 24) | ((values & 0xFF00) << 8) | ((values >> 8) & 0xFF00) | (values >> 24)
@@ -278,7 +280,7 @@ def float64(values: Array) -> Float[Array, ...]:
 class RowReader:
     """Reads image rows of all frames into arrays of `height` × `width` pixels, which each thread uses again and again.
 
-    What was made of the rows must be finished before the next ones are read.
+    Computations on the rows must be finished before the next ones are read.
     """
 
     def __init__(self, intensities: FrameIntensities, height: int, width: int) -> None:
@@ -295,16 +297,16 @@ class RowReader:
         closed[:] = True
         first = 0
         for stack in self.intensities.stacks:
-            here = slice(first, first + stack.exposures)
-            for array, own in ((counts, stack.counts), (sigma, stack.sigma)):
-                for camera, cube in enumerate(own):
-                    _read(cube, start, stop, array[camera, here])
-            closed[(here, *inside)] = False if stack.flag is None else _is_set(stack.flag, start, stop)
+            rows = slice(first, first + stack.exposures)
+            for array, stored in ((counts, stack.counts), (sigma, stack.sigma)):
+                for camera, cube in enumerate(stored):
+                    _read(cube, start, stop, array[camera, rows])
+            closed[(rows, *inside)] = False if stack.flag is None else _is_set(stack.flag, start, stop)
             first += stack.exposures
         return RawRows(jax.device_put(counts), jax.device_put(sigma), ~closed)
 
     def _buffers(self) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, "e h w"]]:
-        """This thread's arrays. Closed pixels hold zeros or what was there before, and are never used."""
+        """This thread's arrays. Values of closed pixels are undefined and never used."""
         if not hasattr(self._own, "buffers"):
             frames = self.intensities
             cubes = [cube for stack in frames.stacks for cube in (*stack.counts, *stack.sigma)]

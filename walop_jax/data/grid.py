@@ -49,10 +49,10 @@ class Grid:
 def read_grid(header: Any, place: Place) -> Grid:
     """Read the linear coordinates of the first two axes: CRPIX, CRVAL and CD, or CDELT with PC."""
     for axis, name in ((1, "X"), (2, "Y")):
-        found = str(header.get(f"CTYPE{axis}", "")).strip().upper()
-        if found != name:
+        axis_type = str(header.get(f"CTYPE{axis}", "")).strip().upper()
+        if axis_type != name:
             raise place.fail(
-                f"is {found!r} where {name!r} is needed", f"CTYPE{axis}", "field coordinates, linear"
+                f"is {axis_type!r} where {name!r} is needed", f"CTYPE{axis}", "field coordinates, linear"
             )
     if float(header.get("CROTA2", 0.0)) != 0.0:
         raise place.fail("is an obsolete rotation", "CROTA2", "write PC or CD")

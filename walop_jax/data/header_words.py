@@ -1,6 +1,6 @@
 """Exposures from the words of an observatory: headers of FITS files, exports of a telescope's log, tables of words.
 
-A TOML file says which word is which column of EXPOSURES, in which unit, and what is to be made of it (docs: files): no
+A TOML file says which word is which column of EXPOSURES, in which unit, and how it is converted (docs: files): no
 code of an observatory's own. Expressions are arithmetic; nothing else is evaluated.
 """
 
@@ -22,7 +22,7 @@ import numpy as np
 from walop_jax.data.kinds import KINDS
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, table_of, table_rules
 from walop_jax.data.table_files import read_table_file
-from walop_jax.data.units import Place, convert_unit
+from walop_jax.data.units import Place, convert_unit, sexagesimal
 from walop_jax.io.errors import errors_naming, fail, nearest
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.io.toml import Reader
@@ -35,6 +35,7 @@ TOP: Mapping[str, Any] = {"extension": int, "rows": str, "filters": Mapping[str,
 filters and facts of schedules (`data.schedule`)."""
 _SEXAGESIMAL = re.compile(r"[+-]?\d+[: ]\d+[: ]\d+(\.\d*)?")
 _MOVES = re.compile(r"[A-Z][A-Z0-9_]*_(IN|ANGLE|TURN)")
+_INSIDE = dict.fromkeys(("t", "true", "1", "in"), True) | dict.fromkeys(("f", "false", "0", "out"), False)
 _OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
     ast.Pow: operator.pow, ast.Mod: operator.mod, ast.USub: operator.neg, ast.UAdd: operator.pos,
@@ -45,7 +46,7 @@ _OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
 class Word:
     """Origin of a column: the first of `words` that is there, or a fixed `value`.
 
-    `values` replace what the word says (names of filters, kinds, positions), `unit` is that of the word, `expression`
+    `values` replace those of the word (names of filters, kinds, positions), `unit` is that of the word, `expression`
     makes the value of the column of x, the value in the unit of the column, and of other columns by name.
     """
 
@@ -59,7 +60,7 @@ class Word:
 
 @dataclasses.dataclass(frozen=True)
 class Words:
-    """The words of an observatory by column of EXPOSURES, and what else its files need (`TOP`)."""
+    """The words of an observatory by column of EXPOSURES, and the other entries of its file (`TOP`)."""
 
     columns: Mapping[str, Word]
     extension: int = 0
@@ -69,7 +70,7 @@ class Words:
 
 
 def read_words(path: str | os.PathLike[str]) -> Words:
-    """The words in a file. Raises `DataError` for a column that EXPOSURES do not have, and for what no word has."""
+    """The words in a file. Raises `DataError` for a column that EXPOSURES do not have, and for unknown keys."""
     with errors_naming(path):
         return words_of(parse_toml(read_text(path)))
 
@@ -82,20 +83,20 @@ def words_of(content: Mapping[str, Any]) -> Words:
             continue
         if name not in EXPOSURES and not _MOVES.fullmatch(name):
             raise read.fault("", f"EXPOSURES have no column {name!r}; {nearest(name, [*EXPOSURES, *TOP])}")
-        said = read.values(WORD, table, name)
-        words = said.pop("word", ())
+        settings = read.values(WORD, table, name)
+        words = settings.pop("word", ())
         words = (words,) if isinstance(words, str) else tuple(words)
-        if bool(words) == ("value" in said) or not all(isinstance(word, str) for word in words):
+        if bool(words) == ("value" in settings) or not all(isinstance(word, str) for word in words):
             raise read.fault(
                 name, 'needs word = "…", a list of words of which the first is taken, or value = …'
             )
-        if said.get("expression"):
-            names = _names(said["expression"], read, name)
+        if settings.get("expression"):
+            names = _names(settings["expression"], read, name)
             if odd := names - {"x", *content}:
                 raise read.fault(
                     name, f"expression: there is no {sorted(odd)[0]!r}; {nearest(sorted(odd)[0], content)}"
                 )
-        columns[name] = Word(words, **said)
+        columns[name] = Word(words, **settings)
     top = read.values(TOP, {key: value for key, value in content.items() if key in TOP}, "")
     return Words(columns, **top)
 
@@ -115,26 +116,26 @@ def exposures_table(
     names = list(dict.fromkeys(name for row in rows for name in row))
     if "KIND" not in names:
         raise Place(records[0][0], "").fail(
-            "nothing says what was observed", "KIND", "add [KIND] to the words"
+            "the kind of the exposures is not known", "KIND", "add [KIND] to the words"
         )
     place = Place(", ".join(dict.fromkeys(file for file, _ in records)), "EXPOSURES")
-    given = {name: _column([row.get(name) for row in rows], name) for name in names}
-    given.setdefault("EXPOSURE", np.arange(len(rows)))
-    rules = table_rules("EXPOSURES", list(given), place)
-    made = table_of(given, rules, place)
-    made["KIND"] = np.char.lower(made["KIND"])
-    for kind in np.unique(made["KIND"]).tolist():
+    columns = {name: _column([row.get(name) for row in rows], name) for name in names}
+    columns.setdefault("EXPOSURE", np.arange(len(rows)))
+    rules = table_rules("EXPOSURES", list(columns), place)
+    table = table_of(columns, rules, place)
+    table["KIND"] = np.char.lower(table["KIND"])
+    for kind in np.unique(table["KIND"]).tolist():
         if kind not in KINDS:
             place.refuse(
-                made["KIND"] == kind,
+                table["KIND"] == kind,
                 f"{kind!r} is not a kind,",
                 "KIND",
                 f"say it in values; {nearest(kind, KINDS)}",
             )
-    check(made, {name: rule for name, rule in rules.items() if name in made}, place)
-    absent = [name for name in EXPOSURES if name not in given and not _MOVES.fullmatch(name)]
+    check(table, {name: rule for name, rule in rules.items() if name in table}, place)
+    absent = [name for name in EXPOSURES if name not in columns and not _MOVES.fullmatch(name)]
     remarks = [f"no word for {', '.join(absent)}: taken as not known"] if absent else []
-    return made | {"FILE": np.array([file for file, _ in records])}, remarks
+    return table | {"FILE": np.array([file for file, _ in records])}, remarks
 
 
 # ------------------------------------------------------------------------------------------------ files and records
@@ -172,14 +173,14 @@ def _of_json(path: Path, rows: str) -> Iterator[Mapping[str, Any]]:
             raise fail(f"is no JSON: {error}", file=path, advice="export the log again") from None
     for key in filter(None, rows.split(".")):
         if not isinstance(content, Mapping) or key not in content:
-            known = list(content) if isinstance(content, Mapping) else []
+            keys = list(content) if isinstance(content, Mapping) else []
             raise fail(
                 f"rows = {rows!r}: there is no {key!r}",
                 file=path,
-                advice=nearest(key, known) if known else "",
+                advice=nearest(key, keys) if keys else "",
             )
         content = content[key]
-    if not isinstance(content, list) or not all(isinstance(one, Mapping) for one in content):
+    if not isinstance(content, list) or not all(isinstance(record, Mapping) for record in content):
         raise fail("holds no list of records", file=path, advice='say where it is: rows = "data.exposures"')
     yield from content
 
@@ -206,7 +207,7 @@ def _found(record: Mapping[str, Any], word: str) -> Any:
 
 def _row(record: Mapping[str, Any], words: Words, file: str) -> dict[str, Any]:
     """The columns of one exposure."""
-    place, row, made = Place(file, ""), {}, dict[str, Any]()
+    place, row, converted = Place(file, ""), {}, dict[str, Any]()
     rules = table_rules("EXPOSURES", list(words.columns), place)
     for name, word in words.columns.items():
         value = (
@@ -222,17 +223,19 @@ def _row(record: Mapping[str, Any], words: Words, file: str) -> dict[str, Any]:
             raise place.fail(
                 f"the word {listed} is missing", name, f"{like}; optional = true where it may be absent"
             )
-        made[name] = _value(value, name, rules[name], word, place)
-    for name, value in made.items():
+        converted[name] = _value(value, name, rules[name], word, place)
+    for name, value in converted.items():
         expression = words.columns[name].expression
-        row[name] = value if not expression else _evaluated(expression, {**made, "x": value}, name, place)
+        row[name] = (
+            value if not expression else _evaluated(expression, {**converted, "x": value}, name, place)
+        )
     return row
 
 
 def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any:
     """A value in the unit and of the kind of its column."""
     if word.values:
-        keys = {key.upper(): one for key, one in word.values.items()}
+        keys = {key.upper(): replacement for key, replacement in word.values.items()}
         text = _text(value).upper()
         if text not in keys:
             raise place.fail(f"{word.words[0]} = {value!r} is none of its values", name, nearest(text, keys))
@@ -241,21 +244,12 @@ def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any
     if rule.kind == "str":
         return _text(value)
     if rule.kind == "bool":
-        known = {
-            "T": True,
-            "TRUE": True,
-            "1": True,
-            "IN": True,
-            "F": False,
-            "FALSE": False,
-            "0": False,
-            "OUT": False,
-        }
-        if _text(value).upper() not in known:
+        text = _text(value).lower()
+        if text not in _INSIDE:
             raise place.fail(
-                f"{what} is neither true nor false", name, 'say what it means: values = { "…" = true }'
+                f"{what} is neither true nor false", name, 'give its meaning: values = { "…" = true }'
             )
-        return known[_text(value).upper()]
+        return _INSIDE[text]
     number = _number(value, name, rule, word, place, what)
     if rule.kind == "int":
         if number != round(number):
@@ -276,9 +270,7 @@ def _number(value: Any, name: str, rule: Column, word: Word, place: Place, what:
                 f"{what} is no date", name, "as 2026-11-26T01:02:03, or a number of days"
             ) from None
     if isinstance(value, str) and rule.unit in ("deg", "h") and _SEXAGESIMAL.fullmatch(value.strip()):
-        head, *parts = re.split("[: ]", value.strip())
-        sign = -1.0 if head.startswith("-") else 1.0
-        number = sign * (abs(float(head)) + float(parts[0]) / 60.0 + float(parts[1]) / 3600.0)
+        number = sexagesimal(value)
         if not word.unit:
             raise place.fail(
                 f"{what} may be hours or degrees", name, 'say unit = "hourangle" or unit = "deg"'
@@ -304,7 +296,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _column(values: Sequence[Any], name: str) -> np.ndarray:
-    """The values of all exposures; what some lack is what an absent column would hold."""
+    """The values of all exposures; missing ones are those of an absent column."""
     rule = EXPOSURES.get(name)
     missing = (
         False if name.endswith("_IN") else 0.0 if name.endswith("_TURN") else rule.missing if rule else np.nan
@@ -335,13 +327,13 @@ def _evaluated(expression: str, values: Mapping[str, Any], name: str, place: Pla
             if not isinstance(values.get(node.id), int | float):
                 raise place.fail(f"{expression!r} needs {node.id}, which is not known", name, "give its word")
             return float(values[node.id])
-        parts = (node.operand,) if isinstance(node, ast.UnaryOp) else (node.left, node.right)
-        return _OPERATORS[type(node.op)](*map(of, parts))
+        operands = (node.operand,) if isinstance(node, ast.UnaryOp) else (node.left, node.right)
+        return _OPERATORS[type(node.op)](*map(of, operands))
 
     try:
-        found = of(ast.parse(expression, mode="eval").body)
+        result = of(ast.parse(expression, mode="eval").body)
     except (ZeroDivisionError, OverflowError) as error:
         raise place.fail(f"{expression!r}: {error}", name, "correct the expression") from None
-    if isinstance(found, complex) or not np.isfinite(found):
+    if isinstance(result, complex) or not np.isfinite(result):
         raise place.fail(f"{expression!r} is not finite", name, "correct the expression")
-    return found
+    return result

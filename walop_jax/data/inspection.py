@@ -1,4 +1,4 @@
-"""Contents of a calibration set, and what is wrong with it: numbers and findings; nothing is printed here."""
+"""Contents and faults of a calibration set: numbers and findings; nothing is printed here."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Inspection(Displayed):
         low_x, high_x, low_y, high_y = self.field
         counted = math.isfinite(self.median_counts)
         apart = "; standards are measured at places of their own" if self.sources else ""
-        some = f" at {self.looked_at} points looked at" if self.looked_at < self.points else ""
+        sampled_points = f" at {self.looked_at} points looked at" if self.looked_at < self.points else ""
         place = (self.instrument, self.telescope)
         noise = f"{self.noise_ratio**0.5:.4g} × the photon noise √N (median)"
         return Display(
@@ -124,7 +124,7 @@ class Inspection(Displayed):
                 ),
                 (
                     "used",
-                    f"{self.rows} of {self.possible} (exposure, point) pairs{some}{apart}",
+                    f"{self.rows} of {self.possible} (exposure, point) pairs{sampled_points}{apart}",
                 ),
                 ("flagged", ", ".join(f"{count} {name}" for name, count in self.flags.items()) or "none"),
                 (
@@ -171,7 +171,7 @@ def inspect(calset: CalibrationSet) -> Inspection:
     angles = np.unique(np.round(np.mod(e.clp_angle[e.clp_in & live], 180.0), 3))
     gaps = np.diff(np.append(angles, angles[:1] + 180.0))
     ratio = float(np.median(sample.ratio)) if sample.ratio.size else float("nan")
-    made = Inspection(
+    inspection = Inspection(
         instrument=calset.instrument,
         telescope=calset.site.telescope,
         origin=calset.origin,
@@ -195,12 +195,12 @@ def inspect(calset: CalibrationSet) -> Inspection:
         findings=(),
     )
     findings = [
-        *_findings(calset, made),
+        *_findings(calset, inspection),
         *_about_cameras(sample.by_camera),
         *_about_settings(calset.exposures, live),
     ]
     notes = [Finding("note", remark) for remark in calset.remarks]
-    return dataclasses.replace(made, findings=(*findings, *notes))
+    return dataclasses.replace(inspection, findings=(*findings, *notes))
 
 
 def _sample(calset: CalibrationSet) -> _Sample:
@@ -208,9 +208,9 @@ def _sample(calset: CalibrationSet) -> _Sample:
     rows = block.used & ~calset.exposures.flux_known
     counts, sigma = block.counts[rows], block.sigma[rows]
     ratio = np.where(counts > 0, sigma**2 / np.where(counts > 0, counts, 1.0), np.nan)
-    seen = np.isfinite(ratio).any(axis=0)
+    measured = np.isfinite(ratio).any(axis=0)
     by_camera = np.full(ratio.shape[1], np.nan)
-    by_camera[seen] = np.nanmedian(ratio[:, seen], axis=0)
+    by_camera[measured] = np.nanmedian(ratio[:, measured], axis=0)
     return _Sample(len(block.used), block.used, counts.ravel(), ratio[np.isfinite(ratio)], by_camera)
 
 
@@ -228,7 +228,7 @@ def _groups(calset: CalibrationSet, share: np.ndarray) -> tuple[Group, ...]:
     ]
     groups = []
     for key in dict.fromkeys(keys):
-        rows = np.array([n for n, other in enumerate(keys) if other == key])
+        rows = np.array([n for n, group in enumerate(keys) if group == key])
         angles = np.unique(np.round(e.clp_angle[rows][e.clp_in[rows]], 3))
         groups.append(Group(*key, len(rows), len(angles), float(share[rows].mean())))
     return tuple(groups)
@@ -255,7 +255,7 @@ def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
     if not calset.exposures.further:
         yield from _about_angles(made)
     if made.points < 2:
-        # What another instrument needs its own description says.
+        # The needs of other instruments are in their descriptions.
         severity = "fault" if calset.instrument in shipped() else "note"
         yield Finding(
             severity,
@@ -283,8 +283,8 @@ def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
 
 def _about_cameras(noise_ratio: np.ndarray) -> Iterator[Finding]:
     """N_ERR²/N is the same in all cameras whose light is mostly counted in the same unit."""
-    known = noise_ratio[np.isfinite(noise_ratio)]
-    if known.size and known.max() > _UNEVEN * known.min():
+    finite = noise_ratio[np.isfinite(noise_ratio)]
+    if finite.size and finite.max() > _UNEVEN * finite.min():
         listed = ", ".join(f"N{k} {value:.3g}" for k, value in enumerate(noise_ratio))
         yield Finding(
             "doubt",
@@ -307,7 +307,7 @@ def _about_angles(made: Inspection) -> Iterator[Finding]:
     elif number < _FEW_ANGLES:
         yield Finding(
             "doubt",
-            f"only {number} polariser angles",
+            f"only {number} polariser angles modulo 180°",
             "with fewer than 8, polariser errors cannot be told from instrument errors",
         )
 
@@ -319,13 +319,13 @@ def about_exposures(exposures: Exposures) -> Iterator[Finding]:
         yield Finding(
             "note",
             "the polariser turns through half a turn only",
-            "a full turn tells a wobble of its rotation from the instrument",
+            "a full turn is needed to separate an encoder wobble from the instrument",
         )
     if not np.any(e.direct("moon", "standard")):
         yield Finding(
             "note",
-            "no light of known polarisation but through the polariser (neither Moon sky nor standards)",
-            "the zero of the polariser and a polarising telescope cannot be seen without",
+            "the only light of known polarisation is that through the polariser (neither moonlit sky nor standards)",
+            "without these, neither the zero of the polariser nor telescope polarisation can be measured",
         )
 
 

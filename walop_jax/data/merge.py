@@ -59,26 +59,26 @@ class JoinedIntensities(Intensities):
         for part in self.parts:
             piece = part.intensities.block(max(start, 0), max(stop, 0))
             start, stop = start - len(part.points), stop - len(part.points)
-            whole = empty_block(piece.x, piece.y, self.exposures, self.cameras)
+            dense = empty_block(piece.x, piece.y, self.exposures, self.cameras)
             for name in ("counts", "sigma", "used", "source"):
-                getattr(whole, name)[:, part.exposures] = getattr(piece, name)
-            pieces.append(whole)
+                getattr(dense, name)[:, part.exposures] = getattr(piece, name)
+            pieces.append(dense)
         return Block.joined(pieces)
 
 
 def parts_of(calset: CalibrationSet) -> tuple[Part, ...]:
     """The parts of a set with field points of their own, one where it has no others."""
-    whole = calset.intensities
-    if isinstance(whole, JoinedIntensities):
-        return whole.parts
-    return (Part(whole, calset.points, np.arange(len(calset.exposures))),)
+    intensities = calset.intensities
+    if isinstance(intensities, JoinedIntensities):
+        return intensities.parts
+    return (Part(intensities, calset.points, np.arange(len(calset.exposures))),)
 
 
 def frames_among(calset: CalibrationSet) -> tuple[FrameIntensities, Int[np.ndarray, " r"]] | None:
     """The frames of a set and the exposures (positions) that they hold; None where there are none, or on two grids."""
     parts = parts_of(calset)
-    found = [(p.intensities, p.exposures) for p in parts if isinstance(p.intensities, FrameIntensities)]
-    return found[0] if len(found) == 1 else None
+    frames = [(p.intensities, p.exposures) for p in parts if isinstance(p.intensities, FrameIntensities)]
+    return frames[0] if len(frames) == 1 else None
 
 
 def without_frames(calset: CalibrationSet) -> CalibrationSet | None:
@@ -103,8 +103,8 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
     one name and two meanings, and for a set that stands for pixels beside another one, or beside frames.
     """
     first = sets[0]
-    for other in sets[1:]:
-        _refuse_another_instrument(first, other)
+    for calset in sets[1:]:
+        _refuse_another_instrument(first, calset)
     exposures, remarks = _join_exposures(sets)
     compression = _joined_record(sets, exposures)
     sources, source_rows = _join_sources(sets)
@@ -139,17 +139,17 @@ def _joined_record(sets: tuple[CalibrationSet, ...], exposures: Exposures) -> Co
     first = 0
     record: Compression | None = None
     for entry in sets:
-        here, first = slice(first, first + len(entry.exposures)), first + len(entry.exposures)
+        rows, first = slice(first, first + len(entry.exposures)), first + len(entry.exposures)
         if entry.compression is None:
             continue
-        others = [one for one in sets if one is not entry]
-        if any(one.compression is not None or frames_among(one) for one in others):
+        beside = [calset for calset in sets if calset is not entry]
+        if any(calset.compression is not None or frames_among(calset) for calset in beside):
             what = "stands for pixels that were summed at one set of values; so do other sets here, or there are frames"
             again = "walop-jax refit A.fits B.fits --compress SET.fits -o RUN"
             raise _conflict(what, entry, "", f"compress the frames of all together: {again}")
-        numbers = exposures.exposure[here][entry.compression.covers(entry.exposures)]
+        numbers = exposures.exposure[rows][entry.compression.covers(entry.exposures)]
         record = dataclasses.replace(
-            entry.compression, exposures=tuple(numbers.tolist()) if others else entry.compression.exposures
+            entry.compression, exposures=tuple(numbers.tolist()) if beside else entry.compression.exposures
         )
     return record
 
@@ -161,8 +161,10 @@ def _refuse_another_instrument(first: CalibrationSet, other: CalibrationSet) -> 
         what = f"has {other.cameras} cameras, {_name(first)} has {first.cameras}"
         raise _conflict(what, other, "N", "these are not sets of one instrument")
     # To a thousandth of a degree, and ten metres.
-    one, two = ([site.latitude, site.longitude, site.elevation] for site in (first.site, other.site))
-    if not np.isclose(one, two, rtol=0, atol=[1e-3, 1e-3, 10.0], equal_nan=True).all():
+    position, other_position = (
+        [site.latitude, site.longitude, site.elevation] for site in (first.site, other.site)
+    )
+    if not np.isclose(position, other_position, rtol=0, atol=[1e-3, 1e-3, 10.0], equal_nan=True).all():
         what = f"is another site than that of {_name(first)}"
         raise _conflict(what, other, "SITELAT, SITELONG, SITEELEV")
 
@@ -183,8 +185,10 @@ def _parts(sets: tuple[CalibrationSet, ...], source_rows: list[np.ndarray]) -> l
     parts = []
     for grid, members in frames.items():
         stacks = tuple(stack for member, _ in members for stack in member.stacks)
-        whole = FrameIntensities(grid, stacks)
-        parts.append(Part(whole, grid.points, np.concatenate([member_rows for _, member_rows in members])))
+        frames_of_grid = FrameIntensities(grid, stacks)
+        parts.append(
+            Part(frames_of_grid, grid.points, np.concatenate([member_rows for _, member_rows in members]))
+        )
     if tables:
         table, points = _join_tables([sets[n] for n in tables], [source_rows[n] for n in tables])
         parts.append(Part(table, points, np.concatenate([rows[n] for n in tables])))
@@ -234,34 +238,34 @@ def _join_sources(sets: tuple[CalibrationSet, ...]) -> tuple[Sources, list[np.nd
     Values of a star that differ are those of the bands that the files saw it in, if each saw it in one of its own.
     """
     fields = [field.name for field in dataclasses.fields(Sources)]
-    whole = {name: np.concatenate([getattr(entry.sources, name) for entry in sets]) for name in fields}
+    columns = {name: np.concatenate([getattr(entry.sources, name) for entry in sets]) for name in fields}
     owner = np.repeat(np.arange(len(sets)), [len(entry.sources) for entry in sets])
     first = np.cumsum([0, *(len(entry.sources) for entry in sets[:-1])])
     star = np.concatenate([entry.sources.stars + n for entry, n in zip(sets, first, strict=True)]).astype(int)
     earliest: dict[str, int] = {}
     for i in np.flatnonzero(star == np.arange(len(star))).tolist():
-        name, here = str(whole["name"][i]), owner[i]
+        name, file = str(columns["name"][i]), owner[i]
         at = earliest.setdefault(name, i) if name else i
-        if owner[at] != here:
+        if owner[at] != file:
             star[star == i] = at
-    values = np.stack([whole[name] for name in ("q", "u", "q_err", "u_err", "scatter")], axis=1)
-    band = _bands_of(sets, star, owner, values, whole["filter"])
-    kept: list[int] = []
+    values = np.stack([columns[name] for name in ("q", "u", "q_err", "u_err", "scatter")], axis=1)
+    band = _bands_of(sets, star, owner, values, columns["filter"])
+    rows_kept: list[int] = []
     for row in range(len(star)):
-        same = [k for k in kept if star[k] == star[row] and band[k] == band[row]]
-        teff = whole["teff"][[star[row], row]]
+        same = [k for k in rows_kept if star[k] == star[row] and band[k] == band[row]]
+        teff = columns["teff"][[star[row], row]]
         if not (np.array_equal(teff[:1], teff[1:], equal_nan=True) and _equal(values[[*same, row]])):
-            what = f"{str(whole['name'][row])!r} has other values than in an earlier file"
+            what = f"{str(columns['name'][row])!r} has other values than in an earlier file"
             advice = "correct one of them, give it another NAME, or FILTER to values of several bands"
             raise _conflict(what, sets[owner[row]], "SOURCES", advice)
         if not same:
-            kept.append(row)
-    place = {row: number for number, row in enumerate(kept)}
-    rows = np.array(kept, dtype=np.int64)
-    numbers = _fresh(whole["source"][np.unique(star)])
+            rows_kept.append(row)
+    place = {row: number for number, row in enumerate(rows_kept)}
+    rows = np.array(rows_kept, dtype=np.int64)
+    numbers = _fresh(columns["source"][np.unique(star)])
     source = numbers[np.searchsorted(np.unique(star), star[rows])]
     joined = Sources(
-        **{name: column[rows] for name, column in whole.items()} | {"source": source, "filter": band[rows]}
+        **{name: column[rows] for name, column in columns.items()} | {"source": source, "filter": band[rows]}
     )
     becomes = np.array([place[i] for i in star.tolist()], dtype=np.int64)
     return joined, np.split(becomes, first[1:])
@@ -279,10 +283,10 @@ def _bands_of(
     stated: np.ndarray,
 ) -> np.ndarray:
     """The bands of values: as stated, and of stars with different values that in which their file saw its stars."""
-    seen = [np.unique(entry.exposures.filter[entry.exposures.direct("standard")]) for entry in sets]
-    own = np.array([names[0] if len(names) == 1 else "" for names in seen])
-    differ = [not _equal(values[star == one]) for one in star]
-    return np.where((stated == "") & np.array(differ, bool), own[owner], stated)
+    filters = [np.unique(entry.exposures.filter[entry.exposures.direct("standard")]) for entry in sets]
+    filter_of_file = np.array([names[0] if len(names) == 1 else "" for names in filters])
+    differ = [not _equal(values[star == number]) for number in star]
+    return np.where((stated == "") & np.array(differ, bool), filter_of_file[owner], stated)
 
 
 def _join_filters(sets: tuple[CalibrationSet, ...]) -> dict[str, FilterCurve]:
@@ -319,7 +323,7 @@ def _join_tables(
         joined,
         exposure=np.concatenate([t.exposure + n for t, n in zip(tables, first_exposure, strict=False)]),
         point=np.concatenate([row[n + t.point] for t, n in zip(tables, first_point, strict=False)]),
-        # The appended −1 is what a row without a source (−1, the last entry) becomes.
+        # The appended −1 is the entry of a row without a source (−1, the last entry).
         source=np.concatenate(
             [np.append(rows, -1)[t.source] for t, rows in zip(tables, source_rows, strict=True)]
         ),
@@ -327,7 +331,15 @@ def _join_tables(
             name: np.concatenate([getattr(table, name) for table in tables])
             for name in ("counts", "sigma", "flag", "used")
         },
+        sky=_joined_sky(tables),
     ), joined
+
+
+def _joined_sky(tables: Sequence[TableIntensities]) -> np.ndarray | None:
+    """The level of the sky in all tables, 0 in those that do not state it."""
+    if all(table.sky is None for table in tables):
+        return None
+    return np.concatenate([np.zeros_like(t.counts) if t.sky is None else t.sky for t in tables])
 
 
 def _earlier_ones(points: Points) -> Int[np.ndarray, " p"]:

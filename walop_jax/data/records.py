@@ -281,7 +281,7 @@ class Sources:
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """Intensities of some field points in all exposures, dense: what the likelihood is fed with.
+    """Intensities of some field points in all exposures, dense: the input of the likelihood.
 
     `counts` and `sigma` in electrons, camera by camera; `used` is False where there is no measurement, or a
     flagged or unusable one (counts 0 and sigma 1 stand there). `source` is a row of `Sources`, -1 for none.
@@ -363,7 +363,7 @@ class CalibrationSet(Displayed):
         return self.intensities.cameras
 
     def display(self) -> Display:
-        """Summary of what was observed, without reading frames."""
+        """Summary of the observations, without reading frames."""
         e, points = self.exposures, self.points
         kinds = ", ".join(f"{number} {kind}" for kind, number in Counter(e.kind.tolist()).items())
         facts = {
@@ -389,9 +389,9 @@ class CalibrationSet(Displayed):
         """
         block, e = self.intensities.block(0, len(self.points)), self.exposures
         used = block.used[:, :, None]
-        others = {name.lower(): values for name, values in e.columns().items()}
+        columns = {name.lower(): values for name, values in e.columns().items()}
         for name in ("exposure", "kind", "clp_in", "clp_angle"):
-            others.pop(name, None)
+            columns.pop(name, None)
         return {
             "counts": np.where(used, block.counts, np.nan),
             "errors": np.where(used, block.sigma, np.nan),
@@ -400,7 +400,7 @@ class CalibrationSet(Displayed):
             "angles": np.where(e.clp_in, e.clp_angle, np.nan),
             "kinds": e.kind,
             "source": np.where(block.source >= 0, np.append(self.sources.source, -1)[block.source], -1),
-            **others,
+            **columns,
             "instrument": self.instrument,
             "site": self.site,
             "filters": dict(self.filters),

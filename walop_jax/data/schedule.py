@@ -20,6 +20,7 @@ import numpy as np
 
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.data.records import Exposures, Position, Site, Sources
+from walop_jax.data.units import sexagesimal
 from walop_jax.io.errors import fail
 from walop_jax.io.text import read_text
 
@@ -55,8 +56,8 @@ def schedule_of(
 ) -> tuple[dict[str, Any], list[str]]:
     """The schedule of exposures in their order, and remarks; `names` are those of their targets.
 
-    `facts` are name, pi, observer, mode. Raises `DataError` for what a schedule cannot state: more than four filters,
-    other moving elements, a turn that is not one of half turns or faster than three turns a minute.
+    `facts` are name, pi, observer, mode. Raises `DataError` for exposures that no schedule can hold: more than four
+    filters, other moving elements, a turn that is not one of half turns or faster than three turns a minute.
     """
     facts, remarks = dict(facts or {}), list[str]()
     _check(exposures, filters)
@@ -90,7 +91,7 @@ def schedule_of(
         targets.append({"target": target, "type": kind, "acquisition": acquisitions})
     mjd = exposures.mjd[np.isfinite(exposures.mjd)]
     evening = _local(float(mjd.min()) if mjd.size else 51544.0, site) - datetime.timedelta(hours=12)
-    made = {
+    schedule = {
         "name": facts.get("name", "calibration"),
         "date": evening.date().isoformat(),
         "pi": facts.get("pi", "walop-jax"),
@@ -99,7 +100,7 @@ def schedule_of(
         "objects": list(objects.values()),
         "targets": targets,
     }
-    return made, remarks
+    return schedule, remarks
 
 
 def read_schedule(
@@ -108,7 +109,8 @@ def read_schedule(
     """The exposures of a schedule, the names of their targets, and remarks.
 
     An acquisition that was executed may hold `executed`, the UTC at which each exposure began. Without it times are not
-    known. Raises `DataError`, with target and acquisition, for what is missing or cannot be stated of an exposure.
+    known. Raises `DataError`, with target and acquisition, for missing entries and for states that an exposure cannot
+    have.
     """
     try:
         content = json.loads(read_text(path))
@@ -116,7 +118,7 @@ def read_schedule(
         raise fail(f"is no JSON: {error}", file=path, advice="write it again") from None
     if not is_schedule(content):
         raise fail("is no schedule: it has no objects and targets", file=path, advice="give one of format v4")
-    where = {str(one.get("name")): one for one in content["objects"]}
+    where = {str(target.get("name")): target for target in content["objects"]}
     name_of = {number: name for name, number in filters.items()}
     rows, remarks = list(_read(content, where, name_of, path)), list[str]()
     if not rows:
@@ -130,7 +132,7 @@ def read_schedule(
     places = {}
     for prefix in ELEMENTS:
         inside, angle, turn = (
-            np.array(part) for part in zip(*(row["positions"][prefix] for row in rows), strict=True)
+            np.array(column) for column in zip(*(row["positions"][prefix] for row in rows), strict=True)
         )
         places[prefix] = Position(inside.astype(bool), angle.astype(float), turn.astype(float))
     exposures = Exposures(
@@ -208,18 +210,18 @@ def _local(mjd: float, site: Site) -> datetime.datetime:
 
 def _window(mjd: np.ndarray, exptime: np.ndarray, site: Site) -> dict[str, str]:
     """A window about exposures; the whole night where their times are not known."""
-    known = np.isfinite(mjd)
-    if not known.any():
+    dated = np.isfinite(mjd)
+    if not dated.any():
         return {"start": "18:00:00", "end": "06:00:00"}
-    half = np.nan_to_num(exptime[known]) / 2.0 / 86400.0
-    edges = (mjd[known] - half).min() - SLACK / 1440.0, (mjd[known] + half).max() + SLACK / 1440.0
+    half = np.nan_to_num(exptime[dated]) / 2.0 / 86400.0
+    edges = (mjd[dated] - half).min() - SLACK / 1440.0, (mjd[dated] + half).max() + SLACK / 1440.0
     return dict(zip(("start", "end"), (f"{_local(float(t), site):%H:%M:%S}" for t in edges), strict=True))
 
 
 def _sexagesimal(value: float, most: int) -> str:
     hundredths = round(value * 360000.0) % (most * 360000)
-    rest, fraction = divmod(hundredths, 100)
-    return f"{rest // 3600:02d}:{rest // 60 % 60:02d}:{rest % 60:02d}.{fraction:02d}"
+    seconds, fraction = divmod(hundredths, 100)
+    return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}.{fraction:02d}"
 
 
 def _signed(value: float) -> str:
@@ -233,22 +235,26 @@ def _read(
     content: Mapping[str, Any], where: Mapping[str, Any], name_of: Mapping[int, str], path: Any
 ) -> Iterator[dict[str, Any]]:
     for target in content["targets"]:
-        for number, one in enumerate(target.get("acquisition", [])):
+        for number, acquisition in enumerate(target.get("acquisition", [])):
             name = str(target.get("target"))
             place = f"{path}: target {name}, acquisition {number}"
             try:
-                count, seconds = one["exposure"]["multiples"], one["exposure"]["T"]
-                number_of_filter, plate, polariser = one["filter"], one["hwp"], one["polarizer"]
+                count, seconds = acquisition["exposure"]["multiples"], acquisition["exposure"]["T"]
+                number_of_filter, plate, polariser = (
+                    acquisition["filter"],
+                    acquisition["hwp"],
+                    acquisition["polarizer"],
+                )
             except (KeyError, TypeError) as error:
                 raise fail(f"has no {error}", file=place, advice="see the format v4") from None
             if number_of_filter not in name_of:
                 advice = f'give its name: filters = {{ "SDSS-r" = {number_of_filter} }} in the words'
                 raise fail(f"filter {number_of_filter} has no name", file=place, advice=advice)
-            began = one.get("executed", [])
+            began = acquisition.get("executed", [])
             if began and len(began) != count:
                 raise fail(f"has {len(began)} times of {count} exposures", file=place, advice="one for each")
             kind = "clp" if polariser["engage"] else KINDS_OF.get(str(target.get("type")), "lamp")
-            there = where.get(name, {})
+            coordinates = where.get(name, {})
             positions = {CALIBRATION_PLATE: plate, POLARISER: polariser}
             for k in range(count):
                 yield {
@@ -257,8 +263,8 @@ def _read(
                     "mjd": _mjd(began[k], place) + seconds / 2 / 86400.0 if began else math.nan,
                     "exptime": float(seconds),
                     "filter": name_of[number_of_filter],
-                    "ra": 15.0 * _degrees(there.get("ra")),
-                    "dec": _degrees(there.get("dec")),
+                    "ra": 15.0 * sexagesimal(coordinates.get("ra")),
+                    "dec": sexagesimal(coordinates.get("dec")),
                     "positions": {p: _position(state, p, seconds, place) for p, state in positions.items()},
                 }
 
@@ -289,10 +295,3 @@ def _mjd(text: Any, place: str) -> float:
         raise fail(f"executed: {text!r} is no time", file=place, advice="as 2026-11-26T01:02:03Z") from None
     began = began.astimezone(datetime.UTC).replace(tzinfo=None) if began.tzinfo else began
     return (began - datetime.datetime(1858, 11, 17)) / datetime.timedelta(days=1)
-
-
-def _degrees(text: Any) -> float:
-    if text is None:
-        return math.nan
-    parts = [float(part) for part in str(text).strip("+-").split(":")]
-    return (-1.0 if str(text).startswith("-") else 1.0) * sum(p / 60.0**k for k, p in enumerate(parts))

@@ -1,7 +1,7 @@
 """The columns of all tables, what their values must be, and the one way in which they become arrays.
 
 Columns go by name, in upper or lower case. A unit that can be converted is converted; a missing unit is that of the
-column (docs: files); anything else is refused. What comes out is native-endian. FITS tables, tables of users and arrays
+column (docs: files); anything else is refused. Arrays are native-endian. FITS tables, tables of users and arrays
 in memory differ only in how their values are had.
 """
 
@@ -27,7 +27,7 @@ CALVERS = 2
 
 
 class Rule(NamedTuple):
-    """Condition on the values of a column: where `broken` is true, what they are and what to do about it."""
+    """Condition on the values of a column: where `broken` is true, the fault and its remedy."""
 
     broken: Callable[[np.ndarray], np.ndarray]
     what: str
@@ -57,7 +57,7 @@ class Column:
     """One column of a table: its kind, its unit in memory, and its value where the file lacks it.
 
     `missing` None means that the column is required; `width` is the number of values in a row, or None for
-    as many as the file has. `shape_advice` says what a row should hold, `remarked` whether it is worth a remark
+    as many as the file has. `shape_advice` describes the row that is expected, `remarked` whether it is worth a remark
     that the column is not there, `rules` what holds for its values in any table.
     """
 
@@ -129,6 +129,7 @@ INTENSITIES: Mapping[str, Column] = {
     "N_ERR": _COUNTS,
     "FLAG": Column("int", missing=0),
 }
+SKY = dataclasses.replace(_COUNTS, missing=np.nan)
 _SHARE = within(1.0, "fractions are wanted: are these per cent?", "exceeds 1")
 _FRACTION = Column("float", rules=(finite("remove the source"), _SHARE))
 _ERROR = Column("float", rules=(_POSITIVE,))
@@ -172,9 +173,11 @@ def check(table: Mapping[str, np.ndarray], columns: Mapping[str, Column], place:
 def table_rules(name: str, columns: Collection[str], place: Place) -> Mapping[str, Column]:
     """The columns of a table of a calibration set, where a file has `columns` (in capitals).
 
-    EXPOSURES has a pair `<P>_IN`, `<P>_ANGLE` for every moving element. Raises `DataError` for half a pair and for a
-    prefix that is none.
+    EXPOSURES has a pair `<P>_IN`, `<P>_ANGLE` for every moving element, INTENSITIES may have SKY. Raises `DataError`
+    for half a pair and for a prefix that is none.
     """
+    if name == "INTENSITIES" and "SKY" in columns:
+        return {**INTENSITIES, "SKY": SKY}
     return TABLES[name] if name != "EXPOSURES" else {**EXPOSURES, **_moving_columns(columns, place)}
 
 
@@ -183,9 +186,9 @@ def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]
     rules: dict[str, Column] = {}
     for prefix in (POLARISER, CALIBRATION_PLATE):
         inside, angle = f"{prefix}_IN", f"{prefix}_ANGLE"
-        there = inside in columns or angle in columns
-        rules[inside] = Column("bool", missing=None if there else False, remarked=there)
-        rules[angle] = dataclasses.replace(_ANGLE, remarked=there)
+        present = inside in columns or angle in columns
+        rules[inside] = Column("bool", missing=None if present else False, remarked=present)
+        rules[angle] = dataclasses.replace(_ANGLE, remarked=present)
     for name in columns:
         prefix, _, last = name.rpartition("_")
         if last == "TURN" and f"{prefix}_ANGLE" in columns:
@@ -221,15 +224,15 @@ def column_names(hdu: Any, place: Place) -> list[str]:
 
 def distinct(names: Iterable[str], place: Place) -> list[str]:
     """The names of columns; `DataError` if one is there twice."""
-    found = list(names)
-    for name in found:
-        if found.count(name) > 1:
+    columns = list(names)
+    for name in columns:
+        if columns.count(name) > 1:
             raise place.fail("the column is there twice", name, "remove or rename one of them")
-    return found
+    return columns
 
 
 def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[dict[str, Any], list[str]]:
-    """Turn a FITS table into arrays by column name, in the units of `columns`, and remarks on what was odd.
+    """Turn a FITS table into arrays by column name, in the units of `columns`, and remarks on oddities.
 
     Raises `DataError` for a missing, duplicated or ill-typed column, a unit that cannot be converted, and a
     table without rows.
@@ -237,8 +240,8 @@ def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[d
     names = column_names(hdu, place)
     for name, column in columns.items():
         if column.missing is None and name not in names:
-            others = sorted(set(names) - set(columns))
-            advice = f"add it{' (' + nearest(name, others) + ')' if others else ''}"
+            unknown = sorted(set(names) - set(columns))
+            advice = f"add it{' (' + nearest(name, unknown) + ')' if unknown else ''}"
             raise place.fail("the column is missing", name, advice)
     rows = int(hdu.header["NAXIS2"])
     if rows == 0:
@@ -272,7 +275,7 @@ def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[d
 
 
 def table_of(given: Mapping[str, Any], columns: Mapping[str, Column], place: Place) -> dict[str, np.ndarray]:
-    """A table in memory, its columns by name, as `read_table` would have it; what is absent takes its default.
+    """A table in memory, its columns by name, as `read_table` returns it; absent columns have their defaults.
 
     Raises `DataError` for a column that is missing, ill-typed or of another shape than `columns` say, and for one that
     `columns` do not have.
@@ -337,8 +340,8 @@ def values_of(
     """The values of a column in the kind, unit and shape of its rule; numbers that are masked are NaN.
 
     `given` is a column of an astropy table, an array, a quantity, times or a list; `unit` that of one without. In a
-    table of a user (`lenient`) texts may be numbers and truth values, and an empty cell holds what an absent column
-    would.
+    table of a user (`lenient`) texts may be numbers and truth values, and an empty cell has the value of an absent
+    column.
 
     Raises `DataError`, with rows, for values of another kind or shape, for whole numbers, truth values and names that
     are masked, and as `convert_unit` does.
@@ -384,25 +387,25 @@ def values_of(
 
 
 def plain_column(
-    given: Any, name: str, rule: Column, place: Place
+    column: Any, name: str, rule: Column, place: Place
 ) -> tuple[np.ndarray, Bool[np.ndarray, ...], str]:
     """The values of a column, where they are masked, and its unit; times become MJD (UTC) where days are wanted."""
-    if hasattr(given, "jd1") or np.asarray(given).dtype.kind == "M":
+    if hasattr(column, "jd1") or np.asarray(column).dtype.kind == "M":
         from astropy.time import Time
 
         if rule.unit != "d":
             raise place.fail("holds times", name, f"give numbers in {rule.unit or 'plain'}")
-        masked = np.asarray(getattr(given, "mask", False))
-        if not hasattr(given, "jd1"):
-            days = np.asarray(given)
+        masked = np.asarray(getattr(column, "mask", False))
+        if not hasattr(column, "jd1"):
+            days = np.asarray(column)
             masked = masked | np.isnat(days)
-            given = Time(np.where(masked, np.datetime64("2000-01-01"), days), scale="utc")
-        if not hasattr(given, "utc"):
+            column = Time(np.where(masked, np.datetime64("2000-01-01"), days), scale="utc")
+        if not hasattr(column, "utc"):
             raise place.fail("holds differences of times", name, "give dates")
-        values = np.asarray(getattr(given.utc.mjd, "unmasked", given.utc.mjd), dtype=float)
+        values = np.asarray(getattr(column.utc.mjd, "unmasked", column.utc.mjd), dtype=float)
         return values, np.broadcast_to(masked, values.shape), ""
-    unit = unit_of(given)
-    values, masked = without_mask(getattr(given, "value", given) if unit else given)
+    unit = unit_of(column)
+    values, masked = without_mask(getattr(column, "value", column) if unit else column)
     if values.dtype.names:
         raise place.fail("is no plain column", name, "give a column of numbers or texts")
     return values, masked, unit
@@ -457,15 +460,17 @@ def in_unit(values: Any, unit: str, name: str) -> Float[np.ndarray, "*s"]:
     """Numbers that callers bring along (lists, scalars, quantities, columns) as native float64 in `unit`.
 
     Numbers without a unit are taken to have it, masked ones are NaN. `name` is what errors call them. Raises
-    `DataError` for a unit that cannot be converted and for what is not a number.
+    `DataError` for a unit that cannot be converted and for values that are not numbers.
     """
     place = Place("", "")
-    given = unit_of(values)
-    plain = getattr(values, "value", values) if given and not hasattr(values, "colnames") else values
+    unit_given = unit_of(values)
+    plain = getattr(values, "value", values) if unit_given and not hasattr(values, "colnames") else values
     try:
         raw, masked = without_mask(plain)
         numbers = np.where(masked, np.nan, raw.astype(np.float64))
     except (TypeError, ValueError):
         raise place.fail("is not made of numbers", name, f"give numbers in {unit or 'fractions'}") from None
     flat = np.atleast_1d(numbers).astype(np.float64)
-    return (convert_unit(flat, given, unit, name, place) if given else flat).reshape(np.shape(numbers))
+    return (convert_unit(flat, unit_given, unit, name, place) if unit_given else flat).reshape(
+        np.shape(numbers)
+    )

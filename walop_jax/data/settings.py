@@ -1,4 +1,4 @@
-"""Optical settings: what the optics of an instrument are computed for, field point apart; built-in filters."""
+"""Optical settings, for which the optics of an instrument are computed at a field point; built-in filters."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ _SINGLE = re.compile(r"MONO-(\d{3,6}(?:\.\d+)?)")
 
 def single_wavelength(name: str) -> float | None:
     """Wavelength (µm) of light called MONO-<Ångström>, as `import-zemax` names it; None: another name."""
-    found = _SINGLE.fullmatch(name)
-    return None if found is None else 1e-4 * float(found[1])
+    match = _SINGLE.fullmatch(name)
+    return None if match is None else 1e-4 * float(match[1])
 
 
 def builtin_filter(name: str) -> FilterCurve:
@@ -123,11 +123,11 @@ class Settings:
 
     def at(self, **positions: float | Float[np.ndarray, " n"] | None) -> Settings:
         """The same with moving elements at these angles (deg, by column prefix; None or NaN: out)."""
-        there = {
+        angles = {
             prefix: np.broadcast_to(np.asarray(np.nan if angle is None else angle, float), len(self)).copy()
             for prefix, angle in positions.items()
         }
-        return dataclasses.replace(self, positions={**self.positions, **there})
+        return dataclasses.replace(self, positions={**self.positions, **angles})
 
     def __len__(self) -> int:
         return len(self.teff)
@@ -158,11 +158,11 @@ class Settings:
 
     def check_moving(self, moving: Iterable[str]) -> None:
         """Raise ValueError, with the nearest names, for an element in the beam that is none of `moving`."""
-        known = tuple(moving)
+        elements = tuple(moving)
         for prefix, angle in self.positions.items():
-            if prefix not in known and np.isfinite(angle).any():
+            if prefix not in elements and np.isfinite(angle).any():
                 what = f"{prefix}_ANGLE is given, but the instrument has no moving element {prefix!r}"
-                raise ValueError(f"{what}; {nearest(prefix, known)}")
+                raise ValueError(f"{what}; {nearest(prefix, elements)}")
 
     # ----------------------------------------------------------------------------------- rows that agree
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 USUAL_SCATTER = 0.27
 """Degrees, the smallest variability of an angle that was found (Cotton et al. 2024, arXiv:2410.23466)."""
@@ -38,10 +37,10 @@ def shipped_standards() -> Any:
     scatter = np.where(np.isfinite(scatter), scatter, np.deg2rad(USUAL_SCATTER))
     across = 2.0 * degree * np.hypot(np.nan_to_num(stated), scatter)
     across = np.where(degree > POLARISED * error, across, error)
-    known = np.isfinite(angle)
+    has_angle = np.isfinite(angle)
     either = np.sqrt(0.5 * (degree**2 + error**2))
-    error, across = np.where(known, error, either), np.where(known, across, either)
-    degree, angle = np.where(known, degree, 0.0), np.where(known, angle, 0.0)
+    error, across = np.where(has_angle, error, either), np.where(has_angle, across, either)
+    degree, angle = np.where(has_angle, degree, 0.0), np.where(has_angle, angle, 0.0)
     cos, sin = np.cos(2.0 * angle), np.sin(2.0 * angle)
     columns = {
         "SOURCE": np.array([order.index(name) for name in names]),
@@ -53,20 +52,4 @@ def shipped_standards() -> Any:
     }
     for number, (name, values) in enumerate(columns.items()):
         table.add_column(values, index=number if number == 0 else number + 1, name=name)
-    return table
-
-
-def distances(table: Any, ra: float, dec: float) -> Float[np.ndarray, " n"]:
-    """Angles (deg) between the stars of a table and a direction (deg)."""
-    from astropy.coordinates import angular_separation
-
-    alpha, delta = (np.deg2rad(np.asarray(table[name].to_value("deg"), float)) for name in ("RA", "DEC"))
-    return np.rad2deg(angular_separation(alpha, delta, np.deg2rad(ra), np.deg2rad(dec)))
-
-
-def in_degrees(table: Any, name: str, values: Float[np.ndarray, " n"]) -> Any:
-    """The table with one more column of angles (deg)."""
-    from astropy import units
-
-    table[name] = values * units.deg
     return table

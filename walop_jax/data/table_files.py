@@ -81,7 +81,7 @@ def _format(path: Path) -> str:
 
 
 def _content(path: Path) -> tuple[bytes, str]:
-    """The bytes of a file, unpacked, and the name of what they are."""
+    """The bytes of a file, unpacked, and the name of the file that they are of."""
     packed = unpacking(path)
     if packed is None:
         return path.read_bytes(), path.name
@@ -130,13 +130,13 @@ def _from_fits(path: Path, extension: str, needed: Collection[str]) -> tuple[Any
             raise fail(what, file=path, advice=f"name one: {path.name}[{labels[chosen[0]]}]")
         hdu = tables[chosen[0]]
         table = table_of_hdu(hdu)
-    others = [label for n, label in labels.items() if n != chosen[0]]
-    remark = f"the table {labels[chosen[0]]} is read, not {some(others, 5)}"
-    return table, (remark,) if others and not extension else ()
+    unread = [label for n, label in labels.items() if n != chosen[0]]
+    remark = f"the table {labels[chosen[0]]} is read, not {some(unread, 5)}"
+    return table, (remark,) if unread and not extension else ()
 
 
 def table_of_hdu(hdu: Any) -> Any:
-    """The astropy table of an extension: what is undefined is masked, and times are such."""
+    """The astropy table of an extension: undefined values are masked, times are astropy times."""
     from astropy.table import Table
 
     table = Table.read(hdu, character_as_bytes=False)
@@ -146,7 +146,7 @@ def table_of_hdu(hdu: Any) -> Any:
 
 
 def _hide_undefined(table: Any, hdu: Any) -> None:
-    """Mask what is undefined; astropy compares TNULL with scaled values."""
+    """Mask undefined values; astropy compares TNULL with scaled values."""
     from astropy.table import MaskedColumn
 
     for index, name in enumerate(hdu.columns.names):
@@ -164,8 +164,8 @@ def _times(table: Any, hdu: Any) -> None:
     for column in hdu.columns:
         scale = str(column.coord_type or "").upper()
         if scale in _SCALES and np.shape(table[column.name])[1:] == (2,):
-            whole, part = np.moveaxis(np.ma.filled(np.ma.asarray(table[column.name]), np.nan), -1, 0)
-            table[column.name] = Time(whole, part, format="jd", scale=scale.lower())
+            days, fraction = np.moveaxis(np.ma.filled(np.ma.asarray(table[column.name]), np.nan), -1, 0)
+            table[column.name] = Time(days, fraction, format="jd", scale=scale.lower())
 
 
 # -------------------------------------------------------------------------------------------------------------- CSV
@@ -191,15 +191,15 @@ def _from_csv(text: str, path: Path, needed: Collection[str]) -> tuple[Any, tupl
         return _astropy_table(text, "ascii.ecsv"), ()
     remarks = []
     text, comments, separator = _body(text)
-    header, _, rest = text.partition("\n")
+    header, _, body = text.partition("\n")
     if comments and _NUMBER.fullmatch(re.split(r"[,;\t| ]", header.strip())[0]):
-        header, rest = comments[-1], text  # the line of names is a comment, as numpy writes it
-        text = f"{header}\n{rest}"
+        header, body = comments[-1], text  # the line of names is a comment, as numpy writes it
+        text = f"{header}\n{body}"
     separator = separator or _separator_of(header, needed)
     if separator != ",":
-        rest, decimals = _with_points(rest, separator, path)
+        body, decimals = _with_points(body, separator, path)
         remarks.append(f"columns are separated by {_NAMES.get(separator, separator)}{decimals}")
-        text = f"{header}\n{rest}"
+        text = f"{header}\n{body}"
     kind = "ascii.tab" if separator == "\t" else "ascii.basic"  # which refuse rows that are too short
     try:
         options = {"delimiter": separator} if kind == "ascii.basic" else {}
@@ -240,7 +240,7 @@ def _body(text: str) -> tuple[str, list[str], str]:
     """The text without comments and empty lines ahead of it; the comments; the separator that a spreadsheet states."""
     comments, separator = [], ""
     while text:
-        line, _, rest = text.partition("\n")
+        line, _, following = text.partition("\n")
         stated = re.fullmatch(r'"?sep=(.|\\t)"?,*', line.strip(" \n"), re.IGNORECASE)
         if stated:
             separator = stated[1].replace("\\t", "\t")
@@ -248,7 +248,7 @@ def _body(text: str) -> tuple[str, list[str], str]:
             comments.append(line.lstrip("# "))
         elif line.strip(' ,;\t"'):
             break
-        text = rest
+        text = following
     if "\n#" in text:
         text = re.sub(r"(?m)^#.*\n?", "", text)
     return text, comments, separator
@@ -259,9 +259,9 @@ def _separator_of(header: str, needed: Collection[str]) -> str:
     for separator in _SEPARATORS:
         if set(needed) <= {name.strip(" \"'").upper() for name in header.split(separator)}:
             return separator
-    there = [separator for separator in _SEPARATORS if separator in header]
-    blank = not there and set(needed) <= {name.upper() for name in header.split()}
-    return " " if blank else (there or [","])[0]
+    occurring = [separator for separator in _SEPARATORS if separator in header]
+    blank = not occurring and set(needed) <= {name.upper() for name in header.split()}
+    return " " if blank else (occurring or [","])[0]
 
 
 def _with_points(rest: str, separator: str, path: Path) -> tuple[str, str]:

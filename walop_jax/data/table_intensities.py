@@ -31,7 +31,8 @@ class TableIntensities(Intensities):
     """One row per (exposure, point), in the order of the file.
 
     `exposures` is their number in the set; `exposure`, `point` and `source` are rows of its tables (`source` −1: none),
-    `counts` and `sigma` electrons as in the file, `flag` its bits, `used` which rows take part.
+    `counts` and `sigma` electrons as in the file, `flag` its bits, `used` which rows take part. `sky` is the level of
+    the sky that was subtracted from the counts (electrons), 0 where it is not known; None: nowhere.
     """
 
     exposures: int
@@ -43,6 +44,7 @@ class TableIntensities(Intensities):
     sigma: Float[np.ndarray, "r k"]
     flag: Int[np.ndarray, " r"]
     used: Bool[np.ndarray, " r"]
+    sky: Float[np.ndarray, "r k"] | None = None
 
     @functools.cached_property
     def _by_point(self) -> tuple[Int[np.ndarray, " u"], Int[np.ndarray, " b"]]:
@@ -145,7 +147,7 @@ def table_intensities(
 
     Raises `DataError` for identifiers that do not exist, repeated (EXPOSURE, POINT) pairs, errors that are
     not positive, too many spoilt rows, nothing used, counts that are all equal, a single camera
-    that sees light of unknown flux only, and another number of errors than of counts.
+    that sees light of unknown flux only, another number of errors than of counts, and a sky below 0.
     """
     _cameras(table["N"], table["N_ERR"], exposures, place)
     exposure = _rows_of(table["EXPOSURE"], exposures.exposure, "EXPOSURE", "EXPOSURES", place)
@@ -164,7 +166,7 @@ def table_intensities(
     used, spoilt, impossible = usable(counts, sigma, flag)
     place.refuse(impossible, "is zero or negative", "N_ERR", "give the true error, or set FLAG")
     remarks = _judge(counts, used, spoilt, place)
-    source, more = _source_rows(table["SOURCE"], exposures, exposure, sources, used, place)
+    source, unlisted = _source_rows(table["SOURCE"], exposures, exposure, sources, used, place)
     intensities = TableIntensities(
         len(exposures),
         points,
@@ -175,8 +177,9 @@ def table_intensities(
         sigma=sigma,
         flag=flag,
         used=used,
+        sky=_sky(table, place),
     )
-    return intensities, remarks + more
+    return intensities, remarks + unlisted
 
 
 def _cameras(counts: np.ndarray, sigma: np.ndarray, exposures: Exposures, place: Place) -> None:
@@ -189,8 +192,21 @@ def _cameras(counts: np.ndarray, sigma: np.ndarray, exposures: Exposures, place:
         raise place.fail(what, "N_ERR", "give the error of every camera")
 
 
+def _sky(table: dict[str, Any], place: Place) -> Float[np.ndarray, "r k"] | None:
+    """The level of the sky, 0 where it is not known; None without it."""
+    if "SKY" not in table:
+        return None
+    sky = np.where(np.isnan(table["SKY"]), 0.0, table["SKY"])
+    if sky.shape != table["N"].shape:
+        raise place.fail(f"has {sky.shape[1]} value(s) in a row", "SKY", "give the sky of every camera, as N")
+    place.refuse(
+        (sky < 0) | np.isinf(sky), "is below 0 or infinite", "SKY", "the level that was subtracted, or NaN"
+    )
+    return sky
+
+
 def _judge(counts: np.ndarray, used: np.ndarray, spoilt: np.ndarray, place: Place) -> list[str]:
-    """Refuse data that cannot be what they should; remark on what has been masked."""
+    """Refuse data that cannot be measurements; remark on masked rows."""
     bad = np.flatnonzero(spoilt)
     if len(bad) > _SPOILT * len(spoilt):
         cameras = [f"N[{k}]" for k in range(counts.shape[1]) if not np.any(np.isfinite(counts[:, k]))]
@@ -214,12 +230,19 @@ def _judge(counts: np.ndarray, used: np.ndarray, spoilt: np.ndarray, place: Plac
     return remarks
 
 
+def _positions(ids: np.ndarray, known: np.ndarray) -> Int[np.ndarray, " r"]:
+    """Positions of identifiers among those known, −1 where they are not there."""
+    if not len(known):
+        return np.full(len(ids), -1)
+    order = np.argsort(known, kind="stable")
+    at = order[np.minimum(np.searchsorted(known[order], ids), len(known) - 1)]
+    return np.where(known[at] == ids, at, -1)
+
+
 def _rows_of(ids: np.ndarray, known: np.ndarray, column: str, table: str, place: Place) -> np.ndarray:
     """Turn identifiers into rows of the table that defines them."""
-    order = np.argsort(known, kind="stable")
-    at = np.minimum(np.searchsorted(known[order], ids), len(known) - 1)
-    rows = order[at]
-    if np.any(absent := known[rows] != ids):
+    rows = _positions(ids, known)
+    if np.any(absent := rows < 0):
         first = ids[np.argmax(absent)]
         near = known[np.argmin(np.abs(known - first))]
         what = f"{column} {first} does not exist in {table}, asked for"
@@ -236,16 +259,12 @@ def _source_rows(
     place: Place,
 ) -> tuple[np.ndarray, list[str]]:
     """Turn SOURCE into rows of SOURCES; a standard needs one, any other source may be unlisted."""
-    rows = np.full(len(ids), -1, dtype=np.int64)
-    if len(sources):
-        order = np.argsort(sources.source, kind="stable")
-        at = order[np.minimum(np.searchsorted(sources.source[order], ids), len(order) - 1)]
-        rows = np.where((sources.source[at] == ids) & (ids >= 0), at, -1)
+    rows = np.where(ids >= 0, _positions(ids, sources.source), -1)
     standard = exposures.direct("standard")[exposure] & used
     if np.any(bad := standard & (rows < 0)):
-        known = ", ".join(str(entry) for entry in sources.source[:10]) or "none"
+        listed = ", ".join(str(entry) for entry in sources.source[:10]) or "none"
         what = f"a standard star needs a row of SOURCES; {ids[np.argmax(bad)]} is not one,"
-        place.refuse(bad, what, "SOURCE", f"SOURCES has {known}")
+        place.refuse(bad, what, "SOURCE", f"SOURCES has {listed}")
     indoors = [name for name, kind in KINDS.items() if not kind.from_sky and not kind.flux_known]
     lamp = np.isin(exposures.kind, indoors)[exposure] & used & (ids >= 0)
     place.refuse(lamp, "a lamp is no source of the sky,", "SOURCE", "write −1, or another KIND")
@@ -277,25 +296,27 @@ def mask_repeats(
 
     remarks: list[str] = []
     alike: list[str] = []
-    for first, *others in groups.values():
+    for first, *repeats in groups.values():
         rows = rows_of(first)
-        for other in others:
+        for repeat in repeats:
             ids, rows_again = (
-                f"exposures {exposures.exposure[first]} and {exposures.exposure[other]}",
-                rows_of(other),
+                f"exposures {exposures.exposure[first]} and {exposures.exposure[repeat]}",
+                rows_of(repeat),
             )
             if len(rows) and all(np.array_equal(v[rows], v[rows_again]) for v in (point, intensities.counts)):
                 remarks.append(f"{ids} are the same to the last bit, the second is not used")
                 used[rows_again] = False
             elif fine and np.isin(point[rows[used[rows]]], point[rows_again[used[rows_again]]]).any():
-                what = f"{ids} (rows {first} and {other}, counted from 0) have the same time and settings but"
+                what = (
+                    f"{ids} (rows {first} and {repeat}, counted from 0) have the same time and settings but"
+                )
                 advice = "no camera takes two exposures at once: correct the times, or write NaN"
                 raise Place(file, "EXPOSURES").fail(f"{what} different counts", "MJD", advice)
             else:
                 alike.append(ids)
     if alike:
-        more = f" (and {len(alike) - 1} pairs more)" if len(alike) > 1 else ""
-        remarks.append(f"{alike[0]} have the same time and settings but different counts{more}")
+        suffix = f" (and {len(alike) - 1} pairs more)" if len(alike) > 1 else ""
+        remarks.append(f"{alike[0]} have the same time and settings but different counts{suffix}")
     return intensities.using(used), remarks
 
 

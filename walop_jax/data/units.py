@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -34,6 +35,14 @@ class Place:
         return f"{self.file} [{self.extension}] {column}: {what}"
 
 
+def sexagesimal(text: str | None) -> float:
+    """The number of a text ±d:m:s, in the unit of d; NaN for None."""
+    if text is None:
+        return float("nan")
+    digits = [float(part) for part in re.split("[: ]", text.strip().strip("+-"))]
+    return (-1.0 if text.strip().startswith("-") else 1.0) * sum(d / 60.0**k for k, d in enumerate(digits))
+
+
 def unit_of(column: Any) -> str:
     """The unit that a column, an array or a quantity brings along, "" for none."""
     return str(getattr(column, "unit", None) or "")
@@ -61,9 +70,9 @@ def check_units(given: Mapping[str, str], wanted: str, place: Place) -> None:
 def check_partners(given: Mapping[str, str], wanted: Mapping[str, str], place: Place) -> None:
     """`check_units` of every column with its partner; `wanted` are the units of the columns that are numbers."""
     for name, unit in given.items():
-        other = partner_of(name)
-        if other != name and other in given and name in wanted:
-            check_units({other: given[other], name: unit}, wanted[name], place)
+        partner = partner_of(name)
+        if partner != name and partner in given and name in wanted:
+            check_units({partner: given[partner], name: unit}, wanted[name], place)
 
 
 def _differs(unit: str, wanted: str) -> bool:
@@ -81,13 +90,13 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
     """
     try:
         # The generic reading, because `electron` is not a unit of the FITS standard.
-        given = units.Unit(unit.strip())
+        unit_given = units.Unit(unit.strip())
     except (ValueError, TypeError) as error:
         raise place.fail(f"the unit {unit!r} is not known", name, f"use {wanted or 'no unit'}") from error
     target = units.Unit(wanted)
-    if given == target:
-        return values  # no arithmetic: what was written comes back bit for bit
-    if _is_logarithmic(given):
+    if unit_given == target:
+        return values  # no arithmetic: values come back bit for bit
+    if _is_logarithmic(unit_given):
         advice = f"give the column in {wanted or 'fractions'}"
         if wanted == "electron":
             advice = (
@@ -95,16 +104,16 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
                 "N_ERR = 0.921 N · error of m; 10^d of dex"
             )
         raise place.fail(f"is logarithmic ({unit.strip()})", name, advice)
-    if wanted == "h" and given.is_equivalent(units.deg):
+    if wanted == "h" and unit_given.is_equivalent(units.deg):
         target = units.hourangle
     try:
         return np.asarray(
-            units.Quantity(values, given).to_value(target, units.temperature()), dtype=np.float64
+            units.Quantity(values, unit_given).to_value(target, units.temperature()), dtype=np.float64
         )
     except units.UnitConversionError as error:
         advice = f"convert the column to {wanted or 'a fraction without unit'}"
         if wanted == "electron":
-            per_time = given.is_equivalent(units.electron / units.s)
+            per_time = unit_given.is_equivalent(units.electron / units.s)
             advice += f" (multiply by the {'exposure time' if per_time else 'gain'})"
         raise place.fail(
             f"the unit {unit!r} cannot be converted to {wanted or 'none'!r}", name, advice

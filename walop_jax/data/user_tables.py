@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from walop_jax.data.schema import MISSING, Column, distinct, plain_column, values_of
 from walop_jax.data.table_files import read_table_file, table_of_hdu
@@ -49,7 +49,7 @@ class InputTable:
     """A table as it was read, to be handed back with columns added; `rows` is its length.
 
     `used` are the columns that were asked for and are there, `lacking` those that are not; `remarks` say how the table
-    was read, and what is odd in it.
+    was read, and on its oddities.
     """
 
     path: Path
@@ -77,9 +77,9 @@ class InputTable:
         replaced = [name for name in self.names if name in added]
         unused = [name for name in self.names if name not in self.used and name not in replaced]
         sentences = list(self.remarks)
-        kept = [name for name in replaced if name in self.used]
-        if kept:
-            sentences.append(f"{kept[0]} of the table is {self.new_name(kept[0])} in the result")
+        renamed = [name for name in replaced if name in self.used]
+        if renamed:
+            sentences.append(f"{renamed[0]} of the table is {self.new_name(renamed[0])} in the result")
         if gone := [name for name in replaced if name not in self.used]:
             sentences.append(f"{_columns(gone)} replaced by the result")
         if unused:
@@ -102,15 +102,15 @@ def _columns(names: Sequence[str]) -> str:
 
 def hints(names: Sequence[str], lacking: Collection[str], *, unsure: bool = True) -> list[str]:
     """Names that columns that are not used may have been meant to have: colours, flags, and (`unsure`) those alike."""
-    colours, others = [], []
+    colours, flags = [], []
     for name in names:
         if "TEFF" in lacking and _COLOUR.search(name):
             colours.append(f"{name}: the colour of a star is read from TEFF (K) or BP_RP (mag, of Gaia)")
         elif "FLAG" in name and "N_FLAG" in lacking:
-            others.append(f"{name}: flags are read from N_FLAG or FLAG, any bit means not used")
+            flags.append(f"{name}: flags are read from N_FLAG or FLAG, any bit means not used")
         elif unsure and (like := difflib.get_close_matches(name, sorted(lacking), n=1, cutoff=_LIKE)):
-            others.append(f"{name}: did you mean {like[0]}?")
-    return [*colours, *others]
+            flags.append(f"{name}: did you mean {like[0]}?")
+    return [*colours, *flags]
 
 
 def read_input_table(path: str | os.PathLike[str], needed: Collection[str] = ("X", "Y")) -> InputTable:
@@ -118,8 +118,8 @@ def read_input_table(path: str | os.PathLike[str], needed: Collection[str] = ("X
 
     Raises `DataError` if the file is missing, damaged, no table, has no rows, or names a column twice.
     """
-    there, table, remarks = read_table_file(Path(path), needed)
-    return _input_table(there, table, remarks)
+    resolved, table, remarks = read_table_file(Path(path), needed)
+    return _input_table(resolved, table, remarks)
 
 
 def in_memory(columns: Any, name: str = "the table") -> InputTable:
@@ -173,9 +173,9 @@ def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
     """
     place, column = Place(source.path, ""), source.column(name)
     if column is not None:
-        if (other := partner_of(name)) in source.names and rule.kind == "float":
-            beside = unit_of(source.table.columns[source.names.index(other)])
-            check_units({other: beside, name: unit_of(column)}, rule.unit, place)
+        if (partner := partner_of(name)) in source.names and rule.kind == "float":
+            beside = unit_of(source.table.columns[source.names.index(partner)])
+            check_units({partner: beside, name: unit_of(column)}, rule.unit, place)
         return values_of(column, name, rule, place, lenient=True)
     if rule.missing is None:
         raise place.fail("the column is missing", name, f"add it, or name it so; {_what_is_there(source)}")
@@ -196,13 +196,13 @@ def vector_columns(
     some of them have a unit that is converted.
     """
     single = dataclasses.replace(rule, width=1)
-    parts = {name: _side_by_side(source, name, rule.width or 1, cameras) for name in names}
-    columns = {part: source.column(part) for name in names for part in parts[name]}
-    units = {part: unit_of(column) for part, column in columns.items() if column is not None}
+    columns_of = {name: _side_by_side(source, name, rule.width or 1, cameras) for name in names}
+    columns = {name_of: source.column(name_of) for name in names for name_of in columns_of[name]}
+    units = {name_of: unit_of(column) for name_of, column in columns.items() if column is not None}
     values = [
         numeric_column(source, name, rule)
-        if parts[name] == [name]
-        else np.stack([numeric_column(source, part, single) for part in parts[name]], axis=1)
+        if columns_of[name] == [name]
+        else np.stack([numeric_column(source, name_of, single) for name_of in columns_of[name]], axis=1)
         for name in names
     ]
     check_units(units, rule.unit, Place(source.path, ""))
@@ -217,13 +217,59 @@ def _side_by_side(source: InputTable, name: str, width: int, cameras: Sequence[s
     end = f"_{tail}" if tail else ""
     spelled = [f"{head}{k}{end}" for k in range(width)], [f"{camera.upper()}{end}" for camera in cameras]
     forms = (*spelled, [f"{name}{k}" for k in range(width)])
-    parts = next((form for form in forms if any(part in source.names for part in form)), None)
-    if parts is None:
+    spelling = next((form for form in forms if any(column in source.names for column in form)), None)
+    if spelling is None:
         source.lacking.update((name, *spelled[0], *spelled[1]))
         listed = ", or ".join(f"{form[0]} … {form[-1]}" for form in spelled)
         advice = f"add it, or {listed}; {_what_is_there(source)}"
         raise Place(source.path, "").fail("the column is missing", name, advice)
-    return parts
+    return spelling
+
+
+_SEXAGESIMAL = re.compile(r"[+-]?\d+[:hd ]\s*\d.*")
+_FEWEST_STARS = 10  # from which on the shape of a field tells hours from degrees
+_FLAT = 0.25  # of the extent in declination: hours taken as degrees have a fifteenth
+
+
+def sky_positions(
+    source: InputTable, names: Sequence[str] = ("RA", "DEC")
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Right ascensions and declinations (deg) of a table; as sexagesimal texts they are in hours and degrees.
+
+    Raises `DataError` for values that are no angles, and for right ascensions without a unit that are hours: none
+    beyond 24, of a field that would be a fifteenth as wide as high.
+    """
+    ra, dec = (_angles(source, *pair) for pair in zip(names, "hd", strict=True))
+    column, finite = source.column(names[0]), np.isfinite(ra)
+    if unit_of(column) or column.dtype.kind not in "fiu" or not finite.any():
+        return ra, dec
+    low, high = float(ra[finite].min()), float(ra[finite].max())
+    if low >= 0.0 and high <= 24.0:
+        from_first = np.mod(ra[finite] - low + 12.0, 24.0)  # a field about 0 h is no wider than others
+        width = np.std(from_first) * np.cos(np.deg2rad(np.nanmedian(dec)))
+        if len(ra) < _FEWEST_STARS:
+            source.remarks.append(
+                f"{names[0]} has no unit: taken as degrees; hours need the unit hourangle, or texts hh:mm:ss"
+            )
+        elif width < _FLAT * np.nanstd(dec):
+            what = f"lies between {low:.4g} and {high:.4g}, has no unit, and looks like hours"
+            advice = "degrees are needed: multiply by 15, or give the unit hourangle"
+            raise Place(source.path, "").fail(what, names[0], advice)
+    return ra, dec
+
+
+def _angles(source: InputTable, name: str, unit: str) -> Float[np.ndarray, " n"]:
+    """A column of angles in degrees; sexagesimal ones are in hours (h) or degrees (d)."""
+    column = source.column(name)
+    texts = np.asarray(column).astype(str) if column is not None and column.dtype.kind in "OSU" else []
+    if not any(_SEXAGESIMAL.match(text.strip()) for text in texts):
+        return numeric_column(source, name, Column("float", "deg"))
+    from astropy.coordinates import Angle
+
+    try:
+        return np.asarray(Angle(list(texts), unit={"h": "hourangle", "d": "deg"}[unit]).deg, float)
+    except ValueError as error:
+        raise Place(source.path, "").fail(one_line(error), name, "write hh:mm:ss.s and ±dd:mm:ss") from None
 
 
 def empty_cells(source: InputTable, name: str, rule: Column) -> Bool[np.ndarray, " n"]:

@@ -1,6 +1,6 @@
 """Writing calibration sets as tables.
 
-The extension COMPRESSION says of a calibration set that stands for the pixels of whole frames, what they were
+The extension COMPRESSION describes the whole frames for whose pixels a calibration set stands
 (docs: files).
 """
 
@@ -84,7 +84,7 @@ def _in_runs(numbers: Iterable[int]) -> str:
 
 
 def _of_runs(text: object, place: Place) -> tuple[int, ...]:
-    """The whole numbers of runs; `DataError` for what are none."""
+    """The whole numbers of runs; `DataError` for texts that are none."""
     runs = [re.fullmatch(r"(-?\d{1,18}):(-?\d{1,18})", run) for run in str(text).strip().split(",")]
     ends = [(int(run[1]), int(run[2])) for run in runs if run]
     if len(ends) < len(runs) or any(not 0 <= last - first < MOST_EXPOSURES for first, last in ends):
@@ -104,7 +104,7 @@ def remark(found: Compression, points: int) -> str:
     """Caution about a set that stands for pixels."""
     return (
         f"{points} field points stand for {found.pixels:,} pixels, of which χ²/dof was "
-        f"{found.chi2 / max(found.dof, 1):.5g}: what is smaller than a twentieth of the field is not seen here"
+        f"{found.chi2 / max(found.dof, 1):.5g}: structure below a twentieth of the field is not seen here"
     )
 
 
@@ -116,7 +116,7 @@ def write_calibration_set(
 ) -> None:
     """Write a calibration set as tables, with checksums; the file appears whole or not at all.
 
-    What was read comes back bit for bit, rows that are not used included; other intensities (frames, say)
+    Data that were read come back bit for bit, rows that are not used included; other intensities (frames, say)
     are written as their used rows. The bytes depend on the set alone, not on the day.
 
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only,
@@ -143,13 +143,15 @@ def set_tables(calset: CalibrationSet) -> dict[str, dict[str, np.ndarray]]:
         "INTENSITIES": {
             "EXPOSURE": calset.exposures.exposure[intensities.exposure],
             "POINT": points.point[intensities.point],
-            # The appended −1 is what a row without a source (−1, the last entry) becomes.
+            # The appended −1 is the entry of a row without a source (−1, the last entry).
             "SOURCE": np.append(sources.source, -1)[intensities.source],
             "N": intensities.counts,
             "N_ERR": intensities.sigma,
             "FLAG": intensities.flag,
         },
     }
+    if intensities.sky is not None:
+        tables["INTENSITIES"]["SKY"] = intensities.sky
     if len(sources):
         tables["SOURCES"] = sources.columns()
     if calset.filters:

@@ -137,17 +137,19 @@ def _header(lines: list[str], offset: int, path: Path) -> tuple[str, int, float]
     """Title, configuration and angle of the electric vector (degrees, −inf: unpolarised)."""
     cards = {key.strip(): (n, text.strip()) for n, line in enumerate(lines, offset + 1)
              for key, colon, text in [line.partition(":")] if colon}  # fmt: skip
-    found = [int(match[1]) for line in lines if (match := _CONFIGURATION.fullmatch(line))]
-    if len(found) != 1:
+    configurations = [int(match[1]) for line in lines if (match := _CONFIGURATION.fullmatch(line))]
+    if len(configurations) != 1:
         raise _fault(path, offset + 1, "does not say which configuration it is of", _AGAIN)
     folder = _FOLDER.fullmatch(path.parent.name)
-    if folder and int(folder[1]) != found[0]:
+    if folder and int(folder[1]) != configurations[0]:
         raise fail(
-            f"says configuration {found[0]} in a folder {path.parent.name!r}", file=path, advice="move it"
+            f"says configuration {configurations[0]} in a folder {path.parent.name!r}",
+            file=path,
+            advice="move it",
         )
     title = cards.get("Title", (0, ""))[1]
     if "Field is unpolarized." in lines:
-        return title, found[0], -math.inf
+        return title, configurations[0], -math.inf
     state = []
     for name in ("X-Field", "Y-Field", "X-Phase", "Y-Phase"):
         if name not in cards:
@@ -158,7 +160,7 @@ def _header(lines: list[str], offset: int, path: Path) -> tuple[str, int, float]
     if x_phase != y_phase or x == y == 0:
         what = "has no electric field" if x == y == 0 else "is elliptical light (X-Phase and Y-Phase differ)"
         raise _fault(path, cards["X-Field"][0], what, "export linear states, signs in X-Field and Y-Field")
-    return title, found[0], math.degrees(math.atan2(y, x))
+    return title, configurations[0], math.degrees(math.atan2(y, x))
 
 
 def _blocks(lines: list[str], start: int, path: Path) -> list[_Block]:
@@ -246,7 +248,7 @@ def import_transmissions(
 
     An exposure is a wavelength (a filter MONO-<Ångström>) and a state, unpolarised light first; rows that lack a
     camera are left out, exposures and points without any row too. MJD has no meaning, but tells exposures apart.
-    N_ERR is the share `error` of N, at least the rounding of what is printed. `remarks` say what was left out.
+    N_ERR is the share `error` of N, at least the rounding of the printed values. `remarks` list the rows left out.
 
     `instrument` is a shipped one, by default that which the titles of the exports name; `configurations` are those of
     the four cameras O1, E1, O2, E2; `tell` is told of the progress. Each file is read once.
@@ -260,10 +262,11 @@ def import_transmissions(
     yx = np.array(sorted({place for e in exports for place in zip(e.y.tolist(), e.x.tolist(), strict=True)}))
     values, step = _dense(exports, angles, wavelengths, yx, tuple(configurations))
 
-    seen = np.isfinite(values)
-    row = seen.all(axis=-1)
+    measured = np.isfinite(values)
+    row = measured.all(axis=-1)
     missing = ", ".join(
-        f"{np.sum(~seen[..., k])} of {_CAMERA_NAMES[k]} (configuration {configurations[k]})" for k in range(4)
+        f"{np.sum(~measured[..., k])} of {_CAMERA_NAMES[k]} (configuration {configurations[k]})"
+        for k in range(4)
     )
     if not np.any(row):
         advice = "export the same fields and states in all four"
@@ -275,10 +278,10 @@ def import_transmissions(
         )
     # Exposures and points without a row are left out too, what remains is numbered anew.
     values[~row] = np.nan
-    taken, places = row.any(axis=-1), row.reshape(-1, len(yx)).any(axis=0)
-    counts, printed = (_UNIT * part[taken][:, places].swapaxes(0, 1) for part in (values, step))
+    exposed, places = row.any(axis=-1), row.reshape(-1, len(yx)).any(axis=0)
+    counts, printed = (_UNIT * values_of[exposed][:, places].swapaxes(0, 1) for values_of in (values, step))
     curves = [FilterCurve(f"MONO-{1e4 * w:.0f}", np.array([w]), np.ones(1)) for w in wavelengths]
-    colour, state = np.nonzero(taken)
+    colour, state = np.nonzero(exposed)
     y, x = yx[places].T
     with errors_naming(folder):
         calset = from_arrays(
@@ -315,24 +318,24 @@ def _exports(folder: Path, tell: Callable[[str], None]) -> tuple[list[Transmissi
     files = sorted(
         f for f in folder.rglob("*") if f.suffix.lower() == ".txt" and f.name[0] != "." and f.is_file()
     )
-    found: list[TransmissionExport] = []
-    other: list[Path] = []
+    exports: list[TransmissionExport] = []
+    ignored: list[Path] = []
     for n, file in enumerate(files):
         if n % 100 == 0:
             tell(f"reading {n} of {len(files)} files")
         export = read_export(file)
         if export is None:
-            other.append(file)
+            ignored.append(file)
         else:
-            found.append(export)
-    if not found:
+            exports.append(export)
+    if not exports:
         raise fail(f"none of {len(files)} text files begins with {HEADING!r}", file=folder,
                    advice="export that analysis as text, in English")  # fmt: skip
-    if other:
-        return found, [
-            f"{folder}: {len(other)} text files are no exports and not read, {other[0].name} for one"
+    if ignored:
+        return exports, [
+            f"{folder}: {len(ignored)} text files are no exports and not read, {ignored[0].name} for one"
         ]
-    return found, []
+    return exports, []
 
 
 def _instrument(
@@ -362,7 +365,7 @@ def _dense(
 ) -> tuple[Float[np.ndarray, "w s p 4"], Float[np.ndarray, "w s p 4"]]:
     """Transmissions of all exports and the steps they are printed in, NaN where there are none.
 
-    What is there twice is refused, and so is a configuration that is none of the cameras.
+    Duplicates are refused, and so is a configuration that is none of the cameras.
     """
     values, step = np.full((2, len(wavelengths), len(angles), len(yx), 4), np.nan)
     owner = np.full(values.shape, -1)
@@ -381,6 +384,6 @@ def _dense(
         if np.any(owner[at] >= 0):
             raise fail(f"holds what stands in {exports[int(owner[at].max())].path} too (configuration, state, "
                        "field point, wavelength)", file=e.path, advice="remove one of them")  # fmt: skip
-        values[at], step[at] = (part.T[:, None, :, None] for part in (e.transmission, e.step))
+        values[at], step[at] = (transposed.T[:, None, :, None] for transposed in (e.transmission, e.step))
         owner[at] = n
     return values, step

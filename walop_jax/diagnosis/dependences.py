@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.data.records import Exposures
+from walop_jax.diagnosis import thresholds
+from walop_jax.likelihood import limits
 from walop_jax.model.planning import hours_of
 from walop_jax.sky.nights import first_of_nights
 
@@ -41,104 +43,145 @@ def end_of(exposures: Exposures) -> float:
     return float(hours_of(exposures).max()) + AFTER
 
 
+PATTERNS: Mapping[str, tuple[str, ...]] = {
+    "even": ("",),
+    "tilt": ("x", "y"),
+    "r2": ("r2",),
+    "astigmatic": ("x2-y2", "xy"),
+    "focus": ("", "r2"),
+    "rings": tuple(f"ring {degree}" for degree in thresholds.RINGS),
+}
+"""Patterns over the field (`Combinations.over`): factors that have an amplitude each."""
+
+
 @dataclasses.dataclass(frozen=True)
-class Asked:
-    """Factors that the exposures can tell apart."""
+class Dependences:
+    """Factors that exposures can tell apart: groups by form (`Combinations.along`), each factor with an amplitude.
+
+    `over_field` says that points are enough for a pattern; factors may ask for the angles of elements of some
+    `prefixes`, and are those of exposures that are `inside`.
+    """
 
     exposures: Exposures
     over_field: bool
-    colours: bool
-    hours: bool
-    kelvin: bool
+    prefixes: tuple[str, ...]
+    inside: Bool[np.ndarray, " e"]
 
-    @classmethod
-    def of(cls, exposures: Exposures, points: int) -> Asked:
-        """Look for several filters, times and temperatures, and points enough for a pattern."""
+    def of(self, form: str) -> Iterator[tuple[str, ...]]:
+        """The groups of one form."""
+        name, _, most = form.partition(" to ")
+        yield from getattr(self, f"_{name.replace(' ', '_').lower()}")(*map(int, most.split()))
 
-        def varies(values: np.ndarray) -> bool:
-            return bool(
-                np.isfinite(values).all() and np.ptp(values) > 1e-9 * max(1.0, float(np.abs(values).max()))
-            )
+    def _steady(self) -> Iterator[tuple[str, ...]]:
+        yield ("",)
 
-        return cls(
-            exposures,
-            points >= FEWEST_POINTS,
-            len(np.unique(exposures.filter)) > 1,
-            varies(exposures.mjd),
-            varies(exposures.temp),
-        )
+    def _colour(self) -> Iterator[tuple[str, ...]]:
+        if len(np.unique(self.exposures.filter)) > 1:
+            yield ("colour",)
 
-    def harmonics(self, prefix: str, orders: Sequence[int]) -> Iterator[tuple[str, str]]:
+    def _hours(self) -> Iterator[tuple[str, ...]]:
+        if varies(self.exposures.mjd):
+            yield ("hours",)
+
+    def _kelvin(self) -> Iterator[tuple[str, ...]]:
+        if varies(self.exposures.temp):
+            yield ("kelvin",)
+
+    def _counts(self) -> Iterator[tuple[str, ...]]:
+        yield ("counts",)
+
+    def _harmonics(self, most: int) -> Iterator[tuple[str, ...]]:
         """Cosine and sine of the harmonics that the angles of a moving element can show."""
-        position = self.exposures.position(prefix)
-        angles = np.unique(np.round(np.mod(position.angle[position.inside], 360.0), 3))
-        for order in orders:
-            if len(angles) >= 2 * order + 1:
-                yield f"cos {order} {prefix}", f"sin {order} {prefix}"
+        for prefix in self.prefixes:
+            position = self.exposures.position(prefix)
+            angles = np.unique(np.round(np.mod(position.angle[position.inside], 360.0), 3))
+            for order in range(1, most + 1):
+                if len(angles) >= 2 * order + 1:
+                    yield f"cos {order} {prefix}", f"sin {order} {prefix}"
 
-    def hour_angle(self) -> Iterator[str]:
+    def _hour_angle(self) -> Iterator[tuple[str, ...]]:
         """The hour angle, where it is not the time."""
         angle, time = self.exposures.ha, self.exposures.mjd
-        left = angle - angle.mean()
-        if self.hours:
+        remainder = angle - angle.mean()
+        if varies(self.exposures.mjd):
             time = time - time.mean()
-            left = left - time * (time @ left) / (time @ time)
-        if np.isfinite(angle).all() and np.ptp(left) > 1e-3 * np.ptp(angle):
-            yield "hour angle"
+            remainder = remainder - time * (time @ remainder) / (time @ time)
+        if np.isfinite(angle).all() and np.ptp(remainder) > 1e-3 * np.ptp(angle):
+            yield ("hour angle",)
 
-    def single(self) -> Iterator[str]:
-        """Exposure time, and the order of the exposures where that is not the time."""
+    def _per_exptime(self) -> Iterator[tuple[str, ...]]:
         seconds = self.exposures.exptime
         if np.isfinite(seconds).all() and seconds.min() > 0 and np.ptp(seconds) > 1e-3 * seconds.max():
-            yield "per EXPTIME"
+            yield ("per EXPTIME",)
+
+    def _order(self) -> Iterator[tuple[str, ...]]:
+        """The order of the exposures, where it is not the time."""
         hours, order = hours_of(self.exposures), np.arange(len(self.exposures), dtype=float)
-        if self.hours and len(order) > 2 and abs(np.corrcoef(hours, order)[0, 1]) < NEARLY_TIME:
-            yield "order"
+        if (
+            varies(self.exposures.mjd)
+            and len(order) > 2
+            and abs(np.corrcoef(hours, order)[0, 1]) < NEARLY_TIME
+        ):
+            yield ("order",)
 
-    def sides(self, prefix: str) -> Iterator[str]:
+    def _side(self) -> Iterator[tuple[str, ...]]:
         """The side from which a moving element came, where it came from both."""
-        angle, inside = (getattr(self.exposures.position(prefix), name) for name in ("angle", "inside"))
-        turned = np.sin(np.deg2rad(np.diff(angle[inside])))
-        if self.hours and min(np.sum(turned > 1e-9), np.sum(turned < -1e-9)) > 1:
-            yield f"side {prefix}"
+        for prefix in self.prefixes:
+            angle, inside = (getattr(self.exposures.position(prefix), name) for name in ("angle", "inside"))
+            turned = np.sin(np.deg2rad(np.diff(angle[inside])))
+            if varies(self.exposures.mjd) and min(np.sum(turned > 1e-9), np.sum(turned < -1e-9)) > 1:
+                yield (f"side {prefix}",)
 
-    def slow(self) -> Iterator[str]:
-        """Time and temperature."""
-        if self.hours:
-            yield "hours"
-        if self.kelvin:
-            yield "kelvin"
-
-    def moments(self, inside: Bool[np.ndarray, " e"] | None) -> Float[np.ndarray, " s"]:
-        """Times at which something may have changed, of an element that it may have while it was `inside` the beam."""
-        if not self.hours:
+    def _moments(self) -> Float[np.ndarray, " s"]:
+        """Times at which something may have changed, of an element that it may have while it was inside the beam."""
+        if not varies(self.exposures.mjd):
             return np.zeros(0)
-        starts, hours = starts_of_steps(self.exposures), np.unique(hours_of(self.exposures)[inside])
+        starts, hours = starts_of_steps(self.exposures), np.unique(hours_of(self.exposures)[self.inside])
         return starts[np.unique(np.searchsorted(starts, hours[1:]) - 1)]  # ahead of each but the first
 
-    def steps(self, inside: Bool[np.ndarray, " e"] | None = None) -> Iterator[str]:
+    def _step(self) -> Iterator[tuple[str, ...]]:
         """From a time until the end; not so near to an end that all but one or two exposures are alike."""
-        yield from (between(time, end_of(self.exposures)) for time in evenly(self.moments(inside)[1:-1]))
+        for time in evenly(self._moments()[1:-1]):
+            yield (between(time, end_of(self.exposures)),)
 
-    def spells(self, inside: Bool[np.ndarray, " e"]) -> Iterator[str]:
+    def _spell(self) -> Iterator[tuple[str, ...]]:
         """From a time until another: all of them, or of many exposures an eighth, a quarter or half of them."""
-        times = self.moments(inside)
+        times = self._moments()
         some, lengths = evenly(times), (STEPS // 8, STEPS // 4, STEPS // 2)
         each = itertools.chain(*(zip(some, some[length:], strict=False) for length in lengths))
-        yield from (between(*s) for s in (itertools.combinations(times, 2) if len(times) <= FEW else each))
+        for spell in itertools.combinations(times, 2) if len(times) <= FEW else each:
+            yield (between(*spell),)
 
-    def kinds(self) -> Iterator[str]:
-        """Kinds of exposures, but the most frequent."""
-        names, counts = np.unique(self.exposures.kind, return_counts=True)
-        yield from (f"kind {name}" for name in names[np.argsort(-counts, kind="stable")][1:])
-
-    def nights(self) -> Iterator[str]:
+    def _night(self) -> Iterator[tuple[str, ...]]:
         """Every night, where there are several."""
-        if not self.hours:
+        if not varies(self.exposures.mjd):
             return
         hours = np.sort(hours_of(self.exposures))
         first = first_of_nights(hours / 24.0)
         if len(first) < 2:
             return
         for start, stop in itertools.pairwise([*first, len(hours)]):
-            yield f"hours {max(hours[start] - 0.5, 0.0):.2f} to {hours[stop - 1] + 0.5:.2f}"
+            yield (f"hours {max(hours[start] - 0.5, 0.0):.2f} to {hours[stop - 1] + 0.5:.2f}",)
+
+    def _kind(self) -> Iterator[tuple[str, ...]]:
+        """Kinds of exposures, but the most frequent."""
+        names, counts = np.unique(self.exposures.kind[self.inside], return_counts=True)
+        yield from ((f"kind {name}",) for name in names[np.argsort(-counts, kind="stable")][1:])
+
+    def _exposure(self) -> Iterator[tuple[str, ...]]:
+        """Every single exposure, where a field of points shows what it is."""
+        if self.over_field and len(self.exposures) <= limits.FREE_EXPOSURES:
+            yield from ((f"exposure {number}",) for number in np.flatnonzero(self.inside))
+
+    def _patch(self) -> Iterator[tuple[str, ...]]:
+        """Every patch of the Moon sky, which is an exposure, and all of them."""
+        each = [f"exposure {number}" for number in np.flatnonzero(self.exposures.direct("moon"))]
+        if 0 < len(each) <= limits.FREE_EXPOSURES:
+            yield from zip(each)
+            if len(each) > 1:
+                yield tuple(each)
+
+
+def varies(values: np.ndarray) -> bool:
+    """True if all numbers are known and not the same."""
+    return bool(np.isfinite(values).all() and np.ptp(values) > 1e-9 * max(1.0, float(np.abs(values).max())))

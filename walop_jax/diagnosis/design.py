@@ -48,7 +48,6 @@ from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import cut, states
-from walop_jax.likelihood import engine
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.inverses import determined, unit_columns, whitening
@@ -76,11 +75,12 @@ class Measured:
         self.counts: Cube = likelihood.points.gathered("counts")
         self.used: Bool[np.ndarray, "p e"] = likelihood.used
         self.flux, self.residual = likelihood.residuals(values)
+        self.shared = likelihood.sharing
         # Weighted model at unit flux, from data = flux · model + residual.
         flux = np.where(self.flux == 0, 1.0, self.flux)[..., None]
-        self.model: Cube = (self.counts * self.weight - self.residual) / flux
+        residual = self.shared.independent(self.residual, inverse=True)
+        self.model: Cube = (self.counts * self.weight - residual) / flux
         self.known = likelihood.flux_known
-        self.shared = engine.sharing(likelihood.model.template, likelihood.plan)
         self.cameras = likelihood.cameras
         # Of the model, not of the counts: patterns that know the noise would find it in the residuals.
         unit = self.model / np.where(self.weight > 0, self.weight, 1.0)
@@ -132,7 +132,7 @@ class Measured:
     def candidate(self, stratum: _Stratum) -> Candidate:
         """The columns of a stratum, intensity by intensity."""
         camera, one = np.asarray(stratum.camera), np.eye(self.cameras)
-        if self.shared.exposures is None:
+        if self.shared.single:
             changes, m = self.changes([stratum]), self.unit_model
             columns = np.empty((len(m), self.cameras, len(camera)))
             for c in range(self.cameras):
@@ -441,8 +441,8 @@ def held_out(design: Design, scheme: str) -> float:
 def pattern_scores(design: Design, seed: int = 0) -> ScoreTable:
     """The scores of all patterns that the exposures allow, against a fit."""
     found = list(strata(design.measured))
-    alone = design.measured.shared.exposures is None
-    space, scores, square = (_from_rows if alone else _from_columns)(design, found)
+    single = design.measured.shared.single
+    space, scores, square = (_from_rows if single else _from_columns)(design, found)
     return space.table(scores, square, space.smallest_p(np.random.default_rng(seed)))
 
 

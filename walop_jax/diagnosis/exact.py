@@ -143,7 +143,9 @@ def try_model(
         noise_scale=base.noise_scale,
         worth=base.posterior.objective,
     )
-    bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
+    bayes = -np.inf  # of a fit that has run to where nothing is finite
+    if np.isfinite(result.posterior.matrix).all():
+        bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
     return Trial(effect, bayes, result.chi2, result.explains_data, fit=result)
 
 

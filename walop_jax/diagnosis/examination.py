@@ -86,14 +86,23 @@ def follow_physics(probe: Probe, score: Score) -> bool:
 
 
 def shortest(item: Ranked, most: int = thresholds.MOST_TOGETHER) -> Described:
-    """The sentences of a group that are worth their length, with the amplitudes of a linear step."""
+    """The sentences of a group that are worth their length, with the amplitudes of a linear step.
+
+    All subsets of `most` members or fewer are compared, and those that the whole group passes through as it loses
+    its least probable member again and again.
+    """
     information = np.linalg.pinv(item.score.covariance, hermitian=True)
     scores, widths = information @ item.score.amplitudes, item.probe.widths
-    members = range(len(widths))
-    subsets = [list(some) for n in members for some in itertools.combinations(members, n + 1) if n < most]
-    subsets.append(list(members))
-    worth = [log_bayes(information[np.ix_(some, some)], scores[some], widths[some]) for some in subsets]
-    best = subsets[int(np.argmax(worth))]
+
+    def worth(some: Sequence[int]) -> float:
+        return log_bayes(information[np.ix_(some, some)], scores[some], widths[some])
+
+    subset = list(range(len(widths)))
+    subsets = [list(some) for n in subset for some in itertools.combinations(subset, n + 1) if n < most]
+    while len(subset) > most:
+        subsets.append(subset)
+        subset = max(([i for i in subset if i != one] for one in subset), key=worth)
+    best = max(subsets, key=worth)
     amplitudes = np.linalg.lstsq(information[np.ix_(best, best)], scores[best], rcond=None)[0]
     return Described.combine([item.probe.group[i] for i in best], amplitudes)
 

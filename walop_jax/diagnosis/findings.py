@@ -498,7 +498,9 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
     }
     if places:
         words = (f"{key}: {value}".replace("_", " ").replace("%", " %") for key, value in places.items())
-        yield f"{name} sits in: {'; '.join(words)}".replace("clp harmonic", "harmonic of the polariser angle")
+        yield f"{name}, share of the misfit that it removes, by {'; by '.join(words)}".replace(
+            "clp harmonic", "harmonic of the polariser angle"
+        )
     rivals = (*step.get("equivalent", ()), *step.get("nameless", ()))
     if rivals:
         yield f"{name}: these data cannot distinguish it from {some(rivals, _ALIKE)}"

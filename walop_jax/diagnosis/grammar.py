@@ -21,37 +21,36 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 
 from walop_jax.data.records import Exposures
-from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.dependences import STEPS, Asked, between, starts_of_steps
+from walop_jax.diagnosis.dependences import (
+    FEWEST_POINTS,
+    PATTERNS,
+    STEPS,
+    Dependences,
+    between,
+    starts_of_steps,
+    varies,
+)
 from walop_jax.diagnosis.hypotheses import Probe, applicable, probes, said_by
-from walop_jax.likelihood import limits
-from walop_jax.model.conventions import Units
 from walop_jax.model.effects import Context, Described, EffectKind
-from walop_jax.model.effects.change import BAND, OPPOSITE, SKY
+from walop_jax.model.effects.change import BAND, KINDS, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.etalon import probed_gaps
-from walop_jax.model.effects.numbers import OF_SOURCES
-from walop_jax.model.effects.optics import DISPLACEMENTS
-from walop_jax.model.elements.base import Element
+from walop_jax.model.effects.numbers import OF_QU
+from walop_jax.model.effects.optics import ADDED, DISPLACEMENTS, GENERATORS, GROUPS
 from walop_jax.model.elements.geometry import PupilMapping
 from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.slots import acts
 from walop_jax.model.specification import effect_context
 
-# -------------------------------------------------------------------------------------------------------- all sentences
-
-LINEAR = ("diattenuation", "retardance")
-ALONE = ("diattenuation v", "retardance v", "depolarisation")
 ROUNDED = 1e-4  # hours, of times that are written into a description
-HARMONICS = (1, 2)
-HARMONICS_OF_ENCODER = (1, 2, 3, 4, 5, 6)
 
 
 def sentences(instrument: Instrument, exposures: Exposures, points: int) -> tuple[Probe, ...]:
@@ -146,257 +145,134 @@ def retimed(sentence: Sentence, exposures: Exposures, end: int) -> list[Sentence
     return [dataclasses.replace(sentence, factors=(between(*span),)) for span in spans if span[0] < span[1]]
 
 
-# -------------------------------------------------------------------------------------------------- the grammar
+# ------------------------------------------------------------------------------------------------------ all groups
+
+Base = tuple[Sentence, ...]
+Mask = Bool[np.ndarray, " e"]
 
 
-def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterator[tuple[Sentence, ...]]:
-    asked = Asked.of(exposures, points)
-    yield from _of_polariser(instrument, asked)
-    for where, place, fixed in places(instrument, exposures):
-        for base in _families(where, place):
-            yield from _over_field(base, asked)
-            if not fixed:
-                continue
-            for factor in (*(("colour",) if asked.colours else ()), *asked.slow()):
-                yield _times(base, factor)
-                yield from (_times(one, factor) for one in _grown(base, asked))
-    for prefix, element in _turning(instrument, exposures).items():
-        if element is instrument.polariser:
-            continue
-        for base in _families("of", element.name):
-            for pair in asked.harmonics(prefix, HARMONICS):
-                yield _times(base, *pair)
-        inside = exposures.position(prefix).inside
-        for span in (*asked.steps(inside), *asked.spells(inside)):
-            yield (Sentence("turn", "of", element.name, (span,)),)
-    yield from _ahead(instrument, asked)
-    yield from _of_plates(instrument, exposures, asked)
-    yield from _of_cameras(instrument, asked)
-    yield from _of_field_and_band(instrument, asked)
-    yield from _of_sources(instrument, asked)
-    yield from _together(instrument, asked)
+class Subject(NamedTuple):
+    """Changes that have the same dependences, by what is tried together (`Combinations.among`).
+
+    They may grow with the angles of elements of some `prefixes`, and are seen in exposures that are `inside` (None: in
+    all of them).
+    """
+
+    bases: Mapping[str, Sequence[Base]]
+    prefixes: tuple[str, ...] = ()
+    inside: Mask | None = None
+
+    @classmethod
+    def of(cls, *bases: Base, inside: Mask | None = None, **among: Sequence[Base]) -> Subject:
+        """Each alone, and all of several together."""
+        every = [tuple(itertools.chain(*bases))][: len(bases) - 1]
+        return cls({"alone": bases, "all": every, **among}, (), inside)
 
 
-def _turning(instrument: Instrument, exposures: Exposures) -> dict[str, Element]:
-    """Elements of the common train that move and are in the beam in some exposure, by the prefix of their columns."""
+def _base(kinds: Iterable[str], where: str, place: str, origin: str = "") -> Base:
+    return tuple(Sentence(kind, where, place, origin=origin) for kind in kinds)
+
+
+def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterator[Base]:
+    over_field, everything = points >= FEWEST_POINTS, np.ones(len(exposures), bool)
+    for bases, prefixes, inside in _subjects(instrument, exposures, over_field=over_field):
+        shown = Dependences(exposures, over_field, prefixes, everything if inside is None else inside)
+        first = bases["alone"][0][0]
+        for over, along, among in KINDS[first.kind].grows(instrument, first).tried:
+            patterns = [PATTERNS[name] for name in over if over_field or name == "even"]
+            factors = itertools.chain(*map(shown.of, along))
+            every = itertools.chain(*(bases.get(name, ()) for name in among))
+            for group, pattern, base in itertools.product(factors, patterns, every):
+                pairs = [tuple(filter(None, pair)) for pair in itertools.product(group, pattern)]
+                yield tuple(sentence.times(*pair) for sentence in base for pair in pairs)
+
+
+def _subjects(instrument: Instrument, exposures: Exposures, *, over_field: bool) -> Iterator[Subject]:
+    """All changes that an instrument has a place for, and exposures can show."""
+    polariser, sky = instrument.polariser, ~exposures.clp_in
+    groups = [group for group in GROUPS if over_field or not group[0].endswith(("radial", "diagonal"))]
+    for places in _places(instrument, exposures):
+        inside = sky if polariser is not None and places == [("ahead of", polariser.name)] else None
+        anything = [_base(GENERATORS, *place) for place in places]
+        for number, group in enumerate(groups):
+            bases = (_base(group, *place) for place in places)
+            yield Subject.of(*bases, inside=inside, anything=[] if number else anything)
+    if polariser is not None and sky.any():
+        yield Subject.of(_base(ADDED, "ahead of", polariser.name), inside=sky)
     moving = {element.moves: element for element in instrument.train() if element.moves}
-    return {prefix: element for prefix, element in moving.items() if exposures.position(prefix).inside.any()}
+    turning = [prefix for prefix in moving if exposures.position(prefix).inside.any()]
+    for prefix in turning:
+        for group in (("turn",), *groups):
+            bases = {"alone": [_base(group, "of", moving[prefix].name)]}
+            yield Subject(bases, (prefix,), exposures.position(prefix).inside)
+    yield from _of_plates(instrument, exposures)
+    yield from _of_cameras(instrument, exposures, tuple(turning), over_field=over_field)
+    yield Subject.of(_base(("shift",), "of", BAND))
+    for element in instrument.train() if over_field else ():
+        if isinstance(element, PupilMapping):
+            yield Subject.of(_base(DISPLACEMENTS, "ahead of", element.name))
+    for kinds in (OF_QU, ("polarisation",)) if exposures.direct("moon").any() else ():
+        yield Subject.of(_base(kinds, "of", SKY))
+    for name in instrument.standard.names:
+        yield Subject.of(_base(OF_QU, "of", name.replace(" ", "_")))
 
 
-def _times(base: tuple[Sentence, ...], *factors: str) -> tuple[Sentence, ...]:
-    return tuple(sentence.times(factor) for sentence in base for factor in factors)
-
-
-def _families(where: str, place: str) -> Iterator[tuple[Sentence, ...]]:
-    for kind in LINEAR:
-        yield tuple(Sentence(f"{kind} {axis}", where, place) for axis in "qu")
-    for kind in ALONE:
-        yield (Sentence(kind, where, place),)
-
-
-def _over_field(base: tuple[Sentence, ...], asked: Asked) -> Iterator[tuple[Sentence, ...]]:
-    yield base
-    if not asked.over_field:
-        return
-    yield _times(base, "x", "y")
-    yield _times(base, "r2")
-    if len(base) == 1:
-        yield _times(base, "x2-y2", "xy")
-        return
-    kind = base[0].kind.split()[0]
-    for axis in ("radial", "diagonal"):
-        yield (dataclasses.replace(base[0], kind=f"{kind} {axis}"),)
-
-
-def _grown(base: tuple[Sentence, ...], asked: Asked) -> Iterator[tuple[Sentence, ...]]:
-    """The patterns of the field that stress and temperature make: with the radius, radial, diagonal."""
-    if asked.over_field:
-        yield from itertools.islice(_over_field(base, asked), 2, None)
-
-
-def _ahead(instrument: Instrument, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
-    """Changes of light from the sky that differ between exposures: telescopes turn, warm up and gather dust."""
-    polariser, exposures = instrument.polariser, asked.exposures
-    if polariser is None or exposures.clp_in.all():
-        return
-    added = tuple(Sentence(f"added polarisation {axis}", "ahead of", polariser.name) for axis in "qu")
-    if asked.over_field:
-        yield _times(added, "x", "y")
-        yield _times(added, "r2")
-    for factor in (*asked.slow(), *asked.hour_angle(), *asked.single()):
-        yield _times(added, factor)
-        for base in _families("ahead of", polariser.name):
-            yield _times(base, factor)
-
-
-def _of_polariser(instrument: Instrument, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
-    polariser = instrument.polariser
-    if polariser is None or polariser.moves is None or not asked.exposures.clp_in.any():
-        return
-    turn = (Sentence("turn", "of", polariser.name),)
-    for base in (turn, *(f for f in _families("of", polariser.name) if f[0].kind != "retardance v")):
-        yield from _over_field(base, asked)
-        orders = HARMONICS_OF_ENCODER if base is turn else HARMONICS
-        for pair in asked.harmonics(polariser.moves, orders):
-            yield _times(base, *pair)
-        for factor in (*asked.slow(), *asked.single(), *asked.sides(polariser.moves)):
-            yield _times(base, factor)
-    for pair in asked.harmonics(polariser.moves, (1,)) if asked.over_field else ():
-        yield _times(_times(turn, *pair), "x", "y")  # a beam that wanders over a film that is not uniform
-    inside = asked.exposures.clp_in
-    for span in (*asked.nights(), *asked.steps(inside), *asked.spells(inside)):
-        yield _times(turn, span)
-    if asked.over_field and len(asked.exposures) <= limits.FREE_EXPOSURES:
-        for number in np.flatnonzero(asked.exposures.clp_in):
-            yield _times(turn, f"exposure {number}")
-
-
-def places(instrument: Instrument, exposures: Exposures) -> Iterator[tuple[str, str, bool]]:
-    """Places of the train that differ in what acts on polarisation: preposition, element, and whether it may depend on
-    wavelength, time and temperature there (ahead of the polariser nothing may)."""
-    train, polariser = list(instrument.train()), instrument.polariser
+def _places(instrument: Instrument, exposures: Exposures) -> Iterator[list[tuple[str, str]]]:
+    """Places that differ in what acts on polarisation: preposition and element; those of the same name in all arms."""
+    train, polariser, arms = list(instrument.train()), instrument.polariser, instrument.arms
+    behind = train[len(instrument.telescope()) + (polariser is not None) :]
     if polariser is not None:
         if not exposures.clp_in.all():
-            yield "ahead of", polariser.name, False
-        yield "behind", polariser.name, True
-    behind = train[len(instrument.telescope()) + (polariser is not None) :]
-    if polariser is None and behind:
-        yield "ahead of", behind[0].name, True
+            yield [("ahead of", polariser.name)]
+        yield [("behind", polariser.name)]
+    elif behind:
+        yield [("ahead of", behind[0].name)]
     for element in behind:
         if acts(element) and (element.moves is None or exposures.position(element.moves).inside.any()):
-            yield "behind", element.name, True
-    for arm in instrument.arms:
-        own = list(arm.train())
-        if len(instrument.arms) > 1:
-            yield "ahead of", f"{arm.name}.{own[0].name if own else arm.analyser.name}", True
-        for element in own:
-            if acts(element):
-                yield "behind", f"{arm.name}.{element.name}", True
+            yield [("behind", element.name)]
+    for arm in arms if len(arms) > 1 else ():
+        yield [("ahead of", f"{arm.name}.{next(iter((*arm.train(), arm.analyser))).name}")]
+    acting = {arm.name: [element.name for element in arm.train() if acts(element)] for arm in arms}
+    for name in dict.fromkeys(itertools.chain(*acting.values())):
+        yield [("behind", f"{arm}.{name}") for arm, names in acting.items() if name in names]
 
 
-def _of_plates(instrument: Instrument, exposures: Exposures, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
-    warm = []
-    for place in instrument.places(WavePlate):
-        arm, _, name = place.rpartition(".")
-        holder = next(a for a in instrument.arms if a.name == arm).elements if arm else instrument.elements
-        plate = next(e for e in holder if e.name == name)
-        assert isinstance(plate, WavePlate)
-        if plate.moves is not None and not exposures.position(plate.moves).inside.any():
-            continue
-        yield (Sentence("axis", "of", place),)
-        for step in asked.steps():
-            yield (Sentence("axis", "of", place, (step,)),)
-        warm.append(Sentence("thermal", "of", place))
-        layers = [f"{place}.{layer.name}" for layer in plate.layers]
-        yield tuple(Sentence("thickness", "of", layer) for layer in layers)
-        for layer in layers[1:]:
-            yield (Sentence("axis", "of", layer),)
-        for layer in layers:
-            yield (Sentence("cut", "of", layer),)
-    if warm and asked.kelvin:
-        yield tuple(warm)
-    yield from _fringes_ahead([sentence.place for sentence in warm], instrument.units)
+def _of_plates(instrument: Instrument, exposures: Exposures) -> Iterator[Subject]:
+    each = {place: instrument.element(place) for place in instrument.places(WavePlate)}
+    seen = {place: exposures.position(plate.moves).inside for place, plate in each.items() if plate.moves}
+    plates = {place: plate for place, plate in each.items() if place not in seen or seen[place].any()}
+    if fixed := [place for place in plates if place not in seen]:
+        yield Subject.of(*(_base(("axis",), "of", place) for place in fixed))
+    for place in [place for place in plates if place in seen]:
+        yield Subject.of(_base(("axis",), "of", place), inside=seen[place])
+    for place, plate in plates.items():
+        layers = [f"{place}.{layer.name}" for layer in plate.layers]  # pyright: ignore[reportAttributeAccessIssue]
+        yield Subject.of(tuple(Sentence("thickness", "of", layer) for layer in layers))
+        for kind, some in (("axis", layers[1:]), ("cut", layers)):
+            yield from (Subject.of(_base((kind,), "of", layer)) for layer in some)
+    if plates and varies(exposures.temp):
+        yield Subject.of(tuple(Sentence("thermal", "of", place) for place in plates))
+    for pair in probed_gaps(instrument.units) if plates else ():
+        gaps = tuple(f"gap {gap:g}" for gap in pair)
+        yield Subject.of(*(tuple(Sentence("fringes", "of", p, (gap,)) for gap in gaps) for p in plates))
 
 
-def _fringes_ahead(plates: Sequence[str], units: Units) -> Iterator[tuple[Sentence, ...]]:
-    """Cosine and sine of the fringes of an air gap ahead of one plate, and of the same gap ahead of all of them."""
-    for pair in probed_gaps(units) if plates else ():
-        pairs = [tuple(Sentence("fringes", "of", place, (f"gap {g:g}",)) for g in pair) for place in plates]
-        yield from pairs
-        if len(pairs) > 1:
-            yield tuple(itertools.chain(*pairs))
-
-
-def _of_field_and_band(instrument: Instrument, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
-    yield (Sentence("shift", "of", BAND),)
-    for element in instrument.train() if asked.over_field else ():
-        if isinstance(element, PupilMapping):
-            moved = tuple(Sentence(kind, "ahead of", element.name) for kind in DISPLACEMENTS)
-            yield moved
-            for factor in (*asked.slow(), *asked.hour_angle()):
-                yield _times(moved, factor)
-
-
-def _of_sources(instrument: Instrument, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
-    own = tuple(Sentence(kind, "of", SKY) for kind in OF_SOURCES)
-    moon = np.flatnonzero(asked.exposures.direct("moon"))
-    if moon.size:
-        yield own[2:]
-    each = [_times(own[:2], f"exposure {number}") for number in moon]
-    if 0 < len(each) <= limits.FREE_EXPOSURES:
-        yield from each
-        if len(each) > 1:
-            yield tuple(itertools.chain(*each))
-    for name in instrument.standard.names:
-        yield tuple(Sentence(kind, "of", name.replace(" ", "_")) for kind in OF_SOURCES[:2])
-
-
-def _together(instrument: Instrument, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
-    """The same kind at the same place of every arm, or in every camera, each with its own amplitude."""
-    arms, names = instrument.arms, instrument.cameras.names
-    if len(arms) > 1 and len({arm.path for arm in arms}) == 1:
-        for element in arms[0].train():
-            if acts(element):
-                each = [list(_families("behind", f"{arm.name}.{element.name}")) for arm in arms]
-                yield from (tuple(itertools.chain(*same)) for same in zip(*each, strict=True))
-    plates = [place for place in instrument.places(WavePlate) if "." in place]
-    if len(plates) > 1:
-        yield tuple(Sentence("axis", "of", place) for place in plates)
-    yield tuple(Sentence("gain", "of", name, ("counts",)) for name in names)
-    if asked.over_field:
-        yield tuple(Sentence("light", "in", name) for name in names)
-        every = tuple(Sentence("gain", "of", name) for name in names)
-        for prefix in _turning(instrument, asked.exposures):
-            for pair in asked.harmonics(prefix, (1,)):
-                yield _times(_times(every, *pair), "x", "y")
-    if asked.hours:
-        yield tuple(Sentence("afterglow", "in", name) for name in names)
-    if asked.over_field:
-        yield tuple(Sentence("light", "in", name, origin=OPPOSITE) for name in names)
-    pairs = zip(names, instrument.cameras.orthogonal, strict=True)
-    yield tuple(Sentence("light", "in", name, origin=names[j]) for name, j in pairs if names[j] != name)
-
-
-def _of_cameras(instrument: Instrument, asked: Asked) -> Iterator[tuple[Sentence, ...]]:
-    cameras, e = instrument.cameras.names, asked.exposures
-    for camera in cameras:
-        gain = (Sentence("gain", "of", camera),)
-        yield _times(gain, "counts")
-        for prefix in _turning(instrument, e):
-            for pair in asked.harmonics(prefix, HARMONICS_OF_ENCODER):
-                yield _times(gain, *pair)
-            for pair in asked.harmonics(prefix, (1,)) if asked.over_field else ():
-                yield _times(_times(gain, *pair), "x", "y")  # an image that goes in a circle
-        for factor in (*asked.slow(), *asked.single(), *asked.nights(), *asked.steps()):
-            yield _times(gain, factor)
-        if asked.over_field and len(e) <= limits.FREE_EXPOSURES:
-            for number in range(len(e)):
-                yield _times(gain, f"exposure {number}")
-        for kind in asked.kinds():
-            yield _times(gain, kind)
-        if asked.over_field:
-            for factor in (*asked.slow(), *asked.single(), *asked.kinds()):
-                yield _times(_times(gain, factor), "x", "y")
-            for factor in asked.slow():
-                yield (*_times(gain, factor), *_times(_times(gain, factor), "r2"))  # a focus that drifts
-        light = (Sentence("light", "in", camera),)
-        if asked.over_field:
-            yield (Sentence("light", "in", camera, origin=OPPOSITE),)
-            yield light
-            for factor in asked.slow():
-                yield _times(light, factor)
-        if asked.hours:
-            yield (Sentence("afterglow", "in", camera),)
-        for other in cameras:
-            if other != camera:
-                yield (Sentence("light", "in", camera, origin=other),)
-    for arm in instrument.arms if len(instrument.arms) > 1 else ():
-        gain = (Sentence("gain", "of", arm.name),)
-        for factor in (*asked.slow(), *asked.single(), *asked.nights()):
-            yield _times(gain, factor)
-        if asked.over_field:
-            yield _times(gain, *(f"ring {n}" for n in thresholds.RINGS))
-            both = tuple(Sentence("gain", "of", name) for name in arm.analyser.cameras)
-            for factor in (*asked.kinds(), *asked.single()):
-                yield _times(_times(both, factor), "x", "y")
-                yield _times(_times((Sentence("gain", "of", arm.name),), factor), "x", "y")
+def _of_cameras(
+    instrument: Instrument, exposures: Exposures, turning: tuple[str, ...], *, over_field: bool
+) -> Iterator[Subject]:
+    cameras, arms = instrument.cameras.names, instrument.arms if len(instrument.arms) > 1 else ()
+    gains = {name: _base(("gain",), "of", name) for name in (*cameras, *(arm.name for arm in arms))}
+    pairs = [tuple(itertools.chain(*(gains[name] for name in arm.analyser.cameras))) for arm in arms]
+    yield Subject.of(*(gains[name] for name in cameras), arm=pairs)._replace(prefixes=turning)
+    if arms:
+        yield Subject.of(*(gains[arm.name] for arm in arms))
+    for origin in ("", OPPOSITE) if over_field else ():
+        yield Subject.of(*(_base(("light",), "in", name, origin) for name in cameras))
+    if varies(exposures.mjd):
+        yield Subject.of(*(_base(("afterglow",), "in", name) for name in cameras))
+    orthogonal = {name: cameras[j] for name, j in zip(cameras, instrument.cameras.orthogonal, strict=True)}
+    if two := [pair for pair in orthogonal.items() if pair[0] != pair[1]]:
+        yield Subject.of(*(_base(("light",), "in", *pair) for pair in two))
+    for name, origin in itertools.permutations(cameras, 2):
+        if orthogonal[name] != origin:
+            yield Subject.of(_base(("light",), "in", name, origin))

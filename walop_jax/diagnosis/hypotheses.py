@@ -8,6 +8,7 @@ a user's own, which are differentiated themselves. Structural effects have no am
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -48,7 +49,7 @@ class Probe:
         """Names of the parameters that the amplitudes belong to, one for each."""
         return tuple(self._fields())
 
-    @property
+    @functools.cached_property
     def widths(self) -> Vector:
         """Prior widths of the amplitudes, member by member."""
         declared = self.effect.numbers()

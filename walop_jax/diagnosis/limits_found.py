@@ -164,7 +164,7 @@ class DetectionLimits(Displayed):
         effects = {f"{entry.effect}.{entry.parameter}": entry for entry in self.limits}
         conditions = {entry.what: entry for entry in self.conditions}
         rows: list[tuple[str, ...]] = []
-        for kind, title in ((EFFECT, "EFFECTS"), (DATA, "MISTAKES IN THE DATA")):
+        for kind, title in ((EFFECT, "EFFECTS"), (DATA, "ERRORS IN THE DATA")):
             some = [one for one in self.mistakes if one.kind == kind]
             names = {one.name: one for one in some} | dict.fromkeys(
                 name
@@ -181,7 +181,7 @@ class DetectionLimits(Displayed):
         )
         return Display(
             title="What these data can show, with 99 % probability",
-            facts=(("could hide", self.protection_in_words() or NO_LEVEL),),
+            facts=(("undetectable", self.protection_in_words() or NO_LEVEL),),
             head=HEAD,
             rows=tuple(rows),
             notes=notes,
@@ -208,8 +208,9 @@ class DetectionLimits(Displayed):
             return ""
         worst = self.mistakes[0]
         return (
-            f"a mistake too small to be detected could still bias q or u by {two_digits(100 * worst.error[0])} % "
-            f"(median over the field, stars with p ≤ 5 %; {two_digits(100 * worst.error[1])} % at worst): "
+            "a systematic error too small to be detected could still bias q or u by "
+            f"{two_digits(100 * worst.error[0])} % (median over the field, stars with p ≤ 5 %; "
+            f"{two_digits(100 * worst.error[1])} % at worst): "
             f"{worst.in_words}"
         )
 

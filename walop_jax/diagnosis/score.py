@@ -334,6 +334,16 @@ class ScoreSpace:
             first += rank
         return smallest
 
+    def smallest_of(self, drawn: Float[np.ndarray, "a d"]) -> Vector:
+        """ln of the smallest p among all candidates in each draw of the scores C̃ᵀr, for noise of unit size."""
+        smallest = np.zeros(drawn.shape[1])
+        for name, at in self.places().items():
+            w = self.whitened[name]
+            if w.shape[1]:
+                statistic = np.sum((w.T @ np.where(self.alive[at][:, None], drawn[at], 0.0)) ** 2, axis=0)
+                np.minimum(smallest, _log_survival(statistic, w.shape[1]), out=smallest)
+        return smallest
+
 
 class _Root:
     """L of a Gram matrix G = L Lᵀ (`whole`) of some `rank`: Cholesky's method, the column with most left coming next.
@@ -392,8 +402,13 @@ def _log_of_chi2(statistic: Any, rank: int) -> Any:
 
 def _log_survival(statistic: np.ndarray, rank: int) -> np.ndarray:
     """ln of the χ² survival function by interpolation: millions of values, 10⁻⁴ is plenty."""
+    return np.interp(statistic, *_survival_grid(rank))
+
+
+@functools.cache
+def _survival_grid(rank: int) -> tuple[np.ndarray, np.ndarray]:
     grid = np.linspace(0.0, rank + 12.0 * np.sqrt(2.0 * rank) + 60.0, 2000)
-    return np.interp(statistic, grid, _log_of_chi2(grid, rank))
+    return grid, _log_of_chi2(grid, rank)
 
 
 def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, float]:

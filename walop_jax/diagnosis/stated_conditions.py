@@ -10,7 +10,8 @@ So each number has its own efficient score (`score`), with the derivative
 of the whitened residuals r with respect to the number c that the set states, fluxes solved for anew. A row knows of the
 field only its own place, so that scale and angle are sums of X and Y, row by row.
 
-The coordinates and times of sky exposures, the site and ROTATOR are asked in the same way. A number of the instrument
+The coordinates and times of sky exposures, the site and ROTATOR are asked in the same way, and the share of the sky
+(SKY) that is left in the counts. A number of the instrument
 that is thought to be known, and is not, looks much like these: the prior of each parameter, and those of each element
 together, are rivals with the column (mean − value)/width. So are terms of one camera with one amplitude: a
 non-linearity (its counts squared), a pedestal, scattered light (the median counts of an exposure), light of another
@@ -32,6 +33,7 @@ from jaxtyping import Bool, Float
 from scipy import special
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import log_evidence_ratio
@@ -434,6 +436,21 @@ def _stated(calset: CalibrationSet) -> Iterator[_Stated]:
             what = f"TEFF of exposures of kind {kind}"
             yield _Stated(what, "K", remedy, "a measured spectrum of their light", typical, warmer, stated)
     yield from _of_sky(calset)
+    table = calset.intensities
+    if isinstance(table, TableIntensities) and table.sky is not None and table.sky.any():
+        remedy, shown_by = "subtract the sky anew", "the same stars under a sky of another level"
+        less = functools.partial(_with_less_sky, calset, table)
+        yield _Stated(
+            "the light of the sky that is left, in units of SKY,", "", remedy, shown_by, 0.1, less, 0.0
+        )
+
+
+def _with_less_sky(calset: CalibrationSet, table: TableIntensities, share: float) -> CalibrationSet:
+    """The set from whose counts a further share of the sky is subtracted."""
+    assert table.sky is not None
+    return dataclasses.replace(
+        calset, intensities=dataclasses.replace(table, counts=table.counts - share * table.sky)
+    )
 
 
 def _moved(

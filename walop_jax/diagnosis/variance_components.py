@@ -154,7 +154,7 @@ def groupings(design: Design, *, pixels: bool = False) -> Iterator[_Grouping]:
     at_points = np.broadcast_to(at_points, used.shape)
     if used.shape[0] > 1:
         yield _Grouping(f"{point}s", agree, at_points, one, "gain")
-        said = f"{agree} in what they make of q and u"
+        said = f"{agree} in q and u"
         yield _Grouping(f"{point}s in q and u", said, at_points, stokes, "response")
     if pixels:
         return

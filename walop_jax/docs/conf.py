@@ -25,6 +25,9 @@ myst_heading_anchors = 3
 html_theme = "pydata_sphinx_theme"
 html_theme_options = {"show_prev_next": False, "secondary_sidebar_items": ["page-toc"]}
 html_show_sourcelink = False
+html_sidebars: dict[str, list[str]] = {
+    "**": []
+}  # all pages are in the bar at the top: no empty column beside the text
 exclude_patterns = ["build"]
 NOTEBOOKS = Path(walop_jax.__file__).parents[1] / "notebooks"
 

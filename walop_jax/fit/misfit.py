@@ -9,7 +9,8 @@ field is in the unit of the matrix, so it can be compared with the 0.1 % goal.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from os import PathLike
 
 import numpy as np
 from jaxtyping import Float
@@ -22,6 +23,7 @@ from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.conventions import matrix_elements
 
+MOST_REASONS = 3  # that are printed
 MISFIT_POINTS = 65536
 """Field points whose residuals are grouped to describe a misfit: their cube then takes 50 MB at 25 exposures."""
 
@@ -51,6 +53,23 @@ class Misfit:
         plate = elements.pop(CALIBRATION_PLATE)
         return entries | {"calibration_plate": plate, "elements": elements, "sentences": self.sentences()}
 
+    def advice(self) -> tuple[str, ...]:
+        """The remedy, where single rows spoil the fit."""
+        share = (
+            f"{100 * self.outliers:.2g} % of the rows lie more than {BEYOND:g} standard errors off: if these are "
+            "cosmic rays or stars, walop-jax clip flags them"
+        )
+        return (share,) if 0.0 < self.outliers <= MOST else ()
+
+    def reasons(self, warnings: Sequence[str], folder: str | PathLike[str] | None) -> tuple[str, ...]:
+        """The first reasons against a fit, its `warnings` among them, and the command that shows all of them."""
+        reasons = tuple(dict.fromkeys((*self.advice(), *warnings, *self.sentences())))
+        more = len(reasons) - MOST_REASONS
+        return (
+            *reasons[:MOST_REASONS],
+            f"{more} more, with the misfit by camera and exposure: walop-jax report {folder}",
+        )
+
     def sentences(self) -> tuple[str, ...]:
         """The disagreement in words, the largest of each kind first."""
 
@@ -65,12 +84,8 @@ class Misfit:
             for prefix, groups in self.positions.items()
             if set(groups) != {"out"}
         ]
-        clip = (
-            f"{100 * self.outliers:.2g} % of the rows lie more than {BEYOND:g} standard errors off: if these are "
-            "cosmic rays or stars, walop-jax clip flags them"
-        )
         return (
-            *([clip] if 0.0 < self.outliers <= MOST else []),
+            *self.advice(),
             f"mean squared residual by camera: {ranked(self.camera, '.3g')}",
             "; ".join(
                 (f"by kind: {ranked(self.kind, '.3g')}", f"by filter: {ranked(self.filter, '.3g')}", *moved)

@@ -112,7 +112,7 @@ def parameter_notes(model: Model, sigma: Vector) -> tuple[str, ...]:
     notes = [f"{hidden} throughput terms not shown; to_table() has them"] if hidden else []
     if idle:
         listed = f": {', '.join(idle)}" if len(idle) <= MOST_LISTED else " (marked in to_table())"
-        notes.append(f"{len(idle)} parameters are set by their priors alone{listed}")
+        notes.append(f"{len(idle)} parameters are constrained only by their priors{listed}")
     return tuple(notes)
 
 

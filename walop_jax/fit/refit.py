@@ -367,7 +367,7 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
         large = result.noise_scale**2 > 1.0 + EXCESS_NOISE**2
         yield Doubt(
             Quality.EXCESS_NOISE if large else Quality(0),
-            f"the errors of the data had to be multiplied by {result.noise_scale:.3g} for a fit: the model is far off",
+            f"to reach a solution the errors of the data were multiplied by {result.noise_scale:.3g}: the fit is poor",
             blocking=False,
         )
     instrument = result.model.instrument(result.values).patched()
@@ -387,7 +387,7 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
         reason = reason.replace(" states", " states of the exposures").replace(
             " cells", " cells of the field"
         )
-        text = f"error bars were enlarged to match the scatter of the residuals ({reason})"
+        text = f"errors of parameters are estimated from the scatter of the residuals ({reason})"
         yield Doubt(Quality(0), text, blocking=False)
 
 

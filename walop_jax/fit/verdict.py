@@ -53,7 +53,7 @@ class Quality(enum.IntFlag):
     PLACE = 1048576, "stars of one place in the field disagree with the calibration together"
     OTHER_FRAME = 2097152, "in the frame of the instrument, where other rows have a ROTATOR"
     REPEATED = 4194304, "a row has the place and counts of another star or setting"
-    CATALOGUE = 524288, "the stars of the catalogue together say that calibration or errors do not hold"
+    CATALOGUE = 524288, "the stars of the catalogue together contradict the calibration or the errors"
     NO_STOKES = (
         16384,
         "no Stokes parameters: too few cameras, too little light, or no u in the rows there are",

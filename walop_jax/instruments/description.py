@@ -88,12 +88,12 @@ def default_name() -> str:
 @functools.cache
 def described(name: str) -> Description:
     """A shipped instrument by name. Raises `DataError` with the nearest names for one that does not exist."""
-    known = {each.upper(): each for each in shipped()}
-    if name.upper() not in known:
+    by_name = {shipped_name.upper(): shipped_name for shipped_name in shipped()}
+    if name.upper() not in by_name:
         raise DataError(
             f"there is no instrument {name!r}; {nearest(name.upper(), shipped())} (or give a description file)"
         )
-    return parsed(_shipped_text(known[name.upper()]), f"instrument {name}")
+    return parsed(_shipped_text(by_name[name.upper()]), f"instrument {name}")
 
 
 def _shipped_text(name: str) -> str:
@@ -128,12 +128,12 @@ def _whole(text: str, where: str, seen: tuple[str, ...]) -> Table:
     like = table.get("like")
     if like is None:
         return table
-    known = {name.upper(): name for name in shipped()}
-    if not isinstance(like, str) or like.upper() not in known or like in seen:
+    by_name = {name.upper(): name for name in shipped()}
+    if not isinstance(like, str) or like.upper() not in by_name or like in seen:
         raise DataError(
             f"{where}: like = {like!r} must name a shipped instrument; {nearest(str(like), shipped())}"
         )
-    base = dict(_whole(_shipped_text(known[like.upper()]), like, (*seen, like)))
+    base = dict(_whole(_shipped_text(by_name[like.upper()]), like, (*seen, like)))
     base.pop("default", None)  # of one instrument alone
     field = table.get("field")
     if (
@@ -142,8 +142,8 @@ def _whole(text: str, where: str, seen: tuple[str, ...]) -> Table:
         and isinstance(base.get("field"), Mapping)
     ):
         # A field of another size has another scale.
-        kept = {"raster"} | ({"limit"} if "edge" in field else set())
-        base["field"] = {key: value for key, value in base["field"].items() if key in kept}
+        replaceable = {"raster"} | ({"limit"} if "edge" in field else set())
+        base["field"] = {key: value for key, value in base["field"].items() if key in replaceable}
     return merged(base, table)
 
 
@@ -173,9 +173,9 @@ def _description(read: Reader, table: Table, text: str) -> Description:
     for key in REQUIRED:
         if key not in table:
             raise read.fault("", f"{key} is missing; walop-jax docs adding-an-instrument has an example")
-    parts = ("site", "field", "throughput", "cameras", "elements", "arms")
+    tables = ("site", "field", "throughput", "cameras", "elements", "arms")
     site, field, series, cameras, elements, arms = (
-        read.table(table.get(key, {}), "", f"{key} = ") for key in parts
+        read.table(table.get(key, {}), "", f"{key} = ") for key in tables
     )
     for place, hints in (("site", SITE), ("field", FIELD), ("throughput", THROUGHPUT), ("cameras", CAMERAS)):
         read.values(hints, table.get(place, {}), place)

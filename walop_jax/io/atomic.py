@@ -1,7 +1,7 @@
 """Files that appear whole or not at all: written beside their place, flushed to disk, then renamed.
 
 The temporary name tells for what, on which machine and by which process it was made, so that the next writer of the
-same result can remove what a killed one has left. Messages never show it: users have not chosen it.
+same result can remove the remains of a killed one. Messages never show it: users have not chosen it.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def atomic_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Ite
     and has the same suffix, because many writers choose the format by it. It is removed when the block
     raises, so an old file survives a full disk, an interrupt and a bug untouched.
 
-    Raises `DataError` as `check_output` does, and for what the operating system refuses (a full disk).
+    Raises `DataError` as `check_output` does, and for errors of the operating system (a full disk).
     """
     target = check_output(path, overwrite=overwrite)
     remove_leftovers(target)

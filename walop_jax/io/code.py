@@ -78,7 +78,7 @@ SOFTWARE = ("walop-jax", "jax", "jaxlib", "equinox", "lineax", "optimistix", "nu
 
 
 def versions_of(names: Iterable[str]) -> dict[str, str]:
-    """Versions of packages; "unknown" for what is not installed."""
+    """Versions of packages; "unknown" for those that are not installed."""
     return {name: _version(name) for name in names}
 
 

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 from walop_jax.io.code import blank
 
 MOST_LINES = 25
-"""Of what a result shows of itself unasked."""
+"""Largest number of lines of the `repr` of a result."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,7 +146,7 @@ class Drawn(Displayed):
 
 
 class Result(Drawn):
-    """Something with a calibration in it: what can be done with it is asked of the public functions."""
+    """Base class of results with a calibration, which the public functions take."""
 
     first_figure = "matrix"
 

@@ -19,7 +19,7 @@ _ALIKE, _SHORT = 0.75, 3
 
 
 class DataError(ValueError):
-    """An input cannot be trusted; the message says what is wrong, where, and what to do about it.
+    """An input cannot be trusted; the message states fault, place and remedy.
 
     >>> walop.read("nowhere.fits")
     Traceback (most recent call last):
@@ -39,7 +39,7 @@ def fail(
 
 
 def printable(text: str) -> str:
-    """The text on one line: what a terminal cannot show (of a damaged header, of a hostile name) as its escape."""
+    """The text on one line, with escapes for unprintable characters (of a damaged header, of a hostile name)."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -62,24 +62,25 @@ def rows_text(rows: Sequence[int] | np.ndarray) -> str:
     return f"row{'s' if len(rows) > 1 else ''} {shown} (counted from 0)"
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+def nearest(name: str, names: Iterable[str]) -> str:
     """Advise on a name that does not exist: the names most like it, or some of those that there are.
 
-    Of a mapping the values are what the names mean: where none is much like it, those are taken that have a word of it.
+    Of a mapping the values are the meanings of the names: where none is much like it, those are taken that have a word
+    of it.
     """
-    meanings = known if isinstance(known, Mapping) else {}
-    known = sorted(set(known))
-    if not known:
+    meanings = names if isinstance(names, Mapping) else {}
+    names = sorted(set(names))
+    if not names:
         return "there are none to choose from"
-    close = difflib.get_close_matches(name, known, n=3, cutoff=_ALIKE if meanings else 0.4)
+    close = difflib.get_close_matches(name, names, n=3, cutoff=_ALIKE if meanings else 0.4)
     if meanings and not close:
         words = [word for word in re.split(r"[\W_]+", name.lower()) if len(word) > _SHORT]
         texts = {key: f"{key} {meaning}".lower() for key, meaning in meanings.items()}
         close = [key for key, text in texts.items() if any(word in text for word in words)][:_SHOWN]
-        close = close or difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+        close = close or difflib.get_close_matches(name, names, n=3, cutoff=0.4)
     if not close:
-        lowered = {entry.lower(): entry for entry in known}
+        lowered = {entry.lower(): entry for entry in names}
         close = [lowered[m] for m in difflib.get_close_matches(name.lower(), lowered, n=3, cutoff=0.4)]
     if close:
         return "did you mean " + " or ".join(repr(entry) for entry in close) + "?"
-    return "known: " + ", ".join(known[:_SHOWN]) + (" …" if len(known) > _SHOWN else "")
+    return "known: " + ", ".join(names[:_SHOWN]) + (" …" if len(names) > _SHOWN else "")

@@ -1,11 +1,11 @@
-"""Opening a FITS file so that what comes out of it is what was written, or an error.
+"""Opening a FITS file: its content as it was written, or an error.
 
 A file is read once from end to end: for its SHA-256, for the FITS checksums (Seaman, Pence & Rots 2012, an
 appendix of the FITS standard: the 32-bit words of an HDU, summed in ones' complement, are all ones), and
 for its length. astropy would check the sums too, but in small blocks, and would only warn. The sums find
 every damaged byte, but not two changes that cancel each other; the SHA-256 is what tells two files apart.
 
-Before astropy makes anything of the header cards, what they announce (number of axes, rows, columns, groups) is held
+Before astropy makes anything of the header cards, the sizes in them (number of axes, rows, columns, groups) are held
 against the length of the file: a count that is negative or beyond all bounds makes readers loop or ask for any amount
 of memory (FITS standard 4.0, sections 4.4.1, sizes, and 7.3, binary tables).
 """
@@ -57,7 +57,7 @@ UNREADABLE = (
 
 @dataclasses.dataclass(frozen=True)
 class OpenFile:
-    """A FITS file that has passed its checks: its HDUs, its hash, and what is worth remarking."""
+    """A FITS file that has passed its checks: its HDUs, its hash, and remarks."""
 
     path: Path
     sha256: str
@@ -115,7 +115,7 @@ def open_fits(path: str | os.PathLike[str], advice: str | None = None) -> Iterat
 
 
 def primary_keywords(path: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Keywords of the primary header, unchecked, to see what a file is; none if it is no FITS file."""
+    """Keywords of the primary header, unchecked, which tell the kind of a file; none if it is no FITS file."""
     try:
         packed = unpacking(check_input(path))
         with Path(path).open("rb") if packed is None else packed[0] as content:
@@ -144,7 +144,7 @@ def one_line(message: object) -> str:
 def unpacked(stream: io.BufferedIOBase, path: Path, *, fits: bool = False) -> bytes:
     """Read the content of a packed file, `LARGEST_UNPACKED` at most; with `fits`, only if it begins as FITS does."""
     if fits:
-        header_keywords(stream, path)  # of what is no FITS file nothing more is unpacked
+        header_keywords(stream, path)  # a file of another format is not unpacked further
         stream.seek(0)
     content = stream.read(LARGEST_UNPACKED + 1)
     if len(content) > LARGEST_UNPACKED:
@@ -208,7 +208,7 @@ BROKEN = "the copy is damaged or incomplete; transfer or write the file again"
 def check_structure(stream: io.BufferedIOBase, path: Path) -> None:
     """Follow the headers of a FITS file from end to end without reading its data.
 
-    Raises `DataError` for what is no FITS file, counts that are negative or impossible, a file shorter than its headers
+    Raises `DataError` for other formats, counts that are negative or impossible, a file shorter than its headers
     say, and bytes that no header announces.
     """
     size = stream.seek(0, os.SEEK_END)

@@ -61,7 +61,7 @@ class NotWrittenError(DataError):
 
 @dataclasses.dataclass(frozen=True)
 class OutputFolder:
-    """A folder that this process alone writes results to; `path` is what the caller named it."""
+    """A folder that this process alone writes results to; `path` is the name that the caller gave."""
 
     path: Path
     target: Path
@@ -77,7 +77,7 @@ class OutputFolder:
         may leave a part of one result, never parts of two. When the block raises, nothing of it is left. `names` are
         those of the reservation, unless given.
 
-        Raises `DataError` as `check_folder` does, and for what the operating system refuses; `NotWrittenError` where a
+        Raises `DataError` as `check_folder` does, and for errors of the operating system; `NotWrittenError` where a
         file was not written, once all others are in place.
         """
         names = tuple(names) or self.names
@@ -117,7 +117,7 @@ class OutputFolder:
 def output_folder(
     path: str | os.PathLike[str], names: Sequence[str], *, overwrite: bool = False
 ) -> Iterator[OutputFolder]:
-    """Reserve a folder for the results `names` of the block; what a killed writer has left of its own goes.
+    """Reserve a folder for the results `names` of the block; remains of a killed writer are removed.
 
     Raises `DataError` as `check_folder` does, and if another process is writing there.
     """

@@ -73,29 +73,29 @@ def _as_votable(table: Table) -> Any:
     from astropy.io.votable import from_table
     from astropy.io.votable.tree import Param, TimeSys
 
-    made: Any = from_table(table)
-    made.version = "1.4"
-    resource, cards = made.resources[0], dict(table.meta or {})
+    votable: Any = from_table(table)
+    votable.version = "1.4"
+    resource, cards = votable.resources[0], dict(table.meta or {})
     for key, value in cards.items():
         text = json.dumps(value) if isinstance(value, bool | int | float) else str(value)
-        param = Param(made, name=str(key), ID=str(key), datatype="unicodeChar", arraysize="*", value=text)
+        param = Param(votable, name=str(key), ID=str(key), datatype="unicodeChar", arraysize="*", value=text)
         resource.tables[0].params.append(param)
     if scale := str(cards.get("TIMESYS", "")):
         resource.time_systems.append(
             TimeSys(ID="TIME", timescale=scale, refposition="TOPOCENTER", timeorigin=0.0)
         )
-    return made
+    return votable
 
 
 def stacked(first: Any, second: Any) -> Any:
-    """The rows of two tables as one; what a row has no column for is masked."""
+    """The rows of two tables as one; cells without a value are masked."""
     return vstack([first, second], metadata_conflicts="silent")
 
 
 def write_table(path: str | os.PathLike[str], table: Table, *, overwrite: bool = False) -> None:
     """Write an astropy table in the format of the name; whole or not at all.
 
-    Raises `DataError` as `atomic_path` does, for an unknown extension, and for what the format cannot hold.
+    Raises `DataError` as `atomic_path` does, for an unknown extension, and for columns that the format cannot hold.
     """
     kind = table_format(path)
     with atomic_path(path, overwrite=overwrite) as temporary, warnings.catch_warnings():

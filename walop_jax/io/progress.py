@@ -34,9 +34,9 @@ class Stage(str):
 
 @contextlib.contextmanager
 def repeated(tell: Tell, every: float = EVERY) -> Generator[Tell, None, None]:
-    """A function that tells what is being done, and tells it again, with how long, after `every` s of silence.
+    """A function that reports progress, and repeats the last report, with its age, after `every` s of silence.
 
-    What it repeats is told from another thread, never at the same time as anything else.
+    Repeated reports come from another thread, never at the same time as others.
     """
     lock, over = threading.Lock(), threading.Event()
     begin = time.monotonic()

@@ -145,7 +145,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def json_text(value: Any) -> str:
-    """The JSON text of a value, indented, with a final newline; null for what is not finite."""
+    """The JSON text of a value, indented, with a final newline; null for numbers that are not finite."""
     return json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""Tables of TOML files, read by the annotations of what they become: each value checked, unknown keys with advice."""
+"""Tables of TOML files, read by the annotations of their records: each value checked, unknown keys with advice."""
 
 from __future__ import annotations
 

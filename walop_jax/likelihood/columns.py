@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.engine import PointData, best_flux, point_prediction, real_counts, sharing
-from walop_jax.likelihood.flux import Sharing, project_flux
+from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.layout import PointReader, median_over_field
 from walop_jax.likelihood.likelihood import Likelihood, Vector, used_rows
 from walop_jax.model import light, slots
@@ -98,7 +98,7 @@ def _own_at_point(
     change = jax.lax.map(lambda one: push(to_tree(one)), jnp.eye(flat.size), batch_size=some) * point.weight
     _, along = jax.jvp(lambda f: real_counts(at_neutral, plan, unit, f), (flux,), (jnp.ones_like(flux),))
     projected = project_flux(
-        change, along * point.weight, plan.exposures.flux_known, sharing(instrument, plan)
+        change, along * point.weight, plan.exposures.flux_known, sharing(instrument, plan, point)
     )
     return -projected.reshape(len(change), -1).T
 
@@ -218,10 +218,7 @@ class Columns:
         self.exposures: ExposureArrays = jax.tree.map(np.asarray, self.plan.exposures)
         self.fringed = slots.fringe_places(self.patched)
         self._known: dict[Sentence, list[SlotTerm]] = {}
-        floor = likelihood.model.template.cameras.floor
-        self.reader = PointReader(likelihood.calset, self.plan, mirrored=True, floor=floor)
-        groups = self.plan.exposures.shared
-        self.shared = Sharing(self.patched.cameras.together, None if groups is None else np.asarray(groups))
+        self.reader = PointReader(likelihood.calset, self.plan, likelihood.model.template, mirrored=True)
         self._responses: dict[int, tuple[PointData, _AtPoint]] = {}
 
     def has(self, change: Change) -> bool:
@@ -289,6 +286,7 @@ class Columns:
         if known is not None:
             return np.asarray(known)
         _, residual = self.likelihood.residuals(self.values)
+        residual = self.likelihood.sharing.independent(residual, inverse=True)
         counts, weight = map(self.likelihood.points.gathered, ("counts", "weight"))
         used = self.likelihood.used[..., None]
         return median_over_field(np.where(used, counts - residual / np.where(used, weight, 1.0), np.nan))
@@ -346,7 +344,8 @@ class ResponseBlock:
         self.value = np.asarray(of.patched.standard.values(source, of.exposures.colour))
         self.used = weight[..., 0] > 0
         self.linear = light.is_linear(of.patched)
-        self.whole = not self.linear or of.shared.exposures is not None
+        self.shared = sharing(of.patched, of.plan, data)
+        self.whole = not self.linear or not self.shared.single
         self.chosen = np.arange(self.used.size) if self.whole else np.flatnonzero(self.used)
         self.sites, self.cameras = self.found.share.shape[1], weight.shape[2]
         self.weight = self._pairs(weight)
@@ -487,16 +486,16 @@ class ResponseBlock:
         along = self._pairs(self.found.along) * self.weight
         known = self.of.likelihood.flux_known
         shape = (*self.used.shape, self.cameras)
-        if self.of.shared.exposures is not None:
+        if not self.shared.single:
 
             def cube(pairs: Float[np.ndarray, "... k n"]) -> np.ndarray:
                 return np.moveaxis(pairs, -2, -1).reshape(*pairs.shape[:-2], *shape)
 
-            left = project_flux(cube(change), cube(along), known, self.of.shared)
+            left = project_flux(cube(change), cube(along), known, self.shared)
             found[:] = -left[:, self.used].reshape(len(found), -1)
             return
         free = np.where(np.broadcast_to(~known, self.used.shape).reshape(-1)[self.chosen], 1.0, 0.0)
-        together = self.of.shared.cameras
+        together = self.shared.cameras
         groups = (
             [np.arange(self.cameras)]
             if together is None

@@ -51,15 +51,17 @@ class PointData(NamedTuple):
     source: Int[Array, "p e"]
     band: Int[Array, "p e"]
     opposite_sky: Float[Array, "p e 2"] | None = None  # the sky at (−X, −Y), only where an effect asks for it
+    stars: Float[Array, "p e k c"] | None = None  # `Sharing.stars`, only where stars of a field scatter
 
     def sight(self, plan: Plan) -> Sight:
         """Quantities of a field point that the model asks for."""
         return Sight(plan.exposures, self.sky, self.source, self.x, self.y)
 
 
-def sharing(instrument: Instrument, plan: Plan) -> Sharing:
-    """Common fluxes of cameras and of the exposures of a plan."""
-    return Sharing(instrument.cameras.together, plan.exposures.shared)
+def sharing(instrument: Instrument, plan: Plan, point: PointData | None = None) -> Sharing:
+    """Common fluxes of cameras and of the exposures of a plan; at a point, common q, u of its star."""
+    stars = None if point is None else point.stars
+    return Sharing(instrument.cameras.together, plan.exposures.shared, stars)
 
 
 class Normal(NamedTuple):
@@ -164,7 +166,8 @@ def residuals_of(
 ) -> tuple[Float[Array, "e f"], Float[Array, "e k"]]:
     """Best flux of every exposure and the normalised residuals, from the counts for light of unit flux."""
     flux = best_flux(instrument, plan, unit, point)
-    return flux, (point.counts - real_counts(instrument, plan, unit, flux)) * point.weight
+    residual = (point.counts - real_counts(instrument, plan, unit, flux)) * point.weight
+    return flux, sharing(instrument, plan, point).independent(residual)
 
 
 def _linear_unit_counts(
@@ -178,6 +181,27 @@ def _linear_unit_counts(
         return unit_counts(to_instrument(values), plan, rows, local, point)
 
     return linearised(instrument, counts, throughput_at(instrument, point))
+
+
+def _star_responses(
+    instrument: Instrument, plan: Plan, fields: Float[Array, "f s"], data: PointData
+) -> Float[Array, "p e k c"]:
+    """Share by which the counts of a star change for 1 rms of q in each field, then of u.
+
+    `fields` are rms of the values of standards, field by field.
+    """
+    standard = instrument.standard
+
+    def counts(off: Float[Array, "2 f"], point: PointData) -> Float[Array, "e k"]:
+        moved = instrument.changed("standard", q=standard.q + off[0] @ fields, u=standard.u + off[1] @ fields)
+        return point_prediction(moved, plan, point)
+
+    def at(point: PointData) -> Float[Array, "e k c"]:
+        neutral = jnp.zeros((2, len(fields)))
+        unit, slope = counts(neutral, point)[..., None], jax.jacfwd(counts)(neutral, point)
+        return slope.reshape(*unit.shape[:-1], -1) / jnp.where(unit > 0, unit, jnp.inf)
+
+    return jax.vmap(at)(data)
 
 
 def unit_slopes(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e k n"]:
@@ -211,13 +235,10 @@ def _point_jacobian(
         all_values = jnp.concatenate([each, jnp.zeros((throughput.size, values.size))])
         d_counts = jax.vmap(push_detector)(all_values, d_counts)
         along = push_detector(jnp.zeros_like(values), unit)
-    projected = project_flux(
-        d_counts * point.weight,
-        along * point.weight,
-        plan.exposures.flux_known,
-        sharing(instrument, plan),
-    )
-    return ((point.counts - counts) * point.weight).reshape(-1), -projected.reshape(d_counts.shape[0], -1)
+    shared = sharing(instrument, plan, point)
+    projected = project_flux(d_counts * point.weight, along * point.weight, plan.exposures.flux_known, shared)
+    residual = shared.independent((point.counts - counts) * point.weight)
+    return residual.reshape(-1), -projected.reshape(d_counts.shape[0], -1)
 
 
 def _point_normal(
@@ -330,6 +351,7 @@ _table_equations = compiled(_on_table, kept_as="table_equations")
 linearised_residuals = compiled(
     _linearised_residuals, optimised_above=limits.OFTEN_OPTIMISED_ABOVE, kept_as="linearised_residuals"
 )
+star_responses = compiled(_star_responses, kept_as="star_responses")
 residuals = compiled(_residuals, optimised_above=limits.OPTIMISED_ABOVE, kept_as="residuals")
 prediction = compiled(_prediction, optimised_above=limits.OPTIMISED_ABOVE, kept_as="prediction")
 detected = compiled(jax.vmap(light.detected, (None, None, 0)), kept_as="detected")

@@ -4,7 +4,9 @@ Equation    For the cameras of one exposure at one field point, with y = N/σ an
                 F = y·a / a·a,    r = y − F a,    d ← d − a (a·d)/(a·a)
 Symbols     d a derivative of F a, the flux held; behind detectors that are not linear a is ∂(model)/∂F over σ
 Source      Kaufman's form of variable projection (Golub & Pereyra 2003, Inverse Problems 19, R1): the gradient
-            is exact, and JᵀJ is the Fisher information with the flux marginalised
+            is exact, and JᵀJ is the Fisher information with the flux marginalised; a star of a field that is off by
+            δ ~ N(0, 1) in a direction adds A Aᵀ to the covariance of its r, A = ∂r/∂δ, and r ← (1 + A Aᵀ)^(−1/2) r
+            as well as d makes them independent again (`inverses.of_low_rank`)
 Limits      where the flux is known, F = 1 and nothing is projected; where the shares of the arms are unknown
             (`Cameras.split`), y·a and a·a run over the cameras and exposures that have a flux in common (`Sharing`)
 """
@@ -27,11 +29,18 @@ def _namespace(array: Any) -> ModuleType:
 class Sharing(NamedTuple):
     """Common fluxes: `cameras` is 1 where two of them share one, `exposures` where one is of a group that does.
 
-    None: all cameras; every exposure for itself.
+    None: all cameras; every exposure for itself. `stars` is U of 1 − U Uᵀ = (1 + A Aᵀ)^(−1/2) at a point, where the
+    exposures of a star have its own q, u in common; None: no star differs from its catalogue.
     """
 
     cameras: Float[Any, "k k"] | None = None
     exposures: Float[Any, "e s"] | None = None
+    stars: Float[Any, "*p e k c"] | None = None
+
+    @property
+    def single(self) -> bool:
+        """True where every exposure of a point is independent of the others."""
+        return self.exposures is None and self.stars is None
 
     def summed(self, values: Float[Any, "... e k"]) -> Float[Any, "... e f"]:
         """Sums over what has a flux in common, once for all cameras (f = 1) or camera by camera (f = k)."""
@@ -41,6 +50,19 @@ class Sharing(NamedTuple):
         xp = _namespace(values)
         groups = xp.einsum("...ek,es->...sk", each, self.exposures)
         return xp.einsum("...sk,es->...ek", groups, self.exposures)
+
+    def independent(self, values: Float[Any, "... e k"], inverse: bool = False) -> Float[Any, "... e k"]:
+        """Weighted residuals or derivatives, the flux eliminated, with errors that are independent; or back."""
+        if self.stars is None:
+            return values
+        xp = _namespace(values)
+        *lead, exposures, cameras, directions = self.stars.shape
+        stars = xp.asarray(self.stars).reshape(*lead, exposures * cameras, directions)
+        back = xp.swapaxes(stars, -2, -1)
+        if inverse:
+            back = -xp.linalg.solve(xp.eye(directions) - back @ stars, back)
+        flat = values.reshape(*values.shape[:-2], 1, exposures * cameras)
+        return (flat - (flat @ xp.swapaxes(back, -2, -1)) @ xp.swapaxes(stars, -2, -1)).reshape(values.shape)
 
 
 ALONE = Sharing()
@@ -75,4 +97,4 @@ def project_flux(
     xp = _namespace(columns)
     power = shared.summed(along**2)
     share = shared.summed(columns * along) / xp.where(power > 0, power, 1.0)
-    return columns - xp.where(xp.asarray(flux_known)[..., None], 0.0, share) * along
+    return shared.independent(columns - xp.where(xp.asarray(flux_known)[..., None], 0.0, share) * along)

@@ -72,7 +72,7 @@ class Forward(eqx.Module):
             on_cpu = jax.default_backend() == "cpu"
             batch = limits.FORWARD_BATCH if on_cpu else limits.ACCELERATOR_BATCH
         layout = Layout.of(calset, model, batch=batch, interpolate=False)
-        reader = PointReader(calset, layout.plan, layout.mirrored, model.template.cameras.floor)
+        reader = PointReader(calset, layout.plan, model.template, layout.mirrored)
         batches = reader.batches(0, layout.points, layout.batch)
         data = jax.tree.map(lambda *parts: array(np.stack(parts)), *batches)
         rows: PriorRows = prior_rows(model)

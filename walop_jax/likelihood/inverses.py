@@ -63,3 +63,12 @@ def root_of(matrices: Float[np.ndarray, "r n n"], least: float = 0.0) -> Float[n
     value, vector = np.linalg.eigh(matrices)
     kept = int((value > least * value[:, -1:]).sum(axis=1).max())
     return vector[:, :, -kept:] * np.sqrt(np.clip(value[:, None, -kept:], 0.0, None))
+
+
+def of_low_rank(responses: Float[np.ndarray, "*p e k c"]) -> Float[np.ndarray, "*p e k c"]:
+    """U with 1 − U Uᵀ = (1 + A Aᵀ)^(−1/2), from A: with AᵀA = V D Vᵀ, U = A V √((1 − (1 + D)^(−1/2)) / D)."""
+    square, axes = np.linalg.eigh(np.einsum("...ekc,...ekd->...cd", responses, responses))
+    square = np.maximum(square, 0.0)
+    root = np.sqrt(1.0 + square)
+    size = 1.0 / np.sqrt(root * (1.0 + root))  # (1 − 1/√(1 + D)) / D without a difference of equal numbers
+    return responses @ (axes * size[..., None, :])[..., None, :, :]

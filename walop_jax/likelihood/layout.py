@@ -25,9 +25,12 @@ from walop_jax.data.records import (
     Intensities,
     Points,
     Site,
+    Sources,
 )
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.engine import PointData
+from walop_jax.likelihood.engine import PointData, sharing, star_responses
+from walop_jax.likelihood.flux import project_flux
+from walop_jax.likelihood.inverses import of_low_rank
 from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
 from walop_jax.model.chebyshev import Rectangle
@@ -99,7 +102,8 @@ class Layout:
         usual = limits.LARGE_BATCH if interpolated else limits.BATCH
         batch = min(batch or usual, points)
         allowed = limits.MEMORY if memory is None else memory
-        each = bytes_per_point(exposures, calset.cameras, mirrored=mirrored)
+        fields = len(fields_of_stars(calset.sources))
+        each = bytes_per_point(exposures, calset.cameras, mirrored=mirrored, fields=fields)
         kept = 2 * each * points <= allowed
         # Whole batches; and many of them, as pixels are read in whole rows of the frames.
         most = min(
@@ -150,9 +154,18 @@ def curves_of(calset: CalibrationSet) -> list[FilterCurve]:
     ]
 
 
-def bytes_per_point(exposures: int, cameras: int = 4, *, mirrored: bool = False) -> int:
-    """Size of the point data of one field point: per exposure counts and weights, sky, source and band."""
-    return 8 * (2 + exposures * (2 * cameras + (4 if mirrored else 2) + 1 + 1))
+def bytes_per_point(exposures: int, cameras: int = 4, *, mirrored: bool = False, fields: int = 0) -> int:
+    """Size of the point data of one field point: per exposure counts and weights, sky, source and band.
+
+    For each field of stars that scatter as much as counts and weights once more.
+    """
+    return 8 * (2 + exposures * (2 * (1 + fields) * cameras + (4 if mirrored else 2) + 1 + 1))
+
+
+def fields_of_stars(sources: Sources) -> Float[np.ndarray, "f s"]:
+    """For each field of stars that scatter their rms, in its own rows of SOURCES; 0 in those of others."""
+    firsts = np.unique(sources.stars[sources.scatter > 0])
+    return np.where(sources.stars == firsts[:, None], sources.scatter, 0.0)
 
 
 def _rectangle(calset: CalibrationSet, *, mirrored: bool) -> Rectangle:
@@ -255,13 +268,14 @@ Vector = Float[np.ndarray, " n"]
 class PointReader:
     """Turns blocks of measurements into point data; `mirrored` with the sky at the opposite points, for ghosts.
 
-    No error is taken to be smaller than `floor`, a share of the mean counts of its row (`Cameras.floor`).
+    No error is taken to be smaller than a share of the mean counts of its row (`Cameras.floor`); `instrument` gives
+    that, and how stars of a field that differ look in the cameras.
     """
 
     calset: CalibrationSet
     plan: Plan
+    instrument: Instrument
     mirrored: bool = False
-    floor: float = 0.0
 
     def batches(self, start: int, stop: int, size: int) -> list[PointData]:
         """The points `start:stop` in batches of `size`, the last one filled up with its last point, of weight 0."""
@@ -277,10 +291,10 @@ class PointReader:
     def point_data(self, block: Block) -> PointData:
         """A block of measurements as the engine wants it."""
         band = np.take_along_axis(self.plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
-        sigma = with_floor(self._with_scatter(block), block.counts, self.floor)
+        sigma = with_floor(block.sigma, block.counts, self.instrument.cameras.floor)
         weight = np.where(block.used[:, :, None], 1.0 / np.where(sigma > 0, sigma, 1.0), 0.0)
         opposite = self.sky_polarisation(-block.x, -block.y) if self.mirrored else None
-        return PointData(
+        data = PointData(
             x=array(block.x),
             y=array(block.y),
             counts=array(np.where(block.used[:, :, None], block.counts, 0.0)),
@@ -290,19 +304,17 @@ class PointReader:
             band=array(band),
             opposite_sky=None if opposite is None else array(opposite),
         )
+        fields = fields_of_stars(self.calset.sources)
+        return data._replace(stars=array(self._stars(data, fields))) if len(fields) else data
 
-    def _with_scatter(self, block: Block) -> Float[np.ndarray, "p e k"]:
-        """Errors of the counts with the scatter of the stars of a field around their mean q, u.
-
-        A camera of a pair with (N0 − N1)/(N0 + N1) off by s has √2 s N. What is off is the same in all n exposures of a
-        star, so that their mean does not make it smaller: √n more in each.
-        """
-        scatter = np.append(self.calset.sources.scatter, 0.0)[block.source]
-        if not scatter.any():
-            return block.sigma
-        same = (block.source[:, :, None] == block.source[:, None, :]) & block.used[:, None, :]
-        share = scatter * np.sqrt(2.0 * np.maximum(same.sum(axis=2), 1))
-        return np.hypot(block.sigma, share[:, :, None] * np.abs(block.counts))
+    def _stars(self, data: PointData, fields: Float[np.ndarray, "f s"]) -> Float[np.ndarray, "p e k c"]:
+        """`Sharing.stars`: q, u of a star differ from those of its field by the same in all exposures of its point."""
+        share = np.asarray(star_responses(self.instrument, self.plan, array(fields), data))
+        counts = np.asarray(data.counts) * np.asarray(data.weight)
+        shared = sharing(self.instrument, self.plan)
+        change = np.moveaxis(share * counts[..., None], -1, 0)
+        change = project_flux(change, counts, np.asarray(self.plan.exposures.flux_known), shared)
+        return of_low_rank(np.moveaxis(change, 0, -1))
 
     @cached_property
     def _moon(self) -> tuple[np.ndarray, Vector, Vector]:

@@ -14,8 +14,16 @@ from jaxtyping import Array, Bool, Float, Int
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
+from walop_jax.likelihood.flux import Sharing
 from walop_jax.likelihood.inverses import determined
-from walop_jax.likelihood.layout import Layout, MeasuredPoints, PointReader, curves_of, planned_instrument
+from walop_jax.likelihood.layout import (
+    Layout,
+    MeasuredPoints,
+    PointReader,
+    curves_of,
+    fields_of_stars,
+    planned_instrument,
+)
 from walop_jax.likelihood.optics import directions
 from walop_jax.likelihood.runner import Runner
 from walop_jax.model.effects.base import Effect
@@ -200,7 +208,7 @@ class Likelihood:
             interpolate=interpolate,
             sets=sets,
         )
-        reader = PointReader(calset, layout.plan, layout.mirrored, model.template.cameras.floor)
+        reader = PointReader(calset, layout.plan, model.template, layout.mirrored)
         return cls(layout, MeasuredPoints(reader, layout), runner, model)
 
     def following(self, values: Vector) -> Likelihood:
@@ -243,6 +251,12 @@ class Likelihood:
         groups = self.plan.exposures.shared
         size = np.ones(len(self.flux_known)) if groups is None else np.asarray(groups @ groups.sum(axis=0))
         return self.cameras - np.where(self.flux_known, 0.0, self.model.template.cameras.fluxes / size)
+
+    @cached_property
+    def sharing(self) -> Sharing:
+        """Fluxes in common to cameras and exposures, and q, u in common to the exposures of a star, point by point."""
+        stars = self.points.gathered("stars") if len(fields_of_stars(self.calset.sources)) else None
+        return engine.sharing(self.model.template, self.plan)._replace(stars=stars)
 
     @cached_property
     def priors(self) -> PriorRows:

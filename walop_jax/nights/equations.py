@@ -137,6 +137,8 @@ def of_exposures(calset: CalibrationSet, keep: Bool[np.ndarray, " e"]) -> Calibr
     some = {
         name: getattr(whole, name)[rows] for name in ("point", "source", "counts", "sigma", "flag", "used")
     }
+    if whole.sky is not None:
+        some["sky"] = whole.sky[rows]
     table = TableIntensities(int(keep.sum()), whole.points, exposure=place[whole.exposure[rows]], **some)
     return dataclasses.replace(calset, exposures=calset.exposures[keep], intensities=table)
 

@@ -84,8 +84,8 @@ class Offsets:
             return dict(zip(("rms_q", "rms_u", "max_q", "max_u"), (100 * sizes).tolist(), strict=True))
 
         def explained(values: Float[np.ndarray, "p 2"]) -> dict[str, float]:
-            left = np.sum((self.found - values) ** 2, axis=0) / np.sum(self.found**2, axis=0)
-            return {"q": 1.0 - float(left[0]), "u": 1.0 - float(left[1])}
+            unexplained = np.sum((self.found - values) ** 2, axis=0) / np.sum(self.found**2, axis=0)
+            return {"q": 1.0 - float(unexplained[0]), "u": 1.0 - float(unexplained[1])}
 
         return {
             "found": size(self.found),
@@ -162,7 +162,7 @@ class Comparison(Displayed):
 
     def document(self) -> dict[str, Any]:
         """Everything as numbers in per cent; errors are rms over the stars, statistics over the field."""
-        spread, most = 100.0 * self.paper.spread, 100.0 * np.abs(self.paper.delta).max(axis=0)
+        spread, largest = 100.0 * self.paper.spread, 100.0 * np.abs(self.paper.delta).max(axis=0)
         return {
             "filter": self.filter,
             "teff": self.teff,
@@ -174,7 +174,7 @@ class Comparison(Displayed):
                 "sigma_q": _summary(spread[:, 0]),
                 "sigma_u": _summary(spread[:, 1]),
                 "share_sigma_u_below_goal": float(np.mean(spread[:, 1] < 100.0 * GOAL)),
-                "delta_max": dict(zip("qu", most.tolist(), strict=True)),
+                "delta_max": dict(zip("qu", largest.tolist(), strict=True)),
             },
             "on_grid": self.grid.document(),
             "between": self.between.document(),
@@ -213,7 +213,7 @@ class Comparison(Displayed):
         )
 
     def columns(self) -> dict[str, tuple[np.ndarray, str]]:
-        """One row per point, the grid first: position, errors of both methods, what the paper gives."""
+        """One row per point, the grid first: position, errors of both methods, the values of the paper."""
         places = (self.grid, self.between)
         count = len(self.between.x)
         on_grid = np.arange(len(self.grid.x) + count) < len(self.grid.x)
@@ -286,8 +286,8 @@ def compare(
         true = truth_vectors(vectors(x, y), truth.matrix)
     on_grid = vectors(paper.x, paper.y)
     block = calset.intensities.block(0, len(calset.points))
-    whole = block.used[:, exposures].all(axis=1)
-    measured = measured_qu(block.counts[whole][:, exposures])
+    complete = block.used[:, exposures].all(axis=1)
+    measured = measured_qu(block.counts[complete][:, exposures])
     states = polariser_states(calset.exposures.clp_angle[exposures])
     curve = calibration.filter_curve(filter_name)
     lit = curve.wavelength[curve.throughput > 0.05 * curve.throughput.max()]
@@ -329,7 +329,7 @@ def _moon(
         }
     except (DataError, ValueError) as error:
         return document | {"scheme": None, "why_not": str(error)}
-    seen = measured_qu(transmitted(reference, stars))
+    measured = measured_qu(transmitted(reference, stars))
     outside = np.abs(determinant(reference)) >= SMALLEST_DETERMINANT
-    found = {name: star_errors(scheme.recover(seen), stars) for name, scheme in schemes.items()}
-    return document | {"scheme_outside_zone": {name: statistics(v, outside) for name, v in found.items()}}
+    errors = {name: star_errors(scheme.recover(measured), stars) for name, scheme in schemes.items()}
+    return document | {"scheme_outside_zone": {name: statistics(v, outside) for name, v in errors.items()}}

@@ -5,7 +5,7 @@
 
 Step 1      Unweighted least squares on the states behind the calibration polariser, point by point.
 Step 2      A transmission model T_k = s₁ + s₂ q + s₃ u (+ s₄ q² + s₅ u²) per camera predicts 100 stars with
-            p ≤ 5 %; the mean differences Δq, Δu between what the polynomial makes of them and what they are
+            p ≤ 5 %; the mean differences Δq, Δu between the result of the polynomial and the truth
             are taken off; μ and σ of what remains characterise the point.
 
 The squares of T_k: light is linear, so s₄ = s₅ = 0; behind a polariser q² + u² is constant and they cannot be told
@@ -16,7 +16,7 @@ Full Moon   The field is divided into 5 × 5 boxes. In each, standard stars at t
             whole box; the patches, with their polarisation so known, give Δq, Δu of every other point of the box.
 Checks      A patch need not be what single Rayleigh scattering says (neutral points, aerosol, cloud). Seen with the
             joint model, (q, u) of exposure m at point i is compared with s_m R_mi + c_m, R the Rayleigh sky for δ = 1:
-              flat       χ² of what is left per degree of freedom: structure that no smooth sky has;
+              flat       χ² of the residuals per degree of freedom: structure that no smooth sky has;
               Rayleigh   departure D_m of the patch's mean from δ R, δ the median of all patches' s_m.
             Weight of a patch: 1 / (1 + (D/D₀)²) / max(1, χ²/dof), D₀ = 0.05 %.
 """
@@ -87,7 +87,7 @@ class PaperCalibration:
         return polynomial(self.coefficients, measured) - self.delta[:, None]
 
     def between(self, x: Float[np.ndarray, " m"], y: Float[np.ndarray, " m"]) -> PaperCalibration:
-        """Coefficients and Δ interpolated bilinearly to other positions: what the paper says cannot be done.
+        """Coefficients and Δ interpolated bilinearly to other positions, which the paper excludes.
 
         Raises ValueError where the points are no regular grid.
         """
@@ -129,14 +129,14 @@ def fit_paper(
     """
     rows = polariser_exposures(calset, filter_name)
     block = calset.intensities.block(0, len(calset.points))
-    whole = np.flatnonzero(block.used[:, rows].all(axis=1))
-    if whole.size == 0:
+    complete = np.flatnonzero(block.used[:, rows].all(axis=1))
+    if complete.size == 0:
         raise DataError("INTENSITIES: no point has been measured at all polariser angles")
-    counts = block.counts[whole][:, rows]
+    counts = block.counts[complete][:, rows]
     states = polariser_states(calset.exposures.clp_angle[rows])
     coefficients, condition = fit_polynomials(measured_qu(counts), states)
     transmission = fit_transmissions(counts, states)
-    return with_test_stars(block.x[whole], block.y[whole], coefficients, condition, transmission, stars)
+    return with_test_stars(block.x[complete], block.y[complete], coefficients, condition, transmission, stars)
 
 
 def with_test_stars(
@@ -184,9 +184,9 @@ def fit_transmissions(counts: Float[np.ndarray, "p e 4"], states: QuPairs) -> Fl
     flux = counts.sum(axis=2)
     vectors = np.zeros((len(counts), 4, 3))
     for _ in range(_ROUNDS):
-        left = np.einsum("pek,pe,ei,ej->pkij", weight, flux**2, s, s, optimize=True)
+        normal = np.einsum("pek,pe,ei,ej->pkij", weight, flux**2, s, s, optimize=True)
         right = np.einsum("pek,pe,pek,ei->pki", weight, flux, counts, s, optimize=True)
-        vectors = np.linalg.solve(left, right[..., None])[..., 0]
+        vectors = np.linalg.solve(normal, right[..., None])[..., 0]
         vectors /= vectors[..., 0].mean(axis=1)[:, None, None]
         model = np.einsum("pki,ei->pek", vectors, s)
         flux = np.sum(weight * model * counts, axis=2) / np.sum(weight * model**2, axis=2)
@@ -252,13 +252,18 @@ def judge_patches(calset: CalibrationSet, calibration: Calibration) -> Patches:
     settings = analysis.reduced(Settings.of(e, analysis.instrument.patched().moving()))
     rows = []
     for k, m in enumerate(moon):
-        there = np.flatnonzero(block.used[:, m])
+        measured = np.flatnonzero(block.used[:, m])
         vectors = analysis.coloured(
-            settings[m : m + 1], block.x[there], block.y[there], np.full(len(there), float(e.teff[m]))
+            settings[m : m + 1],
+            block.x[measured],
+            block.y[measured],
+            np.full(len(measured), float(e.teff[m])),
         )
-        found = estimate(vectors, block.counts[there, m], block.sigma[there, m], np.arange(len(there)))
-        rows.append(_smooth_fit(found.qu, found.photon, sky[there, k]))
-    scale, offset, flatness, mean = (np.array(part) for part in zip(*rows, strict=True))
+        estimates = estimate(
+            vectors, block.counts[measured, m], block.sigma[measured, m], np.arange(len(measured))
+        )
+        rows.append(_smooth_fit(estimates.qu, estimates.photon, sky[measured, k]))
+    scale, offset, flatness, mean = (np.array(column) for column in zip(*rows, strict=True))
     depolarisation = float(np.median(scale))
     # Mean over the patch of (q, u) − δ R = (s − δ) <R> + c.
     departure = np.hypot(*((scale - depolarisation)[:, None] * mean + offset).T)
@@ -277,18 +282,18 @@ def _smooth_fit(
     good = np.isfinite(qu).all(axis=1)
     qu, covariance, sky = qu[good], covariance[good], sky[good]
     white = np.linalg.cholesky(np.linalg.inv(covariance)).swapaxes(1, 2)
-    one = np.broadcast_to(np.eye(2), (len(qu), 2, 2))
-    design = (white @ np.concatenate([sky[..., None], one], axis=2)).reshape(-1, 3)
+    weights = np.broadcast_to(np.eye(2), (len(qu), 2, 2))
+    design = (white @ np.concatenate([sky[..., None], weights], axis=2)).reshape(-1, 3)
     data = (white @ qu[..., None]).reshape(-1)
     along = (white @ sky[..., None]).reshape(-1)
     only = float(along @ data / (along @ along))
     pull = np.array([[1.0, 0.0, 0.0]])
     solution = np.linalg.lstsq(np.concatenate([design, pull]), np.append(data, only), rcond=None)[0]
-    left = data - design @ solution
+    residual = data - design @ solution
     return (
         only,
         solution[1:] + (solution[0] - only) * sky.mean(axis=0),
-        float(left @ left / max(len(left) - 3, 1)),
+        float(residual @ residual / max(len(residual) - 3, 1)),
         sky.mean(axis=0),
     )
 
@@ -340,12 +345,12 @@ def full_moon_scheme(
     # Standards: Δ at the centres, where the polynomials are interpolated.
     local = paper.between(centre_x, centre_y).coefficients
     true = _catalogue(calset, block, standard)
-    found = polynomial(local, measured_qu(block.counts[middle][:, standard]))
-    known = block.used[middle][:, standard]
-    delta_centre = _mean(found - true[middle], known[..., None], axis=1)
+    corrected = polynomial(local, measured_qu(block.counts[middle][:, standard]))
+    standard_used = block.used[middle][:, standard]
+    delta_centre = _mean(corrected - true[middle], standard_used[..., None], axis=1)
 
     # Moon: the patch is measured where the polynomials are closest to a centre, and is the same in all the box.
-    seen = polynomial(paper.coefficients, measured_qu(block.counts[grid][:, moon]))
+    moon_qu = polynomial(paper.coefficients, measured_qu(block.counts[grid][:, moon]))
     box = box_number(paper.x, paper.y)
     delta = np.empty_like(paper.delta)
     for b in range(BOXES_ALONG * BOXES_ALONG):
@@ -354,8 +359,8 @@ def full_moon_scheme(
             continue
         away = np.hypot(paper.x[inside] - centre_x[b], paper.y[inside] - centre_y[b])
         near = inside[away <= away.min() + 0.25 * BOX_WIDTH]
-        patch = seen[near].mean(axis=0) - delta_centre[b]
-        delta[inside] = np.average(seen[inside] - patch, axis=1, weights=weight)
+        patch = moon_qu[near].mean(axis=0) - delta_centre[b]
+        delta[inside] = np.average(moon_qu[inside] - patch, axis=1, weights=weight)
     return dataclasses.replace(paper, delta=delta)
 
 

@@ -67,8 +67,8 @@ def colour_spread(
     angle = np.arange(ANGLES) * np.pi / ANGLES
     stars = DEGREE * np.stack([np.cos(2 * angle), np.sin(2 * angle)], axis=1)
     vectors = AnalysisVectors(calibration).exact(Settings.default(1, filter_name), x, y, temperatures)
-    seen = np.stack([measured_qu(transmitted(vectors[:, k], stars)) for k in range(len(temperatures))])
-    return np.ptp(seen, axis=0).max(axis=1)
+    measured = np.stack([measured_qu(transmitted(vectors[:, k], stars)) for k in range(len(temperatures))])
+    return np.ptp(measured, axis=0).max(axis=1)
 
 
 def spread_document(spread: Float[np.ndarray, "p 2"]) -> dict[str, Any]:
@@ -102,7 +102,7 @@ def _plates(
     _, ray = fold.stations((*train.leading, *train.banded), ray)
     arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
     stations = [station for arm in arms for station in arm if isinstance(station[0], WavePlate)]
-    return jnp.stack([jnp.asarray(element.mueller(there)) for element, there in stations])
+    return jnp.stack([jnp.asarray(element.mueller(ray_at)) for element, ray_at in stations])
 
 
 _all_plates = compiled(jax.vmap(_plates, in_axes=(None, None, 0, 0)))
@@ -129,12 +129,12 @@ def plate_retardances(
 ) -> Float[np.ndarray, "w p l"]:
     """Retardance (deg, modulo 360) about the first optic axis of every plate of `plate_names` at wavelengths (µm,
     ascending) and field positions."""
-    there = instrument.patched()
-    plan = _monochromatic(there, wavelength)
-    mueller = np.asarray(_all_plates(there, plan, jnp.asarray(x), jnp.asarray(y)))
-    plates = [e for arm in there.arms for e in arm.train() if isinstance(e, WavePlate)]
-    found = []
+    patched = instrument.patched()
+    plan = _monochromatic(patched, wavelength)
+    mueller = np.asarray(_all_plates(patched, plan, jnp.asarray(x), jnp.asarray(y)))
+    plates = [e for arm in patched.arms for e in arm.train() if isinstance(e, WavePlate)]
+    retardances = []
     for k, plate in enumerate(plates):
         angle = 2.0 * np.deg2rad(float(plate.axis) + float(plate.layers[0].axis))
-        found.append(retardance(mueller[:, k], np.array([np.cos(angle), np.sin(angle)])))
-    return np.stack(found)
+        retardances.append(retardance(mueller[:, k], np.array([np.cos(angle), np.sin(angle)])))
+    return np.stack(retardances)

@@ -1,4 +1,4 @@
-"""Possible observations and their costs: filters, plates, exposure times, what is up, the time beside exposing.
+"""Possible observations and their costs: filters, plates, exposure times, visibility, overheads.
 
 Their file (docs: files) is that of an observing plan, of which the polariser angles are ignored, with a few entries
 more.
@@ -14,26 +14,20 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from walop_jax.data.kinds import CALIBRATION_PLATE
+from walop_jax.data.records import Exposures
 from walop_jax.io.errors import errors_naming
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.parameters import check_names
 from walop_jax.simulation.observing_plan import EXPOSED, OUT, ObservingPlan, Stop, is_plan, plan_of
+from walop_jax.sky.directions import separation
 from walop_jax.sky.moon import altitude, body_direction
 
-Direction = Float[np.ndarray, "2 *e"] | tuple[Any, Any]
 DARK = -12.0  # altitude of the Sun (deg) below which the sky is dark enough for Moon and stars
 _FULL = 120.0  # distance of Moon and Sun (deg) from which the Moon is as good as full
 _SEARCHED, _STEP = 60.0, 1.0 / 24.0  # days in which a better time is looked for, and its steps
-
-
-def separation(one: Direction, other: Direction) -> Float[np.ndarray, "*e"]:
-    """Angle (deg) between directions: right ascension and declination (deg)."""
-    (a, d), (b, e) = np.deg2rad(one), np.deg2rad(other)
-    cosine = np.sin(d) * np.sin(e) + np.cos(d) * np.cos(e) * np.cos(a - b)
-    return np.asarray(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +62,7 @@ class CandidateExposure(NamedTuple):
 
     Angles of the polariser repeat themselves after `turn` (deg): half a turn, or a whole one where it is not ideal. The
     place of an exposure is the phase (rad) of its angle θ in that turn; where the plate is free, that of the direction
-    2α − θ in which light is polarised behind the plate at α, with which what is seen changes quickly, and that of α.
+    2α − θ in which light is polarised behind the plate at α, with which counts change quickly, and that of α.
     """
 
     kind: str
@@ -165,7 +159,7 @@ class Available:
 
     @classmethod
     def read(cls, content: Mapping[str, Any], folder: Path) -> Available:
-        """From the entries of a file; raises ValueError for what is not known or not allowed."""
+        """From the entries of a file; raises ValueError for unknown or impossible ones."""
         content, options = dict(content), {}
         for name in ("altitude", "places"):
             if name in content:
@@ -181,7 +175,7 @@ class Available:
         return cls(plan_of(content, folder), Costs(**costs), seconds, **options)
 
     def choices(self) -> tuple[tuple[CandidateExposure, ...], tuple[str, ...]]:
-        """All choices, and in words what had to be left out, with what would do."""
+        """All choices, and remarks on those left out, with a remedy."""
         plan, notes = self.plan, []
         up: dict[str, tuple[int, ...]] = {}
         for kind, total in (("moon", plan.moon_patches), ("standard", len(plan.star_names))):
@@ -197,11 +191,8 @@ class Available:
                     blank = Stop(
                         0.0 if kind == "clp" else None, name, stops[0], moving, kind=kind, seconds=seconds
                     )
-                    members = (
-                        (blank,)
-                        if kind == "clp" or (kind == "lamp" and plan.lamps)
-                        else tuple(self._members(blank, up.get(kind, ())))
-                    )
+                    indoors = kind == "clp" or (kind == "lamp" and plan.lamps)
+                    members = (blank,) if indoors else tuple(self._members(blank, up.get(kind, ())))
                     if members:
                         candidates.append(CandidateExposure(kind, name, where, seconds, members))
                     if kind == "clp" and self.any_plate and stops[0] == plan.plate[0]:
@@ -209,15 +200,13 @@ class Available:
         return tuple(candidates), tuple(notes)
 
     def _members(self, blank: Stop, numbers: tuple[int, ...]) -> Iterator[Stop]:
-        single = self.places and blank.kind == "standard"
         for number in numbers:
-            for place in (
-                range(self.plan.standard_grid**2) if single and number < self.plan.standards else (None,)
-            ):
+            single = self.places and blank.kind == "standard" and number < self.plan.standards
+            for place in range(self.plan.standard_grid**2) if single else (None,):
                 yield dataclasses.replace(blank, number=number, place=place)
 
     def _up(self, kind: str, total: int) -> tuple[tuple[int, ...], list[str]]:
-        """Numbers of what is up in the dark, and what to say of the rest."""
+        """Numbers of those that are up in the dark, and remarks on the others."""
         if not total:
             return (), []
         plan, what = self.plan, "Moon patches" if kind == "moon" else "standards"
@@ -229,13 +218,42 @@ class Available:
             patches=(),
             stars=(),
         ).exposures()
-        high = altitude(e.mjd, e.ra, e.dec, plan.site) >= self.altitude
-        dark = altitude(e.mjd, *body_direction("sun", e.mjd, plan.site), plan.site) < DARK
-        up = tuple(np.flatnonzero(high & dark).tolist())
-        if len(up) == total:
-            return up, []
-        why = "it is not dark" if not dark.all() else f"they are below {self.altitude:g}°"
-        return up, [f"{total - len(up)} of {total} {what} are left out: {why}{self._better()}"]
+        visible, why = self._visible(e)
+        if visible.all():
+            return tuple(range(total)), []
+        lost = total - int(visible.sum())
+        notes = [f"{lost} of {total} {what} are left out: {why}{self._better()}"]
+        return tuple(np.flatnonzero(visible).tolist()), notes
+
+    def _visible(self, exposures: Exposures) -> tuple[Bool[np.ndarray, " e"], str]:
+        """Exposures of the sky that are high enough, in the dark; and why others are not."""
+        mjd, site = exposures.mjd, self.plan.site
+        high = altitude(mjd, exposures.ra, exposures.dec, site) >= self.altitude
+        dark = altitude(mjd, *body_direction("sun", mjd, site), site) < DARK
+        return high & dark, "it is not dark" if not dark.all() else f"they are below {self.altitude:g}°"
+
+    def doubts(self, plan: ObservingPlan) -> tuple[str, ...]:
+        """Sentences on exposures of a plan that cannot be taken at the times that it gives them.
+
+        Visibility is checked at the begin of the night, before the order of the exposures is known.
+        """
+        exposures = plan.exposures()
+        exposures = exposures[exposures.direct("moon", "standard")]
+        if not len(exposures) or not plan.site.known:
+            return ()
+        visible, why = self._visible(exposures)
+        if visible.all():
+            return ()
+        lost = len(exposures) - int(visible.sum())
+        return (f"{lost} of {len(exposures)} exposures of the sky come too late in this order: {why}",)
+
+    def in_whole_seconds(self) -> Available:
+        """The same with exposure times of whole seconds, which schedules need."""
+        seconds = {
+            kind: tuple(dict.fromkeys(max(1.0, float(round(t))) for t in times))
+            for kind, times in self.seconds.items()
+        }
+        return dataclasses.replace(self, seconds=seconds)
 
     def _better(self) -> str:
         """The next time at which the Moon is full, high and the sky dark."""
@@ -243,5 +261,5 @@ class Available:
         site = self.plan.site
         moon, sun = body_direction("moon", mjd, site), body_direction("sun", mjd, site)
         high = altitude(mjd, *moon, site) >= self.altitude + self.plan.separations[1]
-        good = np.flatnonzero(high & (altitude(mjd, *sun, site) < DARK) & (separation(moon, sun) > _FULL))
+        good = np.flatnonzero(high & (altitude(mjd, *sun, site) < DARK) & (separation(*moon, *sun) > _FULL))
         return f"; mjd = {mjd[good[0]]:.2f} would do" if len(good) else "; choose another night (mjd)"

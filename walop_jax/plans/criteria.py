@@ -49,7 +49,7 @@ TARGET_GRID = 9  # field points along each axis at which the error of p is asked
 class Criterion:
     """Linear functions of the parameters, `targets` (draw, target, parameter, column), and what their variance says.
 
-    `unit` is that of the root of the largest variance, after `scale`; `what` says in words what it is. `inverse`: its
+    `unit` is that of the root of the largest variance, after `scale`; `what` describes it. `inverse`: its
     reciprocal is told, in standard deviations. `blocks` (pair, parameter, own) lead from the parameters of each pair to
     those of the candidates; targets are then one after the other for the pairs of each draw.
     """
@@ -109,7 +109,7 @@ def check_wishes(minutes: float, goal: float | None = None, draws: int = 1) -> N
         raise ValueError(f"{minutes:g} minutes: nothing can be observed in no time; give --minutes")
     if not minutes <= LONGEST:
         raise ValueError(
-            f"{minutes:g} minutes: a plan is one of a night, of {LONGEST:g} minutes at most; for what is longer plan "
+            f"{minutes:g} minutes: a plan is one of a night, of {LONGEST:g} minutes at most; for a longer time plan "
             "a night, and add to its calibration with --after RUN"
         )
     if goal is not None and not 0 < goal < np.inf:
@@ -197,7 +197,7 @@ def _of_stars(found: Candidates, table: InputTable) -> Criterion:
     teff = numeric_column(table, "TEFF", Column("float", "K", missing=np.nan))
     if np.any(np.hypot(q, u) == 0):
         raise ValueError(
-            f"{table.path}: a star with Q = U = 0 has no p; leave it out, or state what is expected of it"
+            f"{table.path}: a star with Q = U = 0 has no p; leave it out, or state its expected values"
         )
     targets_by_colour = []
     for colour in np.unique(teff):

@@ -5,7 +5,7 @@ Information  of an exposure e: J_eᵀ J_e, J_e the derivatives of its whitened r
 Polariser    Light is linear, so that counts and their derivatives are series of low degree in 2θ, and in 2α where the
              calibration plate may stand at any angle α: they are computed at `NODES` angles and known at all. The
              information, which divides by the variance of the counts, is a series of high degree in the direction
-             2α − θ behind the plate, of a lower one in α, cut at `ORDERS`; `Candidates.truncation` is what is lost.
+             2α − θ behind the plate, of a lower one in α, cut at `ORDERS`; `Candidates.truncation` is the loss.
 Draws        of the instrument as built, from the priors or around a calibration: the best plan depends on it.
 Limits       Detectors are linear. Exposures know of each other only by the parameters. Changes between exposures
              (slews, filters) cost time when the plan is put in order; the bound without them stays a bound.
@@ -16,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -27,7 +28,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.flux import Sharing, project_flux
-from walop_jax.likelihood.inverses import pseudo_inverse
+from walop_jax.likelihood.inverses import of_low_rank, pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
@@ -71,7 +72,7 @@ class Candidates:
     """Everything that could be observed, with the information that each exposure would bring.
 
     `families` go with `choices`, their information scaled to the field points of the plan. `values` (draw, parameter)
-    are all parameters of the instruments that were drawn, `prior` what is known of the free ones beforehand, `names`
+    are all parameters of the instruments that were drawn, `prior` the information on the free ones beforehand, `names`
     of these. `truncation` is the largest error of the information between the angles that were computed, in units of
     the mean diagonal of each parameter; `notes` say what had to be left out. `effects` are those that are to be told
     apart, parameters of the model as well, with whether their size is known.
@@ -141,6 +142,8 @@ def candidates(
     factor, flux, exptime = _factor(available.plan, few), fluxes(plan, None), plan.exposures().exptime
     noise, floor = PhotonNoise(plan.read_noise), model.template.cameras.floor
     shared = Sharing(model.template.cameras.together)
+    of_mean = {f"standard.{plan.star_names[-1]}.{axis}" for axis in "qu"} if plan.zero_stars else set()
+    means = [place for place, i in enumerate(model.free) if model.names[i] in of_mean]
     responses = []
     for number, draw in enumerate(values):
         tell(f"expected counts of instrument {number + 1} of {draws}")
@@ -153,8 +156,10 @@ def candidates(
         for rows in [slice(start, stop)] if polarised else [slice(i, i + 1) for i in range(start, stop)]:
             at = likelihood.used[:, rows.start]
             electrons = flux[at, rows.start] * choice.seconds / exptime[rows.start]
+            star = choice.kind == "standard"
+            scatter = plan.zero_scatter if star and choice.stops[0].number == plan.standards else 0.0
             light = Illumination(
-                electrons, noise, floor, shared, 1.0 if choice.kind == "standard" else factor
+                electrons, noise, floor, shared, 1.0 if star else factor, dict.fromkeys(means, scatter)
             )
             counts = tuple((unit[at, rows], slopes[at, rows]) for unit, slopes in responses)
             if polarised:
@@ -286,7 +291,8 @@ class Illumination(NamedTuple):
     """Light of an exposure: `flux` (electron) at its points, noise, what shares a flux.
 
     No error is smaller than `floor`, a share of the mean counts of all cameras, as in a fit (`Cameras.floor`). `scale`
-    leads from these points to those of the plan.
+    leads from these points to those of the plan. `scatter` is the rms of single stars around a parameter, by its place;
+    each exposure counts as one of other stars.
     """
 
     flux: Float[np.ndarray, " p"]
@@ -294,6 +300,7 @@ class Illumination(NamedTuple):
     floor: float
     shared: Sharing
     scale: float
+    scatter: Mapping[int, float] = MappingProxyType({})
 
     def sigma(self, counts: Float[np.ndarray, "p a b"], cameras: int) -> Float[np.ndarray, "p a b"]:
         """Standard errors of counts; `cameras` is the axis of these."""
@@ -307,6 +314,10 @@ class Illumination(NamedTuple):
         weight = 1.0 / self.sigma(flux * unit, 2)
         columns = np.moveaxis(slopes * (flux * weight)[..., None], -1, 0)
         projected = project_flux(columns, unit * weight, False, self.shared)
+        if any(self.scatter.values()):
+            stars = np.stack([size * projected[place] for place, size in self.scatter.items()], axis=-1)
+            alone = Sharing(stars=of_low_rank(stars[:, :, None]))
+            projected = alone.independent(projected[..., None, :])[..., 0, :]
         flat = projected.transpose(2, 0, 1, 3).reshape(unit.shape[1], len(projected), -1)
         return self.scale * flat @ flat.swapaxes(1, 2)
 

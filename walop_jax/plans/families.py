@@ -113,7 +113,7 @@ def highest(values: Float[np.ndarray, ...], most: int) -> tuple[Float[np.ndarray
     Limit: the series p, of degrees H, and its second derivatives p_ij, series as well, are bounded on a finer grid.
     Somewhere on N > 2H points of each angle |p| is at least max |p| Π cos(πH/N) (Ehlich & Zeller 1964, Math. Z. 86,
     41). Where p is largest its gradient vanishes, and the nearest point of the grid is no further than δ = π/N in each
-    angle: there p is at least max p − ½ Σ δ_i δ_j max |p_ij| (Taylor). What is no series of these degrees is taken to
+    angle: there p is at least max p − ½ Σ δ_i δ_j max |p_ij| (Taylor). Other functions are taken to
     hold no more beyond them than the last harmonics do.
     """
     orders = [count // 2 for count in values.shape]

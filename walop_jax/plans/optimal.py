@@ -1,12 +1,12 @@
 """Optimal experiments from information matrices, with a proof of how far a plan is from the best there is.
 
-Nothing here knows what is measured. A candidate i has the Fisher information M_i (n × n) and the cost c_i; a plan gives
-it the weight w_i ≥ 0, how often it is done. With what is known already, M₀, a plan leaves
+Nothing here depends on the kind of measurement. A candidate i has the Fisher information M_i (n × n) and the cost
+c_i; a plan gives it the weight w_i ≥ 0, how often it is done. With the prior information M₀ a plan leaves
 
     M(w) = M₀ + Σ_i w_i M_i,      Σ_i c_i w_i ≤ B,
 
 and the variance of target k, some linear functions A_k (n × q) of the parameters, is φ_k(w) = tr A_kᵀ M(w)⁻¹ A_k. The
-criterion is the largest of them, averaged over draws r of what the instrument may be,
+criterion is the largest of them, averaged over draws r of the instrument,
 
     f(w) = mean_r max_k φ_rk(w),
 
@@ -49,7 +49,7 @@ from walop_jax.plans.families import Family
 GAP = 0.01  # proven distance from the optimum at which the search ends
 _ROUNDS = 60  # of column generation
 _NEWTON = 80  # steps for one set of candidates
-_SHARPER = 8.0  # by what the barrier falls between two Newton solutions
+_SHARPER = 8.0  # factor by which the barrier falls between two Newton solutions
 _LEAST_WEIGHT = 1e-5  # share of the budget below which a candidate leaves
 _UNSEEN = 1e-13  # eigenvalue, of the scaled information of everything, below which a direction is not seen
 _MAIN = 1e-5  # of the largest eigenvalue: curvature below it is left out of a step
@@ -64,18 +64,18 @@ _TRIED = 60  # exchanges, most promising first, of which the first that lowers t
 _SHARPNESS = 20  # power of the variances by which targets share the slope of an exchange
 _BUDGETS = 8  # tried until a criterion is met
 _ENDLESS = 1e6  # times the budget: no plan reaches the criterion
-_SMALL = 1e-3  # of the budget: what is known reaches the criterion already
+_SMALL = 1e-3  # of the budget: the prior reaches the criterion already
 _TOPS = 8  # candidates of each family that may join in a round
 _PATIENCE = 4  # rounds without a better bound or value after which the search ends
 
 
 class NotEstimableError(ValueError):
-    """A target depends on parameters that neither the candidates nor what is known inform about."""
+    """A target depends on parameters that neither the candidates nor the prior inform about."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """Problem to be solved: what is wanted, what is known and what can be done.
+    """Problem to be solved: targets, prior information and candidates.
 
     `known` is M₀ (draw, n, n), `targets` A (draw, target, n, q), `families` the candidates, `budget` the cost that a
     plan may have; `together` draws in a row share their largest variance. Raises NotEstimableError, when solved, if a
@@ -120,7 +120,7 @@ class Experiment:
         to_seen = vector[:, informed] / size[:, None] / np.sqrt(value[informed])  # θ = to_seen · z
         lost = np.einsum("na,rknq->rkaq", vector[:, ~informed] / size[:, None], self.targets)
         visible = np.einsum("na,rknq->rkaq", to_seen, self.targets)
-        # A target is estimable if it has no part along what is not seen, beside its part along what is.
+        # A target is estimable if it has no part in the null space of the total information.
         lost_share = np.linalg.norm(lost, axis=(2, 3)) if lost.shape[2] else np.zeros(lost.shape[:2])
         if np.any(lost_share > 1e-6 * np.linalg.norm(visible, axis=(2, 3))):
             bad = np.unique(np.argwhere(lost_share > 1e-6 * np.linalg.norm(visible, axis=(2, 3)))[:, 1])
@@ -129,7 +129,8 @@ class Experiment:
             )
 
         families = tuple(family.turned(to_seen[None]) for family in self.families)
-        # What a few candidates leave open is known to next to nothing instead: no target needs it, or it is found bad.
+        # Directions that a few candidates leave open get next to no information: no target needs them, or it is found
+        # bad.
         prior = to_seen.T @ self.known @ to_seen + _NOTHING * np.eye(int(informed.sum()))
         return Experiment(prior, visible, families, self.budget, self.together)
 
@@ -495,7 +496,7 @@ def least_budget(experiment: Experiment, value: float, *, gap: float = GAP) -> t
     for _ in range(_BUDGETS - 1):
         if abs(plan.value / value - 1.0) <= 0.5 * gap or budget <= _SMALL * experiment.budget:
             break
-        # What is known already bends the law 1 / budget: the bound says where it meets the value.
+        # Prior information bends the law 1 / budget: the bound says where it meets the value.
         budget = max(plan.proof.budget(value) * plan.value / plan.bound, _SMALL * experiment.budget)
         if budget > _ENDLESS * experiment.budget:
             raise NotEstimableError(f"the criterion does not fall below {plan.bound:.3g}, whatever is spent")
@@ -507,7 +508,7 @@ def least_budget(experiment: Experiment, value: float, *, gap: float = GAP) -> t
 def rounded(experiment: Experiment, plan: Allocation) -> Allocation:
     """A plan of whole numbers within the budget, and its proven distance from the best plan of any weights.
 
-    Weights are rounded down, what is left of the budget goes where it lowers the criterion most for its cost, then
+    Weights are rounded down, the remaining budget goes where it lowers the criterion most for its cost, then
     single candidates are exchanged while that lowers it further. Raises ValueError for a budget that pays for nothing,
     and NotEstimableError for one that does not pay for all that the targets need.
     """
@@ -546,7 +547,7 @@ def worth(
 def _filled(
     some: _Some, count: Float[np.ndarray, " s"], weight: Float[np.ndarray, " s"]
 ) -> Float[np.ndarray, " s"]:
-    """Spend what is left of the budget, one candidate at a time."""
+    """Spend the remaining budget, one candidate at a time."""
     while True:
         remaining = some.experiment.budget - some.costs @ count
         can = np.flatnonzero(some.costs <= remaining * (1 + 1e-9))
@@ -560,24 +561,24 @@ def _filled(
         count = count + (np.arange(len(count)) == can[int(np.argmax(gain))])
 
 
-def _exchanged(some: _Some, count: Float[np.ndarray, " s"]) -> tuple[_Some, Float[np.ndarray, " _"], bool]:
+def _exchanged(support: _Some, count: Float[np.ndarray, " s"]) -> tuple[_Some, Float[np.ndarray, " _"], bool]:
     """One exchange that lowers the criterion, if there is one: the most promising by their slopes are tried."""
-    problem, value = some.experiment, some.value(count)
-    covariance = some.covariance(count)
-    phi = some.variances(covariance)
+    problem, value = support.experiment, support.value(count)
+    covariance = support.covariance(count)
+    phi = support.variances(covariance)
     # The worst targets, smoothly: the slope of the maximum alone would forget the next one.
     shares = problem.of_one(problem.relative(phi) ** _SHARPNESS)
     promising = lower_bound(problem, covariance, shares).tops
-    new = [top for top in promising if not any(_same(top, candidate) for candidate in some.chosen)]
+    new = [top for top in promising if not any(_same(top, candidate) for candidate in support.chosen)]
     used = np.flatnonzero(count)
-    some = _Some(problem, [*(some.chosen[i] for i in used), *new])
+    support = _Some(problem, [*(support.chosen[i] for i in used), *new])
     count = np.concatenate([count[used], np.zeros(len(new))])
-    y = covariance @ some.wide
-    slope = np.einsum("rsk,rk->s", some.gains(y), shares)
-    worst = some.worst(phi)
-    remaining = problem.budget - some.costs @ count
+    y = covariance @ support.wide
+    slope = np.einsum("rsk,rk->s", support.gains(y), shares)
+    worst = support.worst(phi)
+    remaining = problem.budget - support.costs @ count
     out, into = np.meshgrid(np.arange(len(used)), np.arange(len(count)), indexing="ij")
-    fits = (some.costs[into] - some.costs[out] <= remaining * (1 + 1e-9)) & (out != into)
+    fits = (support.costs[into] - support.costs[out] <= remaining * (1 + 1e-9)) & (out != into)
     promise = np.where(fits, slope[into] - slope[out], -np.inf)
     for flat in np.argsort(-promise, axis=None)[:_TRIED]:
         i, j = np.unravel_index(flat, promise.shape)
@@ -587,6 +588,6 @@ def _exchanged(some: _Some, count: Float[np.ndarray, " s"]) -> tuple[_Some, Floa
         changed[i] -= 1
         changed[j] += 1
         least = value * (1 - 1e-9)
-        if worst.value(changed) < least and some.value(changed) < least:
-            return some, changed, True
-    return some, count, False
+        if worst.value(changed) < least and support.value(changed) < least:
+            return support, changed, True
+    return support, count, False

@@ -1,4 +1,4 @@
-"""A plan of calibration exposures: which, how often, in what order, what it achieves, how far from the best it is.
+"""A plan of calibration exposures: which, how often, in which order; its accuracy and its distance from the best.
 
 Here the best weights (`optimal`) of candidates (`exposures`) for a criterion (`criteria`) become whole exposures in an
 order with few changes, with the gain of each and the price of leaving it out.
@@ -27,7 +27,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind
-from walop_jax.plans.available import Available, separation
+from walop_jax.plans.available import Available
 from walop_jax.plans.criteria import (
     APART,
     NAMED,
@@ -50,8 +50,9 @@ from walop_jax.plans.optimal import (
     worth,
 )
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.sky.directions import separation
 
-_NOTHING = 1e-6  # of what is known: less of it makes no plan
+_NOTHING = 1e-6  # of the prior information: less of it makes no plan
 _ALIKE = 3.0  # deg: angles of the plate that are taken as one
 _TRIES = 6  # budgets, until the exposures and the changes between them fit into the time
 
@@ -77,7 +78,7 @@ class Line(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class PlannedExposure:
-    """One line of a plan: what is set, how often it is exposed, the time (s) of all of it, and what it is worth.
+    """One line of a plan: settings, number of exposures, the time (s) of all of them, and their gain.
 
     `number` is that of the Moon patch or star, −1 through the polariser; `place` that of a star in its raster (None:
     all). `exptime` (s) is of one exposure, `change` (s) the time until the first can begin. `left_out` is the factor by
@@ -102,7 +103,7 @@ class PlannedExposure:
 class ExposurePlan(Displayed):
     """The exposures of a budget, the proof, and the error of p over the field before and after.
 
-    `value` is the criterion of the exposures, `bound` what no plan of the same time can undercut, both as `criteria`
+    `value` is the criterion of the exposures, `bound` the least value of any plan of the same time, both as `criteria`
     reports them (% for errors of p). `needed` are the minutes in which the best plan reaches `goal`, and those in which
     none can.
     `before` and `after` (draw, point) are errors of p (fraction) at `x`, `y` (deg), NaN where one exposure holds no u.
@@ -163,9 +164,7 @@ class ExposurePlan(Displayed):
             "any_plate": self.any_plate,
             "truncation": self.truncation,
             "goal": self.goal,
-            "minutes_to_goal": None
-            if self.needed is None
-            else dict(zip(("best", "least"), self.needed, strict=True)),
+            "minutes_to_goal": self.needed and dict(zip(("best", "least"), self.needed, strict=True)),
             "draws": len(self.after),
             "share_below_goal": self.share,
             "beside": dict(self.beside),
@@ -196,8 +195,8 @@ class ExposurePlan(Displayed):
                 100.0 * np.median(errors[:, measurable]) for errors in (self.before, self.after)
             )
             facts["over the field"] = (
-                f"error of p {middle:.3g} % in the median ({without:.3g} % without them), below 0.1 % in "
-                f"{100 * self.share:.0f} % of the field where one exposure measures u"
+                f"error of p {middle:.3g} % (median over the field; {without:.3g} % without them), below 0.1 % "
+                f"in {100 * self.share:.0f} % of the field where one exposure measures u"
             )
         if self.needed is not None:
             facts[f"{digits(self.goal, '.3g')}{unit} takes"] = (
@@ -207,7 +206,7 @@ class ExposurePlan(Displayed):
         variance_of_plan = self.criterion.variance(self.value)
         for name, other_value in self.beside.items():
             factor = self.criterion.variance(other_value) / variance_of_plan
-            variance = "the same variance" if f"{factor:.2g}" == "1" else f"{factor:.2g} times the variance"
+            variance = "equally good" if f"{factor:.2g}" == "1" else f"{factor:.2g} times the variance"
             facts[name] = f"{digits(other_value, '.3g')}{unit}; {variance}"
         rows = tuple(
             (
@@ -226,7 +225,7 @@ class ExposurePlan(Displayed):
         return Display(
             title=f"Plan of {sum(line.times for line in self.lines)} exposures for {self.observing_plan.name}",
             facts=tuple(facts.items()),
-            head=("KIND", "FILTER", "POSITIONS", ">POLARISER", ">EXPOSURES", ">TIME / s", ">WITHOUT IT"),
+            head=("KIND", "FILTER", "POSITIONS", ">POLARISER", ">EXPOSURES", ">TIME / s", ">LOSS IF OMITTED"),
             rows=rows,
             notes=self.notes,
         )
@@ -256,7 +255,7 @@ def plan_exposures(
     is found. `apart` are effects that are to be told apart (`criteria.APART`), each with its value or by name alone, of
     the `catalogue`; their goal is `NAMED` unless another is given. Raises ValueError as `check_wishes` and for a time
     that pays for nothing, NotEstimableError where nothing that could be observed, or too little in that time,
-    determines what is asked.
+    determines the criterion.
     """
     check_wishes(minutes, goal, draws)
     if apart:
@@ -272,9 +271,9 @@ def plan_exposures(
     )
     if progress is not None:
         progress("criterion")
-    field = None if apart or len(choices.model.template.cameras.pairs) != 2 else field_errors(choices)
-    if field is None and criterion in ("worst", "mean"):
-        field = field_errors(choices)  # raises, with advice
+    two_arms = len(choices.model.template.cameras.pairs) == 2
+    over_field = criterion in ("worst", "mean")  # raises, with advice, for other numbers of arms
+    field = field_errors(choices) if over_field or (two_arms and not apart) else None
     return plan_from(
         choices, minutes, criterion_by_name(choices, field, criterion), field,
         known=None if known is None else information_of(known, choices.names, choices.effects),
@@ -293,7 +292,7 @@ def plan_from(
     gap: float = GAP,
     progress: Callable[[str], None] | None = None,
 ) -> ExposurePlan:
-    """As `plan_exposures`, from candidates that are there; `known` is the information of what was measured before."""
+    """As `plan_exposures`, from candidates that are there; `known` is the information of earlier measurements."""
     tell = progress or (lambda text: None)
     check_wishes(minutes, goal)
     shortest = min(choice.seconds + found.available.costs.of(choice.kind) for choice in found.choices)
@@ -324,7 +323,7 @@ def plan_from(
             needed = (_cost(problem, cheapest.weights) / 60.0, least / 60.0)
         except NotEstimableError:
             reason = f"no time reaches {digits(goal, '.3g')} {criterion.unit}"
-            endless = (f"{criterion.what}: {reason}; add other settings to what could be observed",)
+            endless = (f"{criterion.what}: {reason}; add other settings to the candidates",)
     total = experiment.known + information_of_weights(experiment, best.weights)[0]
     plan = dataclasses.replace(
         chosen.available.plan,
@@ -332,7 +331,7 @@ def plan_from(
         patches=(),
         stars=(),
     )
-    # What was measured before shows what these need not.
+    # Earlier measurements may hold what these lack.
     unseen = () if known is not None else tuple(map(str, about_exposures(plan.exposures())))
     return ExposurePlan(
         minutes=minutes,
@@ -350,7 +349,7 @@ def plan_from(
         after=_errors(found, field, covariance(total)),
         beside=dict(_beside(found, problem, criterion)),
         observing_plan=plan,
-        notes=(*found.notes, *endless, *unseen),
+        notes=(*found.notes, *endless, *unseen, *chosen.available.doubts(plan)),
         any_plate=found.available.any_plate,
     )
 
@@ -362,7 +361,7 @@ Weights = Mapping[tuple[int, tuple[float, ...]], float]
 def experiment_of(
     found: Candidates, minutes: float, criterion: Criterion, prior: Float[np.ndarray, "f f"] | None = None
 ) -> Experiment:
-    """The problem of a budget in minutes; `known` is added to what is known beforehand."""
+    """The problem of a budget in minutes; `known` is added to the prior."""
     before = found.prior if prior is None else found.prior + prior
     families, pairs, budget = found.families, criterion.blocks, 60.0 * minutes
     if pairs is None:
@@ -493,7 +492,7 @@ def _ordered(found: Candidates, plan: Allocation) -> list[Line]:
     while sky:
         same = [line for line in sky if key(line) == key(sky[0])]
         last = done[-1] if done and done[-1] in where else same[0]
-        after = min(same, key=lambda line: float(separation(where[last], where[line])))
+        after = min(same, key=lambda line: float(separation(*where[last], *where[line])))
         done.append(after)
         sky.remove(after)
     return done
@@ -520,13 +519,13 @@ def _changes(found: Candidates, lines: list[Line]) -> Iterator[float]:
             time += costs.position * sum(choice.positions[p] != a for p, a in last.positions.items())
         if choice.kind in ("moon", "standard"):
             (pointing,) = _pointings(found, [line])
-            time += 0.0 if previous is None else costs.slew * float(separation(previous, pointing))
+            time += 0.0 if previous is None else costs.slew * float(separation(*previous, *pointing))
             previous = pointing
         last = choice
         yield time
 
 
-# -------------------------------------------------------------------------------------------------- what it is worth
+# -------------------------------------------------------------------------------------------------- gains
 
 
 def covariance(total: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r n n"]:
@@ -586,7 +585,7 @@ def usual_plans(found: Candidates) -> Iterator[tuple[str, dict[tuple[int, tuple[
 def information_of_weights(
     experiment: Experiment, weights: Weights
 ) -> tuple[Float[np.ndarray, "r n n"], float]:
-    """M of weights of (choice, place) without what is known, and their cost."""
+    """M of weights of (choice, place) without the prior, and their cost."""
     families = experiment.families
     total = sum(w * families[f].information(np.atleast_2d(p))[:, 0] for (f, p), w in weights.items())
     return np.asarray(total), _cost(experiment, weights)

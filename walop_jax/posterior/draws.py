@@ -54,14 +54,14 @@ def group_of_draws(draws: Mapping[str, Float[np.ndarray, "c d"]]) -> Dataset:
     return Dataset({name: (("chain", "draw"), values) for name, values in draws.items()}, coords=place)
 
 
-def digest(*parts: Any) -> str:
+def digest(*items: Any) -> str:
     """SHA-256 of arrays, texts and numbers."""
     total = hashlib.sha256()
-    for part in parts:
-        if isinstance(part, np.ndarray) and part.dtype.kind not in "OUS":
-            total.update(f"{part.dtype.str}{part.shape}".encode() + np.ascontiguousarray(part).tobytes())
+    for item in items:
+        if isinstance(item, np.ndarray) and item.dtype.kind not in "OUS":
+            total.update(f"{item.dtype.str}{item.shape}".encode() + np.ascontiguousarray(item).tobytes())
         else:
-            total.update(repr(part.tolist() if isinstance(part, np.ndarray) else part).encode() + b"\n")
+            total.update(repr(item.tolist() if isinstance(item, np.ndarray) else item).encode() + b"\n")
     return total.hexdigest()
 
 

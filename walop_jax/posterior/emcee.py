@@ -69,12 +69,12 @@ class Emcee(Sampler):
             count, dimension, density.log_density, vectorize=True, moves=mixture(self.moves)
         )
         random = tuple(random_attributes(state).values())
-        now = emcee.State(state["positions"], log_prob=state["log_density"], random_state=random)
+        current = emcee.State(state["positions"], log_prob=state["log_density"], random_state=random)
         positions, value = np.empty((steps, count, dimension)), np.empty((steps, count))
         accepted = np.zeros((steps + 1, count))
-        run = sampler.sample(now, iterations=steps, store=True, skip_initial_state_check=True)
-        for i, now in enumerate(run):
-            positions[i], value[i] = now.coords, now.log_prob
+        run = sampler.sample(current, iterations=steps, store=True, skip_initial_state_check=True)
+        for i, current in enumerate(run):
+            positions[i], value[i] = current.coords, current.log_prob
             accepted[i + 1] = sampler.backend.accepted
         last = emcee_state(positions[-1].copy(), value[-1].copy(), sampler.random_state)
         return last, Stretch(positions, value, np.diff(accepted, axis=0))
@@ -92,9 +92,9 @@ def emcee_state(positions: Float[np.ndarray, "w k"], value: Float[np.ndarray, " 
 
 def random_attributes(state: State) -> dict[str, Any]:
     """The random numbers of a state as emcee's back end keeps them."""
-    rest = state["random_rest"]
-    parts = ("MT19937", state["random_keys"], int(rest[0]), int(rest[1]), float(rest[2]))
-    return {f"random_state_{number}": part for number, part in enumerate(parts)}
+    numbers = state["random_rest"]
+    attributes = ("MT19937", state["random_keys"], int(numbers[0]), int(numbers[1]), float(numbers[2]))
+    return {f"random_state_{number}": attribute for number, attribute in enumerate(attributes)}
 
 
 def _laplace_draws(

@@ -65,14 +65,14 @@ def _write_hdf5(
 class Chain:
     """The chain of emcee in the folder of a run: `emcee.backends.HDFBackend(path, name="ensemble0")`, … reads it.
 
-    `fingerprint` says what it was sampled from, and with.
+    `fingerprint` identifies data, model and options of the sample.
     """
 
     def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, str]) -> None:
         self.path, self.fingerprint = Path(folder) / CHAIN, dict(fingerprint)
 
     def save(self, states: Sequence[State], stretches: Sequence[Stretch], seconds: float) -> None:
-        """Write all ensembles with their states at the end, in the place of what is there."""
+        """Write all ensembles with their states at the end, in place of the former ones."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
 
         def fill(file: h5py.File) -> None:
@@ -103,13 +103,13 @@ class Chain:
                     float(str(file.attrs["seconds"])),
                 )
                 count = len(file)
-            kept: list[Any] = [
+            arrays: list[Any] = [
                 HDFBackend(str(self.path), name=f"ensemble{n}", read_only=True) for n in range(count)
             ]
-            stretches = [Stretch(k.get_chain(), k.get_log_prob(), _shares(k)) for k in kept]
+            stretches = [Stretch(k.get_chain(), k.get_log_prob(), _shares(k)) for k in arrays]
             states = [
                 emcee_state(s.positions[-1], s.log_density[-1], k.random_state)
-                for s, k in zip(stretches, kept, strict=True)
+                for s, k in zip(stretches, arrays, strict=True)
             ]
         except Exception as error:  # whatever a damaged file brings about
             raise fail(f"cannot be read: {error}", file=self.path, advice=_ADVICE) from error

@@ -87,23 +87,23 @@ def _chain(
     """State and information after every step; the step with a given number has random numbers of its own."""
     begin, step = _kernels(density.with_gradient)
     state, random = begin(jnp.asarray(position), density.arrays), jax.random.key(int(key[0]))
-    one = jnp.ones(density.dimension)
+    scale = jnp.ones(density.dimension)
     for number in numbers:
-        here = jax.random.fold_in(random, number)
-        state, info = step(here, state, jnp.asarray(size()), one, density.arrays)
+        seed = jax.random.fold_in(random, number)
+        state, info = step(seed, state, jnp.asarray(size()), scale, density.arrays)
         yield state, info
 
 
 @functools.lru_cache(maxsize=1)
 def _kernels(with_gradient: Callable[..., tuple[Array, Array]]) -> tuple[Callable[..., Any], ...]:
     """Compiled functions that begin a chain and take a step, for one density."""
-    blackjax = importlib.import_module("blackjax")  # optional: what does not import it does not need it
+    blackjax = importlib.import_module("blackjax")  # optional
 
     def log_density(position: Array, arrays: tuple[Any, ...]) -> Array:
         # Value and gradient are known together; this hands both to whoever differentiates.
-        here = jax.lax.stop_gradient(position)
-        value, gradient = with_gradient(here, *arrays)
-        return value + gradient @ (position - here)
+        fixed = jax.lax.stop_gradient(position)
+        value, gradient = with_gradient(fixed, *arrays)
+        return value + gradient @ (position - fixed)
 
     def begin(position: Array, arrays: tuple[Any, ...]) -> Any:
         return blackjax.nuts.init(position, lambda z: log_density(z, arrays))

@@ -104,10 +104,10 @@ def autocorrelation(chains: Chains) -> Float[np.ndarray, " k"]:
 def r_hat(chains: Chains) -> Float[np.ndarray, " k"]:
     """R-hat between the halves of all ensembles, per quantity; NaN for a quantity that never moved."""
     e, k = chains.shape[0], chains.shape[-1]
-    parts = chains[:, :: max(1, chains[..., 0].size // RANKED)]
+    thinned = chains[:, :: max(1, chains[..., 0].size // RANKED)]
     rhat: Any = _statistics().rhat
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.array([float(rhat(parts[..., i].reshape(e, -1))) for i in range(k)])
+        return np.array([float(rhat(thinned[..., i].reshape(e, -1))) for i in range(k)])
 
 
 def effective_samples(chains: Chains) -> Float[np.ndarray, " k"]:
@@ -147,8 +147,8 @@ def _of_rows(likelihood: Likelihood) -> dict[str, Dataset]:
     }
     dims = ("row", "camera")
     return {
-        group: Dataset({name: (dims[: values.ndim], values) for name, values in found.items()}, coords=place)
-        for group, found in columns.items()
+        group: Dataset({name: (dims[: values.ndim], values) for name, values in column.items()}, coords=place)
+        for group, column in columns.items()
     }
 
 
@@ -158,9 +158,9 @@ def arviz_of_fit(result: FitResult, draws: int, seed: int) -> Any:
     varies = np.flatnonzero(size > 0)
     correlation = result.covariance[np.ix_(varies, varies)] / np.outer(size[varies], size[varies])
     normal = functools.partial(np.random.default_rng(seed).multivariate_normal, method="eigh")
-    made = result.values[varies] + size[varies] * normal(np.zeros(len(varies)), correlation, (4, draws))
+    drawn = result.values[varies] + size[varies] * normal(np.zeros(len(varies)), correlation, (4, draws))
     names = [parameters[i].name for i in varies]
-    posterior = group_of_draws({name: made[..., k] for k, name in enumerate(names)})
+    posterior = group_of_draws({name: drawn[..., k] for k, name in enumerate(names)})
     for i, name in zip(varies, names, strict=True):
         posterior[name].attrs["units"] = parameters[i].unit or "1"
     trusted = result.verdict is not None and result.trusted
@@ -225,11 +225,11 @@ LEVELS = {"68": (0.1587, 0.8413), "95": (0.0228, 0.9772)}
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Options of `sample`. `interval` is the length of a block, hence of what a kill can lose, in steps; whole blocks
+    """Options of `sample`. `interval` is the length of a block, which a killed run can lose, in steps; whole blocks
     are done, so that there are never more steps than `maximum_steps`.
 
     `sampler` is a name (`emcee`, `nuts`), `FILE.py:CLASS`, or a `Sampler`; `walkers` and `moves` are options of emcee,
-    `walkers` 0 standing for twice the number of sampled coefficients, at least 64. `parameters` names what is
+    `walkers` 0 standing for twice the number of sampled coefficients, at least 64. `parameters` are the names of those
     sampled (None: the physics coefficients); samplers of the exact posterior sample all and show these in figures.
     Every `thin`-th step is stored (0: as is usual for the sampler). `checks` is the number of draws compared with the
     exact posterior. Raises ValueError for what makes no sense.
@@ -271,8 +271,8 @@ class Options:
     def make_sampler(self) -> Sampler:
         """Return the sampler that is asked for, with the options that are its own."""
         default = {f.name: f.default for f in dataclasses.fields(self)}
-        own: dict[str, Any] = {name: getattr(self, name) for name in ("walkers", "moves")}
-        return make_sampler(self.sampler, {k: value for k, value in own.items() if value != default[k]})
+        settings: dict[str, Any] = {name: getattr(self, name) for name in ("walkers", "moves")}
+        return make_sampler(self.sampler, {k: value for k, value in settings.items() if value != default[k]})
 
 
 class Progress(NamedTuple):
@@ -338,24 +338,24 @@ class PosteriorSample(Drawn):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences about everything that does not hold."""
-        found = [] if self.convergence.converged else [self.convergence.message(self.seconds_per_step)]
+        sentences = [] if self.convergence.converged else [self.convergence.message(self.seconds_per_step)]
         if not self.of_trusted_fit:
-            found.insert(
+            sentences.insert(
                 0, "the fit is not trusted, and neither is its posterior: see the warnings of the fit"
             )
         a = self.accuracy
         if a is not None and not a.exact_enough:
-            found.append(
+            sentences.append(
                 f"the surrogate differs from the exact posterior: {a.shift[0]} by {a.shift[1]:+.2f} ± "
                 f"{a.shift[2]:.2f} σ, width of {a.width[0]} by a factor {a.width[1]:.2f} ± {a.width[2]:.2f}, "
                 f"weights {a.efficiency:.2f} effective; sample fewer or better determined coefficients, or "
                 "take the sampler nuts"
             )
         if self.counts.get("divergences", 0):
-            found.append(
+            sentences.append(
                 f"{self.counts['divergences']} trajectories of the sampler diverged: tails may be missing"
             )
-        return tuple(found)
+        return tuple(sentences)
 
     @property
     def comparison(self) -> str:
@@ -413,8 +413,8 @@ class PosteriorSample(Drawn):
             ("ESS", v.ess, "effective samples"),
             ("RHAT", v.rhat, "R-hat between ensembles"),
         ):
-            known = dict(zip(v.names, numbers, strict=True))
-            columns[name] = np.array([known.get(name_, np.nan) for name_ in names]), "", about
+            by_name = dict(zip(v.names, numbers, strict=True))
+            columns[name] = np.array([by_name.get(name_, np.nan) for name_ in names]), "", about
         return columns
 
     def to_table(self) -> Any:
@@ -430,7 +430,7 @@ class PosteriorSample(Drawn):
                     number of intensities less the fluxes
         Limits      the flux is at its best value, not integrated over. Rows that share a flux are not independent
 
-        Raises ValueError where the data are not at hand, and where rows share a flux.
+        Raises ValueError where the data are not at hand, and where rows share a flux, or the q, u of a star.
         """
         likelihood = self.likelihood
         if likelihood is None:
@@ -438,6 +438,11 @@ class PosteriorSample(Drawn):
         if likelihood.plan.exposures.shared is not None:
             raise ValueError(
                 "exposures share their flux (KIND steady): their rows cannot be left out one by one"
+            )
+        if not likelihood.sharing.single:
+            raise ValueError(
+                "exposures share q and u of the stars of a field (SCATTER of SOURCES): their rows cannot be left out "
+                "one by one"
             )
         used, per_row = likelihood.used, np.broadcast_to(likelihood.data_per_row, likelihood.used.shape)
         chi2 = np.empty((*self.draws.shape[:2], int(used.sum())))
@@ -510,10 +515,10 @@ class PosteriorSample(Drawn):
     def display(self) -> Display:
         """The verdict on the chains and the sampled coefficients."""
         table = self.to_table()
-        told = map(interval_in_words, table[np.isin(np.asarray(table["NAME"]), self.sampled)])
+        intervals = map(interval_in_words, table[np.isin(np.asarray(table["NAME"]), self.sampled)])
         rows = [
             (t["name"], t["median"], t["sigma"], t["unit"], f"{t['low']} … {t['high']}", t["ess"])
-            for t in told
+            for t in intervals
         ]
         return Display(
             title=f"Posterior: {'trusted' if self.trusted else 'not converged, or not exact enough'}",

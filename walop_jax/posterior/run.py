@@ -37,7 +37,9 @@ VERDICTS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
         f"the old calibration {'still holds' if d.get('fits') and d.get('new_trusted') else 'does not hold'}"
     ),
     "survey": lambda d: "trusted" if d["trusted"] else "not trusted",
-    "watch": lambda d: "the calibration holds" if d["holds"] else "the calibration is not known to hold",
+    "watch": lambda d: (
+        "the calibration is still valid" if d["holds"] else "the calibration may be no longer valid"
+    ),
     "plan": lambda d: f"{d['what']}: {d['value']:.3g} {d['unit']}".rstrip(),
 }
 """Documents in a few words."""
@@ -47,7 +49,7 @@ SAME_FIT = 0.05  # standard errors
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """The folder of a run; everything in it is read when it is asked for. None stands for what is not there.
+    """The folder of a run; files are read when they are needed. None stands for files that are missing.
 
     `catalogue` are the effects that its model may have, `data` the sets of its fit (default: where they were, in the
     folder of the run, or beside it).
@@ -110,7 +112,7 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
     def calset(self) -> CalibrationSet:
         """The data of the fit.
 
-        Raises `DataError` where the run does not say what they were, and where they are not there or have changed.
+        Raises `DataError` where the run does not name them, and where they are missing or have changed.
         """
         inputs = () if self.product is None else self.product.inputs
         if not inputs:
@@ -124,9 +126,9 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
     def _located(self, path: Path) -> Path:
         beside = self.folder.resolve()
         for folder in (Path(), beside, *beside.parents):
-            for there in (folder / path, folder / path.name):
-                if there.exists():
-                    return there
+            for candidate in (folder / path, folder / path.name):
+                if candidate.exists():
+                    return candidate
         raise fail(
             f"cannot be found, neither from {Path.cwd()} nor beside {self.folder}",
             file=path,
@@ -179,17 +181,17 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
 
     def display(self) -> Display:
         """The files, and the calibration if there is one."""
-        found = self.documents
+        documents = self.documents
         files = {"calibration": PRODUCT, "posterior": POSTERIOR}
         held = [name for name, file in files.items() if file in self]
-        facts = [("holds", ", ".join([*held, *found]) or "nothing")]
-        known = found.get("summary", {}).get("accuracy_of_p")
-        if known and found["summary"].get("trusted"):
-            share = f"below 0.1 % over {100 * known['share_below_goal']:.0f} % of it"
+        facts = [("holds", ", ".join([*held, *documents]) or "nothing")]
+        accuracy = documents.get("summary", {}).get("accuracy_of_p")
+        if accuracy and documents["summary"].get("trusted"):
+            share = f"below 0.1 % over {100 * accuracy['share_below_goal']:.0f} % of it"
             facts.append(
-                ("p of a star", f"{two_digits(100 * known['median'])} % (median of the field), {share}")
+                ("p of a star", f"{two_digits(100 * accuracy['median'])} % (median of the field), {share}")
             )
-        facts += [(name, VERDICTS[name](found[name])) for name in VERDICTS if name in found]
+        facts += [(name, VERDICTS[name](documents[name])) for name in VERDICTS if name in documents]
         inner = Display("") if self.calibration is None else self.calibration.display()
         return dataclasses.replace(
             inner, title=f"Run {self.folder}. {inner.title}".removesuffix(". "), facts=(*facts, *inner.facts)

@@ -113,7 +113,7 @@ class Sampler(abc.ABC):
 
     @abc.abstractmethod
     def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
-        """Return the ensemble after `steps` more steps, and what they gave."""
+        """Return the ensemble after `steps` more steps, and their results."""
 
 
 def make_sampler(
@@ -150,8 +150,8 @@ def make_sampler(
 
 
 def _check_settings(kind: type[Sampler], settings: Mapping[str, Any], given: bool = False) -> None:
-    known = {f.name for f in dataclasses.fields(kind)} if dataclasses.is_dataclass(kind) else set()
-    unknown = list(settings) if given else [name for name in settings if name not in known]
+    setting_names = {f.name for f in dataclasses.fields(kind)} if dataclasses.is_dataclass(kind) else set()
+    unknown = list(settings) if given else [name for name in settings if name not in setting_names]
     if unknown:
         advice = "set it in the sampler that you give" if given else "leave it out"
         raise fail(f"{unknown[0]!r} is no option of the sampler {kind.name!r}", advice=advice)

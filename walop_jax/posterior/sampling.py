@@ -42,12 +42,12 @@ SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy")
 
 
 class Ensembles:
-    """The ensembles of a run and what they have stored so far: every `thin`-th step of blocks of `interval` steps."""
+    """The ensembles of a run and their stored steps: every `thin`-th step of blocks of `interval` steps."""
 
     def __init__(
         self, sampler: Sampler, density: Density, options: Options, chain: Chain | None = None
     ) -> None:
-        """Takes up what is in `chain`, or starts."""
+        """Resumes from `chain` where it exists, or starts."""
         self.sampler, self.density = sampler, density
         self.options, self.chain = options, chain
         self.thin = options.thin or sampler.thin
@@ -74,11 +74,11 @@ class Ensembles:
     @property
     def stretches(self) -> list[Stretch]:
         """All stored steps, of every ensemble."""
-        whole = []
-        for one in zip(*self.blocks, strict=True):
-            positions, values, shares = (np.concatenate([s[part] for s in one]) for part in range(3))
-            whole.append(Stretch(positions, values, shares))
-        return whole
+        joined = []
+        for ensemble in zip(*self.blocks, strict=True):
+            positions, values, shares = (np.concatenate([s[column] for s in ensemble]) for column in range(3))
+            joined.append(Stretch(positions, values, shares))
+        return joined
 
     @property
     def counts(self) -> dict[str, int]:
@@ -106,19 +106,19 @@ class Ensembles:
     def _stored(self, stretch: Stretch) -> Stretch:
         n, k = self.options.interval, self.density.dimension
         shape = np.shape(stretch.positions)
-        rest = (np.shape(stretch.log_density), np.shape(stretch.acceptance))
-        if len(shape) != 3 or (shape[0], shape[2]) != (n, k) or rest != (shape[:2], shape[:2]):
+        shapes = (np.shape(stretch.log_density), np.shape(stretch.acceptance))
+        if len(shape) != 3 or (shape[0], shape[2]) != (n, k) or shapes != (shape[:2], shape[:2]):
             raise fail(
-                f"the sampler {self.sampler.name!r} gave positions of shape {shape} and numbers of shapes {rest}",
+                f"the sampler {self.sampler.name!r} gave positions of shape {shape} and numbers of shapes {shapes}",
                 advice=f"for {n} steps of {k} coordinates it must be (steps, walkers, coordinates) = ({n}, …, {k}), "
                 "and (steps, walkers)",
             )
-        stored = (np.array(part[self.thin - 1 :: self.thin], float) for part in stretch[:3])
+        stored = (np.array(series[self.thin - 1 :: self.thin], float) for series in stretch[:3])
         return Stretch(*stored, counts=stretch.counts)
 
     def kept(self) -> tuple[Chains, Float[np.ndarray, "e t w"]]:
         """Stored positions and ln p after burn-in."""
-        z, lnp, _ = (np.stack(parts) for parts in zip(*(s[:3] for s in self.stretches), strict=True))
+        z, lnp, _ = (np.stack(series) for series in zip(*(s[:3] for s in self.stretches), strict=True))
         first = int(BURN_IN * z.shape[1])
         return z[:, first:], lnp[:, first:]
 
@@ -152,13 +152,13 @@ def numbers_of(verdict: Convergence | None) -> tuple[float, float]:
 def fingerprint(target: Target, options: Options) -> dict[str, str]:
     """Hashes of everything that decides the chain."""
     model, laid_out = target.model, target.likelihood.plan
-    data = [np.asarray(part) for batch in target.likelihood.points for part in batch if part is not None]
-    plan = [np.asarray(part) for part in (laid_out.wavelength, laid_out.node_weight, laid_out.teff)]
-    exposures = [np.asarray(part) for part in jax.tree.leaves(laid_out.exposures)]
+    data = [np.asarray(array) for batch in target.likelihood.points for array in batch if array is not None]
+    plan = [np.asarray(array) for array in (laid_out.wavelength, laid_out.node_weight, laid_out.teff)]
+    exposures = [np.asarray(array) for array in jax.tree.leaves(laid_out.exposures)]
     parameters = [(p.name, p.start, p.free, p.tie, p.scale) for p in model.parameters]
     priors = [(p.name, p.prior, p.loose) for p in model.parameters]
     chain = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
-    for name in ("maximum_steps", "draws", "checks"):  # how long, and what is made of it: free to change
+    for name in ("maximum_steps", "draws", "checks"):  # length and summary: free to change
         del chain[name]
     for name in ("sampler", "walkers", "moves"):  # have an entry of their own
         del chain[name]
@@ -212,9 +212,9 @@ def sample(
         stated = dataclasses.replace(
             result, covariance=covariance(result.model, result.posterior), errors_from=STATED
         )
-        found = sample(stated, options, folder=folder, resume=resume, report=report)
+        as_stated = sample(stated, options, folder=folder, resume=resume, report=report)
         return sandwich_adjusted(
-            found, result.model, stated.covariance, result.covariance, result.errors_from
+            as_stated, result.model, stated.covariance, result.covariance, result.errors_from
         )
     sampler, target = options.make_sampler(), Target(result)
     marks = {} if folder is None else fingerprint(target, options)
@@ -222,7 +222,7 @@ def sample(
     if chain is not None and chain.path.exists():
         if not resume:
             raise fail("holds a chain already", file=folder, advice="go on with --resume, or --overwrite it")
-        chain.load()  # what is not of this fit is refused before the work
+        chain.load()  # a chain of another fit is refused before the work
     if sampler.exact:
         posterior = ExactPosterior(target, choose_sampled(target, options.parameters), options.inflate)
         seconds = 0.0
@@ -267,7 +267,7 @@ def _finish(
     steps = _evenly(n, -(-options.draws // (e * w)))
     flat = z[:, steps].reshape(e, -1, d)
     x = posterior.draw(flat.reshape(-1, d), rng)
-    values = np.array([target.values(one) for one in x]).reshape(e, flat.shape[1], -1)
+    values = np.array([target.values(point) for point in x]).reshape(e, flat.shape[1], -1)
     accuracy = None
     if isinstance(posterior, Surrogate):
         checked = z.reshape(-1, d)[_evenly(e * n * w, options.checks)]
@@ -308,7 +308,7 @@ def sandwich_adjusted(
                 errors; C (`robust`) that from residuals (`fit.robust`), both of all parameters of the model
     Source      open-faced sandwich: Shaby 2014, Journal of Computational and Graphical Statistics 23, 853
     Limits      C = H⁻¹: nothing changes. Ω is not the symmetric root of that paper but lower triangular; both give
-                draws of covariance C where those of the sampler have H⁻¹, and what is skew in them stays skew. Chains
+                draws of covariance C where those of the sampler have H⁻¹, and their skewness stays. Chains
                 stay as they were sampled.
 
     `errors_from` names the origin of C in the result.

@@ -101,8 +101,8 @@ class Surrogate:
         if self.inflate:
             mixed = [self.linear.T @ q[h:, :h] for q in (self.data, self.prior)]
             prior = self._tilted(self.prior[:h, :h])
-            parts = (self.data[:h, :h], prior, *mixed, self.share, np.asarray(float(self.measured)))
-            function, arrays = _inflated, (pairs, triples, *(jnp.asarray(p) for p in parts))
+            constants = (self.data[:h, :h], prior, *mixed, self.share, np.asarray(float(self.measured)))
+            function, arrays = _inflated, (pairs, triples, *(jnp.asarray(p) for p in constants))
         else:
             q = self.data + self.prior
             schur = q[:h, :h] - q[:h, h:] @ np.linalg.solve(q[h:, h:], q[h:, :h])
@@ -120,7 +120,7 @@ class Surrogate:
 
     @property
     def monitored_names(self) -> tuple[str, ...]:
-        """Names of what is sampled, as people quote it."""
+        """Names of the sampled parameters."""
         return (*(self.names[i] for i in self.sampled), *((INFLATION,) if self.inflate else ()))
 
     def monitored(self, z: Float[np.ndarray, "... k"]) -> Float[np.ndarray, "... q"]:
@@ -178,10 +178,10 @@ class Surrogate:
 
 def features_of(z: Array, pairs: Array, triples: Array) -> Array:
     """h of the module's equations, for every row of z."""
-    parts = [jnp.ones((z.shape[0], 1)), z, z[:, pairs[:, 0]] * z[:, pairs[:, 1]]]
+    features = [jnp.ones((z.shape[0], 1)), z, z[:, pairs[:, 0]] * z[:, pairs[:, 1]]]
     if triples.shape[0]:
-        parts.append(z[:, triples[:, 0]] * z[:, triples[:, 1]] * z[:, triples[:, 2]])
-    return jnp.concatenate(parts, axis=1)
+        features.append(z[:, triples[:, 0]] * z[:, triples[:, 1]] * z[:, triples[:, 2]])
+    return jnp.concatenate(features, axis=1)
 
 
 @compiled
@@ -212,13 +212,15 @@ def _axes(covariance: Matrix, scale: Float[np.ndarray, " k"]) -> Matrix:
 
 
 def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Matrix, Matrix]:
-    rest = np.setdiff1d(np.arange(len(target.free)), sampled)
+    marginalised = np.setdiff1d(np.arange(len(target.free)), sampled)
     c, scale = target.covariance, target.scale
-    own = _axes(c[np.ix_(sampled, sampled)], scale[sampled])
-    follow = np.linalg.solve(own, c[np.ix_(sampled, rest)]).T  # C_λφ A⁻ᵀ
-    along, across = np.zeros((len(c), len(sampled))), np.zeros((len(c), len(rest)))
-    along[sampled], along[rest] = own, follow
-    across[rest] = _axes(c[np.ix_(rest, rest)] - follow @ follow.T, scale[rest])
+    axes = _axes(c[np.ix_(sampled, sampled)], scale[sampled])
+    follow = np.linalg.solve(axes, c[np.ix_(sampled, marginalised)]).T  # C_λφ A⁻ᵀ
+    along, across = np.zeros((len(c), len(sampled))), np.zeros((len(c), len(marginalised)))
+    along[sampled], along[marginalised] = axes, follow
+    across[marginalised] = _axes(
+        c[np.ix_(marginalised, marginalised)] - follow @ follow.T, scale[marginalised]
+    )
     return along, across
 
 
@@ -236,8 +238,8 @@ def _gram(target: Target, x: Float[np.ndarray, "m f"], progress: Callable[[int, 
         first = target.residuals(target.centre, batch)
         rows = np.empty((len(x) + 1, first.size))
         rows[0] = first
-        for m, here in enumerate(x, start=1):
-            rows[m] = target.residuals(here, batch) - first
+        for m, point in enumerate(x, start=1):
+            rows[m] = target.residuals(point, batch) - first
             if progress is not None:
                 progress(number * len(x) + m, len(batches) * len(x))
         gram += rows @ rows.T
@@ -358,8 +360,8 @@ def compare_with_exact(target: Target, surrogate: Surrogate, z: Draws, rng: np.r
     """
     x, weight = surrogate.draw(z, rng), surrogate.weight(z)
     exact = [
-        w * target.data(one) + float(np.sum(target.prior_rows(one) ** 2))
-        for w, one in zip(weight, x, strict=True)
+        w * target.data(point) + float(np.sum(target.prior_rows(point) ** 2))
+        for w, point in zip(weight, x, strict=True)
     ]
     ln_ratio = -0.5 * (np.array(exact) - surrogate.joint(z, x))
     ln_ratio = ln_ratio - ln_ratio.mean()

@@ -101,10 +101,10 @@ class Target:
         """Departure of the residuals from linear at each column of `steps`: squared norm of their second order."""
         total = np.zeros(steps.shape[1])
         for batch in self.likelihood.points:
-            here = self.residuals(self.centre, batch)
+            at_centre = self.residuals(self.centre, batch)
             for m, step in enumerate(steps.T):
                 up, down = (self.residuals(self.centre + sign * step, batch) for sign in (1, -1))
-                total[m] += np.sum((0.5 * (up + down) - here) ** 2)
+                total[m] += np.sum((0.5 * (up + down) - at_centre) ** 2)
         return total
 
     def half_gradient(self, x: Vector) -> Vector:
@@ -156,10 +156,10 @@ def exact_density(target: Target, inflate: bool = False) -> Density:
     ) -> tuple[Array, Array]:
         first, along, offset, slope = linear
         values = first + along @ w[:free]
-        here = engine.summed(
+        at_position = engine.summed(
             lambda batch: jax.value_and_grad(chi2_of)(values, template, plan, batch), batches
         )
-        chi2, by_values = here
+        chi2, by_values = at_position
         # χ² enters as the line that has its value and slope at w.
         return jax.value_and_grad(
             lambda z: log_density(z, chi2 + by_values @ (along @ (z - w)[:free]), offset, slope)
@@ -190,8 +190,8 @@ class ExactPosterior:
 
     @property
     def _order(self) -> Int[np.ndarray, " f"]:
-        rest = np.setdiff1d(np.arange(len(self.target.free)), self.sampled)
-        return np.concatenate([self.sampled, rest])
+        marginalised = np.setdiff1d(np.arange(len(self.target.free)), self.sampled)
+        return np.concatenate([self.sampled, marginalised])
 
     @property
     def monitored_names(self) -> tuple[str, ...]:

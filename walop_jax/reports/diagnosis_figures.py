@@ -106,7 +106,7 @@ def _maps(
     tiles: Any = None
     for number, values in enumerate(maps.values()):
         for k, axis in enumerate(axes[number]):
-            field_axes(axis, f"camera {cameras[k]}" if number == 0 else "")
+            field_axes(axis, cameras[k] if number == 0 else "")
             axis.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 4, 5, 10], prune="both"))
             if on.width is not None:
                 axis.tick_params(axis="x", labelrotation=90)
@@ -154,13 +154,13 @@ def signature_figure(
             axis.axhline(0.0, color=QUIET, lw=0.8, zorder=0)
             axis.errorbar(x, dots, error, fmt="o", ms=3, lw=0.8, color="0.15", label="data", zorder=3)
         upper[k].plot(x, explained, color=BEFORE, lw=1.4, label="effect", zorder=2)
-        upper[k].set_title(f"camera {camera}", fontsize=FONT)
+        upper[k].set_title(camera, fontsize=FONT)
         lower[k].set_xlabel(label, fontsize=FONT)
         if angular:
             angle_ticks(lower[k].xaxis, figure, lower[k].get_subplotspec().get_gridspec().ncols)
     upper[0].set_ylabel("residual (σ)", fontsize=FONT)
     lower[0].set_ylabel("remaining (σ)", fontsize=FONT)
-    upper[0].legend(frameon=False, fontsize=SMALL, loc="best")
+    figure.legend(*upper[0].get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=2, loc=ABOVE)
     return figure
 
 

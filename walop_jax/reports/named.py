@@ -123,7 +123,11 @@ class NamedFigure:
 
 
 def _small(source: FigureSource) -> bool:
-    return source.stored.residuals is None  # which comes with whole frames
+    """True where the run names its data, a set of points: a survey does not, whole frames have a map of residuals."""
+    run = source.run
+    return source.stored.residuals is None and (
+        run is None or bool(run.data or (run.product and run.product.inputs))
+    )
 
 
 def _plates(source: FigureSource) -> list[str]:

@@ -209,9 +209,9 @@ def _asked(run: RunContents) -> tuple[Display | None, bool]:
     whole = all(each.met for each in found)
     title = "No go" if not is_go(found) else "Go: fit for use" if whole else "Go, with reservations"
     advice = requirement_advice(found)
-    return Display(title, head=("", "asked", "found"), rows=requirement_rows(found), notes=advice), is_go(
-        found
-    )
+    return Display(
+        title, head=("", "requirement", "result"), rows=requirement_rows(found), notes=advice
+    ), is_go(found)
 
 
 def _accuracy(run: RunContents) -> FieldAccuracy | None:

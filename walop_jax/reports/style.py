@@ -21,13 +21,14 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
-from matplotlib.ticker import MultipleLocator, NullLocator, ScalarFormatter
+from matplotlib.ticker import MaxNLocator, MultipleLocator, NullLocator, ScalarFormatter
 
 from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.io.text import with_minus_sign
 
 FONT = 9
 SMALL = 7
+NARROW = 4.5  # inches: a column of print, or half a page
 PRINTED = 7
 """Type (pt) of a figure of a given width: what journals ask for at least, at the size of print."""
 WIDTHS = {"column": 89.0, "page": 183.0}
@@ -284,7 +285,10 @@ def _spacing(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> float:
 
 
 def colour_bar(figure: Any, image: Any, axes: Any, label: str = "", **options: Any) -> Any:
-    """A colour bar with small numbers, plain ones on a logarithmic scale; of a single map it has the height."""
+    """A colour bar with small numbers, plain ones on a logarithmic scale; of a single map it has the height.
+
+    In a column of print it has three numbers at most: there is no room for 99.95 beside the next map.
+    """
     if isinstance(axes, Axes):
         bar = figure.colorbar(image, cax=axes.inset_axes((1.04, 0.0, 0.06, 1.0)), **options)
     else:
@@ -295,6 +299,8 @@ def colour_bar(figure: Any, image: Any, axes: Any, label: str = "", **options: A
         plain_ticks(bar.ax.yaxis)
     else:
         bar.ax.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
+        if isinstance(axes, Axes) and figure.bbox.width < NARROW * figure.dpi:
+            bar.ax.yaxis.set_major_locator(MaxNLocator(2, steps=[1, 2, 2.5, 5, 10]))
     return bar
 
 

@@ -51,7 +51,7 @@ def hidden_in_words(summary: Mapping[str, Any]) -> str:
 
 _MJD_0 = datetime.datetime(1858, 11, 17)
 _MANY = 12
-_KINDS = {"clp": "through the polariser", "moon": "of the Moon sky", "standard": "of standard stars"}
+_KINDS = {"clp": "through the polariser", "moon": "of the moonlit sky", "standard": "of standard stars"}
 
 
 def data_in_words(product: Calibration | Product) -> tuple[tuple[str, str], ...]:
@@ -118,10 +118,10 @@ def _range(values: Float[np.ndarray, " e"], unit: str) -> str:
 
 
 PLACES = {
-    "half1": "half1 for the half of the pupil with HWP1",
-    "half2": "half2 for that with HWP2",
-    "chwp": "chwp for the calibration half-wave plate",
-    "throughput": "n0, n1, … for the cameras in their order",
+    "half1": "half1, the half of the pupil with HWP1",
+    "half2": "half2, the half with HWP2",
+    "chwp": "chwp, the calibration half-wave plate",
+    "throughput": "n0, n1, …, the cameras in their order (O1, E1, O2, E2 of WALOP)",
 }
 
 
@@ -129,7 +129,7 @@ def names_in_words(names: Iterable[str]) -> str:
     """Meanings of the first parts of names of parameters, where that is no word of its own."""
     used = {name.partition(".")[0] for name in names}
     found = [words for part, words in PLACES.items() if part in used]
-    return f"In names of parameters stand {listed(found)}." if found else ""
+    return f"Parts of parameter names: {'; '.join(found)}." if found else ""
 
 
 def symbols_in_words(names: Sequence[str]) -> str:
@@ -149,44 +149,45 @@ _NOISE = "noise alone has a standard deviation of about 1 σ. Tiles beyond 3 σ 
 CAPTIONS: Mapping[str, str] = {
     "accuracy": "Standard error of p for one exposure through {filter}, photon noise left out; the white line and the "
     "dashed line are at the goal. Values above 3 % are shown as 3 %.",
-    "protection": "Protection level: the largest error of q and u that a single mistake can make at each field point "
-    "without being detected (99 %).",
+    "protection": "Protection level: the largest error of q and u that a single systematic error can cause at each "
+    "field point without being detected (99 %).",
     "separation": "Standard deviations between an effect at its detection limit (row) and another fitted to imitate it "
     "(column).",
-    "effect": f"{_RESIDUALS}, all with one colour scale: without {{effect}}, what {{effect}} makes of them once all "
-    f"other parameters have followed, and with it. Combination of exposures: {{combination}}; {_NOISE}",
+    "effect": f"{_RESIDUALS}, all with one colour scale: without {{effect}}, the pattern predicted by {{effect}} after "
+    f"refitting all other parameters, and with it. Combination of exposures: {{combination}}; {_NOISE}",
     "signature": "Signature of {effect}. Dots: residuals averaged over the field, with the field pattern of the effect "
-    "in that camera as weight; errors from the scatter over the field. Line: what {effect} explains. Below: the "
-    "remaining residuals.",
+    "in that camera as weight; errors from the scatter over the field. Line: the part explained by {effect}. Below: "
+    "the remaining residuals. Where a camera is dark its error vanishes with its light: residuals in σ change sign "
+    "there from one angle to the next.",
     "whole": f"{_RESIDUALS}. Combination of exposures: {{combination}}; {_NOISE}",
     "ladder": "χ² per degree of freedom from the starting model to the last. In the grey band (5 standard deviations) "
     "a model explains the data.",
     "rms": "Rms residual of every field point over all exposures, with the starting and with the final model, one "
     "colour scale. Noise alone gives 0.87 with four cameras, 0.71 with two (1 where the flux is known).",
-    "shares": "Where χ² sits: mean squared residual by group, divided by what noise alone gives, with the starting "
+    "shares": "Mean squared residual by group, divided by that of noise, with the starting "
     "model (open circles) and the final model (squares).",
     "residuals": "Rms residual of every field point over all exposures, with the instrument as designed and as fitted "
-    "(1 is what noise alone gives), and the residuals of the fit with what noise alone would give.",
+    "(noise alone gives 1), and the distribution of the residuals of the fit with that of noise.",
     "matrix": "Zero offset, efficiency and cross-talk over the field in per cent: q_m = m21 + m22 q + m23 u and "
-    "u_m = m31 + m32 q + m33 u, through {filter}, flat photon spectrum, calibration plate out. Their ranges stand "
-    "above the maps; the ends of the scales go in steps of 1, 2, 5, so that runs can be compared. The lines bound the "
+    "u_m = m31 + m32 q + m33 u, through {filter}, flat photon spectrum, calibration plate out. Ranges are given "
+    "above each map; colour scales are rounded to 1, 2 or 5 so that runs can be compared. The lines bound the "
     "zone in which a single exposure carries almost no information on u.",
     "matrix-errors": "Standard errors of the same, one scale; covariance of the {covariance}.",
     "residual-map": "Residuals of the smooth model in cells of the field, of the matrix through {filter} and of the "
     "throughput of the cameras relative to each other; χ² per degree of freedom before that correction. All of them "
-    "lie {significance} standard deviations above what noise alone makes of them.",
+    "lie {significance} standard deviations above noise.",
     "corner": "Posterior of the coefficients that are most correlated among those that the data constrain: contours "
     "of 39 and 86 %, 1 and 2 σ of two coefficients together.",
     "planned": "Error of p (%) before and after the plan: median over the instruments drawn, largest of all filters "
     "and colours. Crosses: one exposure holds no u there.",
     "change": "Change of the instrument matrix over the field, new − old, in per cent.",
-    "tracks": "Parameters that change: value under the law and its error (band), what each night would have by itself "
-    "(dots), breaks (dashed) and what was done (dotted).",
+    "tracks": "Parameters that change: value under the law and its error (band), values of single nights (dots), "
+    "breaks (dashed) and work on the instrument (dotted).",
     "nights": "χ² of every night against its expectation, in standard deviations; the band is ±2.",
     "comparison_histogram.png": "Errors of q, u and p over the field, on the grid points and between them.",
     "comparison_map.png": "Maps of the errors of q and u of both methods.",
     "comparison_offset.png": "Where the offsets Δq and Δu of Paper II come from.",
-    "comparison_spectral.png": "Efficiencies across the filter, and what the colour of a star changes.",
+    "comparison_spectral.png": "Efficiencies across the filter, and the change with the colour of a star.",
     "watch.png": "Gain of every camera since the calibration, group by group.",
 }
 """Captions of figures by name, and of pictures by file."""

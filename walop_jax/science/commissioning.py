@@ -94,9 +94,9 @@ def is_go(asked: Sequence[Requirement]) -> bool:
 
 
 def requirement_rows(asked: Sequence[Requirement]) -> tuple[tuple[str, str, str], ...]:
-    """A row for each requirement: ok, NO where it is needed, no where it is advice; what is asked, what was found."""
+    """A row for each requirement: ok, NO where it is needed, advice where it is not; the requirement, the result."""
     return tuple(
-        ("ok" if each.met else "NO" if each.needed else "no", each.what, each.found) for each in asked
+        ("ok" if each.met else "NO" if each.needed else "advice", each.what, each.found) for each in asked
     )
 
 

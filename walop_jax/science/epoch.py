@@ -154,8 +154,10 @@ class Epoch(Displayed):
                 "not compared: the model of the old calibration, fitted to the new data, is not to be trusted"
             )
             return Display(title, (("old and new", words),))
+        if self.same:
+            return Display(title, (("old and new", "the same data: nothing can have changed"),))
         rows = []
-        for entry in self.moved[:_SHOWN]:
+        for entry in sorted(self.moved, key=lambda entry: entry.name != largest.name)[:_SHOWN]:
             error = max(entry.error, 1e-6 * abs(entry.new))  # of the same data it is rounding alone
             old, new = (value_and_error(value, error)[0] for value in (entry.old, entry.new))
             rows.append((entry.name, old, new, with_minus_sign(f"{entry.z:+.1f}"), entry.unit))
@@ -164,8 +166,8 @@ class Epoch(Displayed):
         facts = {
             "largest change": f"{largest.name} by {size} {largest.unit}".rstrip()
             + f", {with_minus_sign(f'{largest.z:+.1f}')} standard errors"
-            + (" if it alone has changed" if largest.alone else "")
-            + f": p {probability(largest.p_value)} for the largest of {largest.asked}",
+            + (" if no other parameter has changed" if largest.alone else "")
+            + f" (p {probability(largest.p_value)} after allowing for {largest.asked} trials)",
             "stars with the old one": f"off by {two_digits(errors['median'])} % in p (median), "
             f"{two_digits(errors['max'])} % at most",
             "chance": f"p {probability(self.p_value)} (χ² = {self.test:.1f} in {self.directions} directions, and "
@@ -265,8 +267,8 @@ def _too_alike(test: float, directions: int, same: bool) -> Iterator[str]:
         return
     if special.chdtr(directions, test) < COPIES:
         yield (
-            f"old and new agree better than independent data do (χ² = {test:.2g} in {directions} directions): are they "
-            "the same measurements, at other times?"
+            f"the two data sets agree too well to be independent (χ² = {test:.2g} in {directions} directions): is one "
+            "a copy of the other?"
         )
 
 

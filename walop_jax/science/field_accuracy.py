@@ -111,7 +111,7 @@ class FieldAccuracy:
         if self.hidden > self.goal:
             lacks.append(
                 Shortfall(
-                    f"a systematic error of {two_digits(100 * self.hidden)} % of q or u could hide",
+                    f"a systematic error of {two_digits(100 * self.hidden)} % of q or u would go undetected",
                     self.remedy or "walop-jax limits says which exposures would show it",
                 )
             )
@@ -158,9 +158,9 @@ class FieldAccuracy:
             each = unmeasured(self.not_measured).items()
             lines.append(("not measured", "; ".join(f"{name}: {off_by(*one.error)}" for name, one in each)))
         if self.hidden > 0:
-            lines += [("could hide", off_by(self.hidden, self.hidden_worst)), ("from", self.hidden_by)]
+            lines += [("undetectable", off_by(self.hidden, self.hidden_worst)), ("caused by", self.hidden_by)]
         if self.hidden > 0 and self.remedy:
-            lines.append(("to see that", self.remedy))
+            lines.append(("remedy", self.remedy))
         return tuple(lines)
 
 

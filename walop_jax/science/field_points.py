@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from jaxtyping import Bool, Float
 
-from walop_jax.data.schema import EXPOSURES, Column, check, finite
+from walop_jax.data.schema import EXPOSURES, TURN, Column, check, finite
 from walop_jax.data.settings import TEMPERATURE, Settings
 from walop_jax.data.units import Place
 from walop_jax.data.user_tables import (
@@ -66,9 +66,10 @@ def field_points(
     """The X, Y and optional settings of a table of field points of an instrument.
 
     A moving element has the columns `<P>_ANGLE` and `<P>_IN`; without the latter it is in the beam where it has an
-    angle. Of column prefixes, those `always_in` must have an angle, and those `never_in`, in the beam in no exposure of
-    the calibration, are in it only where `<P>_IN` says so. Single points outside the field are marked; if most of
-    them lie outside, the unit must be wrong.
+    angle. `<P>_TURN` (absent: 0) is by how much it turns during the exposure, about that angle. Of column prefixes,
+    those `always_in` must have an angle, and those `never_in`, in the beam in no exposure of the calibration, are in it
+    only where `<P>_IN` says so. Single points outside the field are marked; if most of them lie outside, the unit must
+    be wrong.
 
     Raises `DataError` naming file, column and row for anything that cannot be meant.
     """
@@ -76,17 +77,18 @@ def field_points(
     columns = {name: numeric_column(source, name, rule) for name, rule in POINT_COLUMNS.items()}
     check(columns, POINT_COLUMNS, place)
     x, y = columns["X"], columns["Y"]
-    positions = {}
-    for prefix in instrument.moving():
+    moving = instrument.moving()
+    missing = [prefix for prefix in moving if prefix in always_in and f"{prefix}_ANGLE" not in source.names]
+    if missing:
+        options = " ".join(f"--at {prefix}=0" for prefix in missing)
+        raise place.fail(
+            f"the angle of {' and of '.join(missing)} is missing, in the beam in all exposures of the calibration",
+            ", ".join(f"{prefix}_ANGLE" for prefix in missing),
+            f"give the column (deg, NaN: out); the same for all points: walop-jax matrix {options}",
+        )
+    positions, turns = {}, {}
+    for prefix in moving:
         name = f"{prefix}_ANGLE"
-        if prefix in always_in and name not in source.names:
-            what = (
-                f"the angle of {prefix} is missing, which was in the beam in all exposures of the calibration"
-            )
-            advice = (
-                f"give the column {name} (deg, NaN: out); for all points of walop-jax matrix --at {prefix}=0"
-            )
-            raise place.fail(what, name, advice)
         angle = numeric_column(source, name, EXPOSURES["CLP_ANGLE"])
         doubt_radians(source, name, angle, place)
         inside, unstated = np.isfinite(angle), np.ones(source.rows, bool)
@@ -102,6 +104,10 @@ def field_points(
         place.refuse(inside & ~np.isfinite(angle), "is not finite", name, advice)
         check({name: angle}, {name: EXPOSURES["CLP_ANGLE"]}, place)
         positions[prefix] = np.where(inside, angle, np.nan)
+        if f"{prefix}_TURN" in source.names:
+            turn = numeric_column(source, f"{prefix}_TURN", TURN)
+            check({f"{prefix}_TURN": turn}, {f"{prefix}_TURN": TURN}, place)
+            turns[prefix] = np.where(inside, np.abs(turn), 0.0)
     limit = instrument.field_limit
     outside = np.maximum(np.abs(x), np.abs(y)) > limit
     if len(x) > _SINGLE and np.mean(outside) > 0.5:
@@ -116,6 +122,7 @@ def field_points(
         temperature=columns["TEMP"],
         hour_angle=columns["HA"],
         positions=positions,
+        turns=turns,
     )
     return FieldPoints(x=x, y=y, settings=settings, outside=outside)
 

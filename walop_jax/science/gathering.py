@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.camera_catalogues import CameraCatalogue
 from walop_jax.data.schema import Column
-from walop_jax.data.user_tables import OF_STARS, in_memory, numeric_column, read_input_table
+from walop_jax.data.user_tables import OF_STARS, in_memory, numeric_column, read_input_table, sky_positions
 from walop_jax.io.errors import fail
 from walop_jax.sky.directions import NOT_MOVED, REACH, Pointing, Registration, mutual, registered
 
@@ -93,8 +93,7 @@ def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
     source = (
         read_input_table(table, ("RA", "DEC")) if isinstance(table, str | os.PathLike) else in_memory(table)
     )
-    rule = Column("float", "deg")
-    ra, dec = (numeric_column(source, name, rule) for name in ("RA", "DEC"))
+    ra, dec = sky_positions(source)
     near = made.pointing.separation(ra, dec) < FARTHEST
     known = np.stack(made.pointing.field_of(ra[near], dec[near]), axis=1)
     place = np.stack([made.columns[name][0] for name in "XY"], axis=1)

@@ -242,14 +242,14 @@ class Watch(Displayed):
         )
         smallest = two_digits(percent * float(np.min(self.smallest)))
         return Display(
-            title="The calibration holds"
+            title="The calibration is still valid"
             if self.holds
-            else "The calibration HAS CEASED TO HOLD"
+            else "The calibration IS NO LONGER VALID"
             if self.changes
-            else "The stars CANNOT SAY whether the calibration holds",
+            else "The stars DO NOT SHOW whether the calibration is still valid",
             facts=(
                 ("exposure groups", f"{len(self.time)}"),
-                ("smallest step seen", f"{smallest} % of one camera, in 99 % of cases"),
+                ("sensitivity", f"a {smallest} % step in one camera would be detected (99 % probability)"),
             ),
             head=("time", ">stars", ">χ²/dof", *(f">{name} %" for name in self.cameras), ">seen %"),
             rows=rows,

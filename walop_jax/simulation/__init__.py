@@ -1,1 +1,1 @@
-"""Synthetic calibration sets that carry their truth: what is observed, an as-built instrument, noise."""
+"""Synthetic calibration sets that carry their truth: plans, an as-built instrument, noise."""

@@ -39,9 +39,7 @@ NARROW_BANDS: Mapping[str, float] = {"NB-580": 0.580, "NB-660": 0.660}  # centre
 _SPACING = 0.004  # d between exposures
 _GOLDEN = 0.5 * (3.0 - np.sqrt(5.0))  # of a turn: spreads any number of angles evenly
 _ZERO_EDGE = 0.9  # of the field
-_SPREAD = np.array(
-    [1.0 / 1.324717957244746, 1.0 / 1.324717957244746**2]
-)  # Roberts 2018: evenly in two dimensions
+_SPREAD = 1.0 / 1.324717957244746 ** np.array([1.0, 2.0])  # Roberts 2018: evenly in two dimensions
 _STANDARD_EDGE = 0.8  # of the field: 5 × 5 centres of boxes that fill it
 EXPOSED: Mapping[str, float] = {
     name: kind.seconds for name, kind in KINDS.items() if kind.seconds is not None
@@ -98,7 +96,7 @@ class Stop:
             )
 
     def document(self) -> dict[str, Any]:
-        """The stop as plain data, with what is as usual left out from `kind` on."""
+        """The stop as plain data, usual values left out from `kind` on."""
         later = {"kind": "clp", "number": 0, "place": None, "seconds": None, "turn": 0.0}
         return {k: v for k, v in dataclasses.asdict(self).items() if k not in later or v != later[k]}
 
@@ -434,21 +432,21 @@ class ObservingPlan:
         )
 
 
-def filter_curve(given: str | FilterCurve) -> FilterCurve:
+def filter_curve(curve: str | FilterCurve) -> FilterCurve:
     """A built-in filter, one of the narrow bands of `NARROW_BANDS` (flat-topped, 15 nm wide), or a curve, checked."""
-    if isinstance(given, FilterCurve):
-        given = _own_filter(given.name, given)
-    if isinstance(given, FilterCurve):
-        return given
-    if given in NARROW_BANDS:
+    if isinstance(curve, FilterCurve):
+        curve = _own_filter(curve.name, curve)
+    if isinstance(curve, FilterCurve):
+        return curve
+    if curve in NARROW_BANDS:
         offset = np.linspace(-0.015, 0.015, 61)
         throughput = np.exp(-np.log(2.0) * (offset / 0.0075) ** 6)
-        return FilterCurve(given, NARROW_BANDS[given] + offset, throughput)
-    if given in BUILTIN_FILTERS or single_wavelength(given) is not None:
-        return builtin_filter(given)
-    suggestion = nearest(given, (*BUILTIN_FILTERS, *NARROW_BANDS, "MONO-6500"))
+        return FilterCurve(curve, NARROW_BANDS[curve] + offset, throughput)
+    if curve in BUILTIN_FILTERS or single_wavelength(curve) is not None:
+        return builtin_filter(curve)
+    suggestion = nearest(curve, (*BUILTIN_FILTERS, *NARROW_BANDS, "MONO-6500"))
     raise ValueError(
-        f"filters: there is no filter {given!r}; {suggestion}; a filter of your own is a table [filters.{given}] with "
+        f"filters: there is no filter {curve!r}; {suggestion}; a filter of your own is a table [filters.{curve}] with "
         "wavelength (um) and throughput, in Python a FilterCurve"
     )
 
@@ -574,7 +572,7 @@ def _entries(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _written(value: Any) -> Any:
-    """Lists and tables as TOML has them, OUT for what is out."""
+    """Lists and tables as TOML has them, OUT for elements that are out."""
     if isinstance(value, Mapping):
         return {name: _written(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -73,7 +73,7 @@ def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
     Every parameter with a prior is drawn from it (efficiencies of analysers stop at 1), tied ones follow; throughputs
     are drawn as smooth maps: levels 0.5 ± 0.03, structure over the field of 2 % rms. The scale that all cameras
     share is a gauge, so the constant of camera N0 is 0.5; of arms whose share of the light is unknown the first camera
-    is 0.5 all over. What else has no prior stays at its start value.
+    is 0.5 all over. Other parameters without a prior stay at their start values.
     """
     values = model.start
     for i, p in enumerate(model.parameters):
@@ -109,7 +109,7 @@ def _throughput(template: Instrument, rng: np.random.Generator) -> Float[np.ndar
 
 
 def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, Standards]:
-    """A catalogue of standards, and what the stars really are."""
+    """A catalogue of standards, and the true stars."""
     n = plan.standards
     degree = np.where(np.arange(n) < plan.unpolarised, 0.0, rng.uniform(*_POLARISED, n))
     angle = rng.uniform(0.0, 2.0 * np.pi, n)
@@ -143,13 +143,13 @@ def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, 
 
 
 def _stars_of(plan: ObservingPlan, catalogue: Sources, true: Standards) -> tuple[Sources, Standards]:
-    """The first stars of a catalogue, with a value each, and what they really are: as in `true`, by name."""
+    """The first stars of a catalogue, with a value each, and the true ones: as in `true`, by name."""
     rows = np.unique(catalogue.stars)[: len(plan.star_names)]
     sources = Sources(**{f.name: getattr(catalogue, f.name)[rows] for f in dataclasses.fields(catalogue)})
     standards = standards_of(sources, plan.exposures(), plan.curves())
-    known = dict(zip((leaf.name for leaf in leaves(true)), np.asarray(values_of(true)), strict=True))
+    true_values = dict(zip((leaf.name for leaf in leaves(true)), np.asarray(values_of(true)), strict=True))
     values = zip((leaf.name for leaf in leaves(standards)), np.asarray(values_of(standards)), strict=True)
-    return sources, with_values(standards)(np.array([known.get(*pair) for pair in values]))
+    return sources, with_values(standards)(np.array([true_values.get(*pair) for pair in values]))
 
 
 def _scattered(
@@ -161,19 +161,19 @@ def _scattered(
 ) -> Cube:
     """Counts that the stars of a field have beyond those of their mean q, u: light is linear in them."""
     _, source = plan.layout()
-    seen, whole = source[:, :, None] == plan.standards, np.zeros_like(expected)
+    measured, scatter = source[:, :, None] == plan.standards, np.zeros_like(expected)
     for axis in "qu":
         moved = truth.changed("standard", **{axis: lambda value: value.at[plan.standards].add(_PROBE)})
-        own = plan.zero_scatter * rng.standard_normal(len(expected))
-        whole += np.where(seen, own[:, None, None] * (counts(moved) - expected) / _PROBE, 0.0)
-    return whole
+        deviation = plan.zero_scatter * rng.standard_normal(len(expected))
+        scatter += np.where(measured, deviation[:, None, None] * (counts(moved) - expected) / _PROBE, 0.0)
+    return scatter
 
 
 @dataclasses.dataclass(frozen=True)
 class PhotonNoise:
     """Photon noise and read noise (electron rms per measurement): N = Poisson(μ) + Normal(0, read_noise²).
 
-    What an observer states as N_ERR comes from the measured counts, σ(N): counts that came out low are given more
+    The N_ERR of an observer comes from the measured counts, σ(N): counts that came out low are given more
     weight, which biases a mean by −1 electron. Source: Howell 2006, Handbook of CCD Astronomy, 4.4.
     """
 
@@ -198,7 +198,7 @@ class PhotonNoise:
             raise ValueError(
                 "expected counts must be finite and non-negative: an effect, or a prior, leaves no possible light"
             )
-        # Read noise first: how many random numbers a Poisson draw takes depends on what is expected.
+        # Read noise first: how many random numbers a Poisson draw takes depends on the expected counts.
         read = self.read_noise * rng.standard_normal(expected.shape)
         counts = rng.poisson(expected) + read
         return counts, self.sigma(counts)
@@ -239,8 +239,8 @@ def simulate(
     flux = fluxes(plan, None if steady else sky)
     expected = _expected(blank, truth, flux)
     if plan.zero_stars and plan.zero_scatter > 0 and not noiseless:
-        own = np.random.SeedSequence(seed if catalogue_seed is None else catalogue_seed).spawn(5)[4]
-        stars = np.random.default_rng(own)
+        seeds = np.random.SeedSequence(seed if catalogue_seed is None else catalogue_seed).spawn(5)[4]
+        stars = np.random.default_rng(seeds)
         expected += _scattered(plan, truth, expected, lambda other: _expected(blank, other, flux), stars)
     detector = PhotonNoise(plan.read_noise)
     if noiseless:
@@ -329,14 +329,13 @@ def fluxes(plan: ObservingPlan, rng: np.random.Generator | None) -> Float[np.nda
     transparency = rng.uniform(*TRANSPARENCY, used.shape[1])
     illumination = rng.uniform(0.9, 1.1, used.shape[0])
     field = [np.mean(TRANSPARENCY)] * (len(plan.star_names) - plan.standards)
-    brightness = np.concatenate(
-        [rng.uniform(*TRANSPARENCY, plan.standards), field, [1.0]]
-    )  # the last: no star
+    stars = rng.uniform(*TRANSPARENCY, plan.standards)
+    brightness = np.concatenate([stars, field, [1.0]])  # the last: no star
     return 4.0 * electrons * illumination[:, None] * transparency * brightness[source]
 
 
 def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, "p e"]) -> Cube:
-    """Expected counts (electron) of every (point, exposure), what the detectors do to them included."""
+    """Expected counts (electron) of every (point, exposure), the response of the detectors included."""
     likelihood = Likelihood.of(blank, make_model(blank.instrument, truth))
     unit = np.concatenate(
         [np.asarray(engine.prediction(truth, likelihood.plan, c)) for c in likelihood.points]
@@ -356,7 +355,7 @@ def effect_from_text(text: str, context: Context, catalogue: Sequence[EffectKind
     """The effect of `catalogue` that a text stands for.
 
     A value is a number, numbers between slashes (one for each element of the parameter), or a word for a discrete
-    choice. Raises ValueError, with the nearest names, for what does not exist, and for values that are missing.
+    choice. Raises ValueError, with the nearest names, for names that do not exist, and for values that are missing.
     """
     name, _, assignments = (item.strip() for item in text.partition("="))
     kind = effect_by_name(name, catalogue)

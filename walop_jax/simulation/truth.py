@@ -62,8 +62,10 @@ class Template:
         """
         replaced = {effect.name for effect in effects}
         lost = () if plan == self.plan else left_behind(self.instrument)
-        kept = tuple(e for e in self.instrument.effects if e.name not in {*replaced, *lost})
-        return dataclasses.replace(self.instrument, effects=kept), tuple(n for n in lost if n not in replaced)
+        applicable = tuple(e for e in self.instrument.effects if e.name not in {*replaced, *lost})
+        return dataclasses.replace(self.instrument, effects=applicable), tuple(
+            n for n in lost if n not in replaced
+        )
 
     @classmethod
     def of(cls, simulated: Simulated) -> Template:
@@ -102,13 +104,13 @@ def read_truth(path: str | os.PathLike[str], effects: Sequence[EffectKind] = EFF
         raise fail("is not the truth of a simulated set", file=path, advice=advice) from None
     with errors_naming(path):
         design = _design(content)
-        made = plan_of_document(plan, design)
+        observing_plan = plan_of_document(plan, design)
         sources = Sources(**{name: np.asarray(catalogue[name]) for name in _CATALOGUE})
-        standards = standards_of(sources, made.exposures(), made.curves())
-        bare = adapted(design, throughput_degree=made.throughput_degree, throughput=LEVEL).with_source(
-            standards
-        )
-        context = made.context()._replace(sources=standards.star_names)
+        standards = standards_of(sources, observing_plan.exposures(), observing_plan.curves())
+        bare = adapted(
+            design, throughput_degree=observing_plan.throughput_degree, throughput=LEVEL
+        ).with_source(standards)
+        context = observing_plan.context()._replace(sources=standards.star_names)
         active = tuple(_effect(name, choices, context, effects) for name, choices in names.items())
         template = dataclasses.replace(bare, effects=active)
         order = [leaf.name for leaf in leaves(template)]
@@ -117,7 +119,7 @@ def read_truth(path: str | os.PathLike[str], effects: Sequence[EffectKind] = EFF
                 "its parameters are not those of its instrument and effects (give the --effects of it)"
             )
         numbers = np.array([values[name]["value"] for name in order], float)
-        return Template(with_values(template)(numbers), sources, made)
+        return Template(with_values(template)(numbers), sources, observing_plan)
 
 
 def _design(content: Mapping[str, Any]) -> Instrument:
@@ -129,5 +131,7 @@ def _design(content: Mapping[str, Any]) -> Instrument:
 
 def _effect(name: str, choices: Mapping[str, Any], context: Context, known: Sequence[EffectKind]) -> Effect:
     """An effect with its discrete choices; its numbers are put in later."""
-    given = {key: tuple(value) if isinstance(value, list) else value for key, value in choices.items()}
-    return effect_by_name(name, tuple(known)).of(context, **given)
+    choices_given = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in choices.items()
+    }
+    return effect_by_name(name, tuple(known)).of(context, **choices_given)

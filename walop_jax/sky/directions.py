@@ -2,7 +2,7 @@
 
     east = X sin R + Y cos R,    north = X cos R − Y sin R      on the tangent plane (deg), R = ROTATOR
 
-X and Y are coordinates on the sky: what the optics distort between sky and detector is in the WCS of an image, not in
+X and Y are coordinates on the sky: the distortion between sky and detector is in the WCS of an image, not in
 them. The axes of the instrument are carried along great circles from the field centre to a star (docs: conventions), so
 that +X has at the star the position angle
 
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from astropy import units
-from astropy.coordinates import SkyCoord
+from astropy.coordinates import SkyCoord, angular_separation
 from astropy.wcs import WCS
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
@@ -61,16 +61,21 @@ class Pointing:
         self, ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
         """Distance of directions from the field centre (deg)."""
-        return np.asarray(_directions(self.ra, self.dec).separation(_directions(ra, dec)).deg, float)
+        return separation(self.ra, self.dec, ra, dec)
 
     def rotator_at(
         self, ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
         """Position angle of +X (deg) at stars, from their own north."""
         centre, stars = _directions(self.ra, self.dec), _directions(ra, dec)
-        there = np.asarray(centre.position_angle(stars).deg)
+        outward = np.asarray(centre.position_angle(stars).deg)
         back = np.asarray(stars.position_angle(centre).deg) + 180.0
-        return np.mod(self.rotator + np.where(self.separation(ra, dec) > 0.0, back - there, 0.0), 360.0)
+        return np.mod(self.rotator + np.where(self.separation(ra, dec) > 0.0, back - outward, 0.0), 360.0)
+
+
+def separation(ra: Any, dec: Any, other_ra: Any, other_dec: Any) -> Float[np.ndarray, "*n"]:
+    """Angle between directions (all in degrees)."""
+    return np.asarray(np.rad2deg(angular_separation(*map(np.deg2rad, (ra, dec, other_ra, other_dec)))))
 
 
 def galactic(
@@ -82,9 +87,10 @@ def galactic(
     """
     stars: Any = _directions(ra, dec)
     pole: Any = SkyCoord(0.0, 90.0, unit="deg", frame="galactic")
-    there = stars.galactic
+    in_galactic = stars.galactic
     longitude, latitude, north = (
-        np.asarray(angle.deg, float) for angle in (there.l, there.b, stars.position_angle(pole.icrs))
+        np.asarray(angle.deg, float)
+        for angle in (in_galactic.l, in_galactic.b, stars.position_angle(pole.icrs))
     )
     return longitude, latitude, north
 
@@ -108,8 +114,8 @@ def same_stars(
 ) -> Int[np.ndarray, " n"]:
     """The number of the star of every position (deg): chains of those within a tolerance (arcsec) are one star."""
     stars = _directions(ra, dec)
-    one, other, *_ = stars.search_around_sky(stars, tolerance * units.arcsec)
-    pairs = coo_array((np.ones(len(one)), (one, other)), shape=(len(ra), len(ra)))
+    first, second, *_ = stars.search_around_sky(stars, tolerance * units.arcsec)
+    pairs = coo_array((np.ones(len(first)), (first, second)), shape=(len(ra), len(ra)))
     return connected_components(pairs, directed=False)[1]
 
 
@@ -151,9 +157,9 @@ def registered(
     Differences of all pairs of bright stars within `REACH` have a peak at the shift; the pairs there give shift and
     rotation by least squares, each round with those that are closer. No peak above chance: `pairs` is 0.
     """
-    some = place[np.argsort(-brightness, kind="stable")[:BRIGHTEST]]
-    others = reference[np.argsort(-of_reference, kind="stable")[:BRIGHTEST]]
-    difference = 3600.0 * (some[:, None] - others[None]).reshape(-1, 2)
+    bright = place[np.argsort(-brightness, kind="stable")[:BRIGHTEST]]
+    bright_reference = reference[np.argsort(-of_reference, kind="stable")[:BRIGHTEST]]
+    difference = 3600.0 * (bright[:, None] - bright_reference[None]).reshape(-1, 2)
     difference = difference[np.abs(difference).max(axis=1) < REACH]
     if not len(difference):
         return NOT_MOVED
@@ -162,22 +168,22 @@ def registered(
     count = count + np.roll(count, 1, 0)  # a peak may lie on the edges of four cells
     count = count + np.roll(count, 1, 1)
     peak, chance = np.unravel_index(count.argmax(), count.shape), count.mean()
-    if count.max() < max(3.0, chance + 6.0 * np.sqrt(chance), 0.05 * min(len(some), len(others))):
+    if count.max() < max(3.0, chance + 6.0 * np.sqrt(chance), 0.05 * min(len(bright), len(bright_reference))):
         return NOT_MOVED
-    found = Registration(np.array([edges[k] for k in peak]), 0.0, int(count.max()))
+    registration = Registration(np.array([edges[k] for k in peak]), 0.0, int(count.max()))
     for radius in np.geomspace(2.0 * _CELL, max(3.0 * tolerance, 1.0), _ROUNDS):
-        _, one, other = mutual(found.apply(some), others, radius)
-        if len(one) < 3:
+        _, rows, matches = mutual(registration.apply(bright), bright_reference, radius)
+        if len(rows) < 3:
             break
-        found = _fitted(some[one], others[other])
-    return found
+        registration = _fitted(bright[rows], bright_reference[matches])
+    return registration
 
 
 def _fitted(place: Float[np.ndarray, "n 2"], reference: Float[np.ndarray, "n 2"]) -> Registration:
     """Shift and rotation by least squares, small rotations: place = reference + shift + angle × (−Y, X)."""
     x, y = reference.T
-    one, none = np.ones(len(x)), np.zeros(len(x))
-    design = np.concatenate([np.stack([one, none, -y], 1), np.stack([none, one, x], 1)])
+    ones, zeros = np.ones(len(x)), np.zeros(len(x))
+    design = np.concatenate([np.stack([ones, zeros, -y], 1), np.stack([zeros, ones, x], 1)])
     along_x, along_y, angle = np.linalg.lstsq(design, (place - reference).T.ravel(), rcond=None)[0]
     return Registration(3600.0 * np.array([along_x, along_y]), float(np.rad2deg(angle)), len(x))
 
@@ -192,14 +198,14 @@ def mutual(
     """
     if not len(place) or not len(reference):
         return np.zeros(len(place), bool), np.zeros(0, int), np.zeros(0, int)
-    one, other = (_directions(*each.T) for each in (place, reference))
-    there, apart, _ = one.match_to_catalog_sky(other)
-    back, *_ = other.match_to_catalog_sky(one)
-    pairs = np.flatnonzero((back[there] == np.arange(len(place))) & (apart.arcsec <= tolerance))
+    stars, references = (_directions(*positions.T) for positions in (place, reference))
+    nearest, apart, _ = stars.match_to_catalog_sky(references)
+    back, *_ = references.match_to_catalog_sky(stars)
+    pairs = np.flatnonzero((back[nearest] == np.arange(len(place))) & (apart.arcsec <= tolerance))
     ambiguous = np.zeros(len(place), bool)
     if len(reference) > 1:
-        ambiguous = one.match_to_catalog_sky(other, nthneighbor=2)[1].arcsec <= tolerance
-    return np.asarray(ambiguous), pairs, np.asarray(there)[pairs]
+        ambiguous = stars.match_to_catalog_sky(references, nthneighbor=2)[1].arcsec <= tolerance
+    return np.asarray(ambiguous), pairs, np.asarray(nearest)[pairs]
 
 
 def _directions(ra: float | Float[np.ndarray, " n"], dec: float | Float[np.ndarray, " n"]) -> Any:

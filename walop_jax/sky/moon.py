@@ -76,7 +76,8 @@ def body_direction(
         raise fail(
             "the site is not known",
             column="SITELAT, SITELONG, SITEELEV",
-            advice="add them to the header, or [site] to the description of the instrument",
+            advice="add them to the header, or [site] to the description of the instrument; a plan without the Moon "
+            "has moon_patches = 0",
         )
     with _offline():
         # Imported here: coordinates take half a second, and only Moon exposures need them.
@@ -155,7 +156,7 @@ def rayleigh_sky(
     inputs = {"MOON": moon_ra, "MOON DEC": moon_dec, "RA": ra, "DEC": dec, "ROTATOR": rotator, "X": x, "Y": y}
     for name, values in inputs.items():
         if not np.all(np.isfinite(values)):
-            raise fail("is not finite", column=name, advice="give only exposures of the Moon sky")
+            raise fail("is not finite", column=name, advice="give only exposures of the moonlit sky")
 
     # Components of the Moon's direction along north, east and line of sight of the field centre.
     alpha, delta, delta_moon = np.deg2rad(np.asarray(moon_ra) - ra), np.deg2rad(dec), np.deg2rad(moon_dec)

@@ -21,7 +21,7 @@ from walop_jax.model.dependence import left_behind
 from walop_jax.model.effects import Change, Described, effect_by_name
 from walop_jax.model.effects.change import AMPLITUDES, KINDS
 from walop_jax.model.effects.factors import PLAIN, factor
-from walop_jax.model.effects.optics import AXES
+from walop_jax.model.effects.optics import AXES, matrix_of
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import NAME
 from walop_jax.model.planning import exposure_arrays
@@ -129,6 +129,21 @@ IN_VAIN = (
 )
 
 
+def test_depolarisation_of_a_stokes_parameter():
+    """diag(1, 1 − a, 1 − b, 1 − c), and the same of all three; ahead of the retarder it is another product."""
+    kinds = [Change(f"depolarisation {axis}", "of", "plate") for axis in "quv"]
+    shares = jnp.array([0.1, 0.02, 0.3])
+    found = matrix_of(list(zip(kinds, shares, strict=True)), 0.0, 0.0)
+    np.testing.assert_allclose(found, np.diag([1.0, 0.9, 0.98, 0.7]), atol=1e-15)
+    every = matrix_of([(Change("depolarisation", "of", "plate"), jnp.asarray(0.2))], 0.0, 0.0)
+    np.testing.assert_allclose(every, np.diag([1.0, 0.8, 0.8, 0.8]), atol=1e-15)
+    turn = Change("retardance v", "of", "plate")
+    both = matrix_of([(kinds[0], shares[0]), (turn, jnp.asarray(0.5 * np.pi))], 0.0, 0.0)
+    along_q, along_u = both @ jnp.array([1.0, 1.0, 0.0, 0.0]), both @ jnp.array([1.0, 0.0, 1.0, 0.0])
+    assert np.linalg.norm(along_q[1:]) == pytest.approx(1.0)  # turned to u before q is lost
+    assert np.linalg.norm(along_u[1:]) == pytest.approx(0.9)
+
+
 @pytest.mark.parametrize(("change", "factor"), IN_VAIN)
 def test_factors_that_would_be_left_out_are_refused(change, factor):
     with pytest.raises(ValueError, match=f"cannot grow with '{factor}'"):
@@ -204,6 +219,9 @@ EVERY_CHANGE = (
     "retardance radial of polariser",
     "retardance u of chwp * cos 2 CHWP",
     "depolarisation behind chwp * kelvin",
+    "depolarisation q behind collimator * x",
+    "depolarisation u of polariser",
+    "depolarisation v of chwp * cos 2 CHWP",
     "retardance v ahead of half2.plate * hours",
     "diattenuation diagonal ahead of half1.plate * colour",
     "added polarisation q ahead of polariser",

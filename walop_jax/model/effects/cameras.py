@@ -23,8 +23,11 @@ from walop_jax.model.cameras import DetectorPart, ExposurePart, GhostPart, Mixin
 from walop_jax.model.effects.change import (
     KINDS,
     OPPOSITE,
+    SINGLE,
+    SLOW,
     AtPoint,
     Change,
+    Combinations,
     Grows,
     Kind,
     Scalar,
@@ -174,8 +177,27 @@ _WITH: Mapping[str, tuple[str, ...]] = {
 }
 
 
+_CAMERA = (
+    Combinations(along=("counts",), among=("alone", "all")),
+    Combinations(along=("harmonics to 6", *SLOW, *SINGLE, "side", "night", "step", "exposure", "kind")),
+    Combinations(("tilt",), ("harmonics to 1",), ("alone", "all")),  # an image that goes in a circle
+    Combinations(("tilt", "focus"), SLOW),
+    Combinations(("tilt",), (*SINGLE, "kind", "side"), ("alone", "arm")),
+)
+_ARM = (
+    Combinations(along=(*SLOW, *SINGLE, "night")),
+    Combinations(("rings",)),
+    Combinations(("tilt",), (*SLOW, *SINGLE, "kind")),
+)
+_LIGHT = Combinations(along=("steady", *SLOW, *SINGLE, "kind")), Combinations(among=("all",))
+
+
 def _grows(instrument: Instrument, change: Change) -> Grows:
-    return Grows(_WITH.get(stage_of(change), ()), None)
+    stage = stage_of(change)
+    tried = _LIGHT if stage == "median" else (Combinations(among=("alone", "all")),)
+    if change.kind == "gain":
+        tried = _CAMERA if change.place in instrument.cameras.names else _ARM
+    return Grows(_WITH.get(stage, ()), None, tried)
 
 
 def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:

@@ -39,13 +39,8 @@ Term = tuple["Change", Scalar]
 Given = str | Callable[[Any], Any]
 """A factor: a text, or a function of the quantities that factors may ask for."""
 OPPOSITE = "opposite"  # the field point, as an origin of light
-SINGLE = (
-    "exposure",
-    "kind",
-    "side",
-    "order",
-    "per EXPTIME",
-)  # forms of factors that ask for the list of exposures
+SLOW, SINGLE = ("hours", "kelvin", "hour angle"), ("per EXPTIME", "order")
+OF_LIST = ("exposure", "kind", "side", *SINGLE)  # forms of factors that ask for the list of exposures
 SKY, BAND = "sky", "band"  # places that are no element
 
 
@@ -69,8 +64,20 @@ AMPLITUDES = {
 """Amplitudes of changes, by the parameter of `described` that holds them."""
 
 
+class Combinations(NamedTuple):
+    """Factors with which a diagnosis tries changes: each pattern over the field with each form of dependence.
+
+    Patterns and forms are those of `diagnosis.dependences`; `among` says which changes are tried together, each with
+    its amplitude: each alone, those of the cameras of an arm, of all cameras or arms, or anything optics can do there.
+    """
+
+    over: tuple[str, ...] = ("even",)
+    along: tuple[str, ...] = ("steady",)
+    among: tuple[str, ...] = ("alone",)
+
+
 class Grows(NamedTuple):
-    """Dependences that a change may have (`Factor.depends_on`), and which of angles and single exposures.
+    """Dependences that a change may have (`Factor.depends_on`), which of angles and single exposures, what is `tried`.
 
     Of angles that of one element, by the prefix of its columns; None: of any, and in single exposures and those of a
     KIND as well.
@@ -78,6 +85,7 @@ class Grows(NamedTuple):
 
     allowed: tuple[str, ...] = ()
     angle: str | None = ""
+    tried: tuple[Combinations, ...] = ()
 
 
 class NoSlotError(ValueError):
@@ -170,7 +178,7 @@ class Change:
         """True if what it does to a star is known from the counts and the place of the star alone."""
         elsewhere = self.kind == "afterglow" or (self.kind == "light" and self.origin in ("", OPPOSITE))
         return not elsewhere and not any(
-            item.text == "hours" or item.form in ("hours", *SINGLE) for item in self.grows_with
+            item.text == "hours" or item.form in ("hours", *OF_LIST) for item in self.grows_with
         )
 
     def times(self, *factors: str) -> Change:
@@ -204,12 +212,12 @@ class Change:
 
     def check_factors(self, instrument: Instrument) -> None:
         """Raise ValueError for a factor that the kind would leave out."""
-        allowed, angle = KINDS[self.kind].grows(instrument, self)
+        allowed, angle, _ = KINDS[self.kind].grows(instrument, self)
         for item in self.grows_with:
             if item.form == "kind":
                 check_names("KIND of exposures", item.given, instrument.kinds)
             matching = angle is None or (item.form in ("cos", "sin") and item.given[-1] == angle)
-            single = item.form in ("cos", "sin", *SINGLE)
+            single = item.form in ("cos", "sin", *OF_LIST)
             if item.depends_on not in allowed or (single and not matching):
                 takes = ", ".join(allowed) or "nothing"
                 only = f"; of angles that of {angle} alone" if angle else ""

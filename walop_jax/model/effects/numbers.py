@@ -12,7 +12,9 @@ from walop_jax.model.effects.change import (
     BAND,
     KINDS,
     SKY,
+    SLOW,
     Change,
+    Combinations,
     Grows,
     Kind,
     SlotTerm,
@@ -44,11 +46,21 @@ def _number(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return instrument
 
 
+_FIELD = ("even", "tilt", "r2")
+
+
 def _with_ray(instrument: Instrument, change: Change) -> Grows:
     """Plates with what a ray knows, and with their own angle."""
     holders = [p for p in instrument.places(WavePlate) if f"{change.place}.".startswith(f"{p}.")]
     moves = instrument.element(holders[0]).moves if holders else None
-    return Grows((FIELD, WAVELENGTH, EXPOSURE), moves or "")
+    tried = (
+        Combinations(_FIELD, ("steady", *SLOW)),
+        Combinations(along=("step",)),
+        Combinations(among=("all",)),
+    )
+    if change.kind != "axis" or change.place not in holders:
+        tried = (Combinations(_FIELD),) if change.kind == "thickness" else (Combinations(),)
+    return Grows((FIELD, WAVELENGTH, EXPOSURE), moves or "", tried)
 
 
 def _of_plate(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -99,8 +111,10 @@ def _polarised(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 def _of_patch(instrument: Instrument, change: Change) -> Grows:
     """Of one patch of the sky, which is an exposure; of a star what changes with time and from filter to filter."""
     if change.place != SKY:
-        return Grows((EXPOSURE, WAVELENGTH))
-    return Grows((EXPOSURE,), None) if change.kind != "polarisation" else Grows()
+        return Grows((EXPOSURE, WAVELENGTH), tried=(Combinations(),))
+    if change.kind == "polarisation":
+        return Grows(tried=(Combinations(),))
+    return Grows((EXPOSURE,), None, (Combinations(along=("patch",)),))
 
 
 def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -149,7 +163,13 @@ KINDS |= {
 OF_POLARISER = ("extinction", "ellipticity")
 KINDS |= {name: Kind("share", _number, slots=itself("light")) for name in OF_POLARISER}
 _OF_BAND = "narrow bands beside the broad one"  # filters wider than `light.BROAD` are displaced
-KINDS["shift"] = Kind("wavelength", _of_instrument, test=_OF_BAND, slots=itself("whole"))
+KINDS["shift"] = Kind(
+    "wavelength",
+    _of_instrument,
+    test=_OF_BAND,
+    grows=lambda *_: Grows(tried=(Combinations(),)),
+    slots=itself("whole"),
+)
 _OF_ROTATOR = "a polariser aligned in the laboratory: an independent zero of the angle"
 KINDS["rotator"] = Kind("angle", _of_instrument, test=_OF_ROTATOR, slots=itself("light"))
 _OF_SOURCE = "the same patch or star again at another ROTATOR angle"

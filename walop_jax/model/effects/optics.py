@@ -1,9 +1,9 @@
 """Changes of the optics: retardance, diattenuation, depolarisation, a turn; displacement of the field; fringes.
 
 Equation    M → M_Δ M_R M_D M at one place of the train, with
-            M_R = exp Σ r_i G_i (a retarder), M_D the diattenuator of vector d, M_Δ = diag(1, k, k, k)
+            M_R = exp Σ r_i G_i (a retarder), M_D the diattenuator of vector d, M_Δ = diag(1, k_q, k_u, k_v)
 Symbols     r, d sums of amplitude × factor along q, u, v; radial: x² − y² along q, 2xy along u (in units of the field);
-            diagonal: −2xy and x² − y²; k = 1 − the share that is lost; a turn by α is r_v = −2α
+            diagonal: −2xy and x² − y²; k = 1 − the share of it that is lost; a turn by α is r_v = −2α
 Source      Lu & Chipman 1996, JOSA A 13, 1106: every Mueller matrix near the identity is such a product
 Limits      exact for one kind at a place; which of several acts first is a matter of second order
 """
@@ -22,8 +22,11 @@ from jaxtyping import Array, Float
 from walop_jax.model import mueller
 from walop_jax.model.effects.change import (
     KINDS,
+    SINGLE,
+    SLOW,
     AtPoint,
     Change,
+    Combinations,
     Grows,
     Kind,
     Scalar,
@@ -47,13 +50,20 @@ LARGEST_GAP = 60.0  # µm of air
 
 
 AXES = ("q", "u", "v", "radial", "diagonal")
-GENERATORS = (
-    *(f"{what} {axis}" for what in ("diattenuation", "retardance") for axis in "quv"),
-    "depolarisation",
+GENERATORS = tuple(
+    f"{what} {axis}" for what in ("diattenuation", "retardance", "depolarisation") for axis in "quv"
 )
 """Kinds of which all others are sums."""
 ADDED = ("added polarisation q", "added polarisation u")
 DISPLACEMENTS = ("displacement x", "displacement y")
+GROUPS = (
+    *(tuple(f"{what} {axis}" for axis in "qu") for what in ("diattenuation", "retardance")),
+    ("diattenuation v",),
+    ("retardance v",),
+    ("depolarisation",),
+    *((f"{what} {axis}",) for what in ("diattenuation", "retardance") for axis in ("radial", "diagonal")),
+)
+"""Kinds that a diagnosis tries, those of one phenomenon together."""
 
 
 def generators_of(kind: str) -> tuple[tuple[str, float, tuple[str, ...]], ...]:
@@ -61,6 +71,8 @@ def generators_of(kind: str) -> tuple[tuple[str, float, tuple[str, ...]], ...]:
     what, _, axis = kind.partition(" ")
     if what == "turn":  # a circular retarder
         return (("retardance v", -2.0 * np.pi / 180.0, ()),)
+    if kind == "depolarisation":
+        return tuple((f"depolarisation {axis}", 1.0, ()) for axis in "quv")
     if axis == "radial":
         return (f"{what} q", 1.0, ("x2-y2",)), (f"{what} u", 1.0, ("xy",))
     if axis == "diagonal":
@@ -80,10 +92,10 @@ def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
         for what, make in (("diattenuation", mueller.diattenuator), ("retardance", mueller.general_retarder))
         if any(name.startswith(what) for name in sums)
     )
-    if "depolarisation" in sums:
-        lost = jnp.asarray(sums["depolarisation"])[..., None, None]
-        transmitted = 1.0 - lost * jnp.array([[0.0], [1.0], [1.0], [1.0]])
-        matrix = transmitted * (jnp.eye(4) if matrix is None else matrix)
+    if any(name.startswith("depolarisation") for name in sums):
+        lost = [jnp.asarray(sums.get(f"depolarisation {axis}", 0.0)) for axis in "quv"]
+        kept = 1.0 - jnp.stack(jnp.broadcast_arrays(jnp.zeros(()), *lost), axis=-1)[..., None]
+        matrix = kept * (jnp.eye(4) if matrix is None else matrix)
     assert matrix is not None
     return matrix
 
@@ -190,16 +202,34 @@ def _beside(instrument: Instrument, element: Element, change: Change) -> Instrum
     return instrument.inserted(element, **{"before" if change.where == "ahead of" else "after": change.place})
 
 
+_FIELD = ("even", "tilt", "r2", "astigmatic")
+_NOT_IN_OTHER_KINDS = {"q": _FIELD[:3], "u": _FIELD[:3], "radial": _FIELD[:1], "diagonal": _FIELD[:1]}
+_ANYTHING = Combinations(_FIELD[:3], ("steady", "hours", "kelvin"), ("anything",))
+_TURN = (
+    Combinations(_FIELD, ("steady", *SLOW)),
+    Combinations(along=("harmonics to 6", *SINGLE, "side", "night", "step", "spell", "exposure")),
+    Combinations(("tilt", "r2"), ("harmonics to 1",)),  # a beam that wanders over a film that is not uniform
+)
+
+
 def _grows(instrument: Instrument, change: Change) -> Grows:
     """Optics with what a ray knows, and with the angle of the element that they are of; the polariser by exposure."""
-    polariser = instrument.polariser
+    kind, polariser = change.kind, instrument.polariser
+    over = _NOT_IN_OTHER_KINDS.get(kind.rpartition(" ")[2], _FIELD)
+    always = Combinations(over, ("steady", *SLOW))
     if _is_ahead(instrument, change):
-        return Grows((FIELD, EXPOSURE), None)
+        return Grows((FIELD, EXPOSURE), None, (always, Combinations(along=(*SINGLE, "kind")), _ANYTHING))
     if change.where != "of":
-        return Grows((FIELD, WAVELENGTH, EXPOSURE))
+        more = Combinations(over, ("colour",)), Combinations(among=("all",)), _ANYTHING
+        return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=(always, *more))
     if polariser is not None and change.place == polariser.name:
-        return Grows((FIELD, EXPOSURE), None)
-    return Grows((FIELD, WAVELENGTH, EXPOSURE), instrument.element(change.place).moves or "")
+        film = always, Combinations(over, ("harmonics to 2",)), Combinations(along=(*SINGLE, "side"))
+        as_a_turn = {"turn": _TURN, "retardance v": ()}
+        return Grows((FIELD, EXPOSURE), None, as_a_turn.get(kind, film))
+    tried = (
+        Combinations(along=("step", "spell")) if kind == "turn" else Combinations(over, ("harmonics to 2",))
+    )
+    return Grows((FIELD, WAVELENGTH, EXPOSURE), instrument.element(change.place).moves or "", (tried,))
 
 
 def _is_ahead(instrument: Instrument, change: Change) -> bool:
@@ -252,7 +282,12 @@ def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 def _grows_added(instrument: Instrument, change: Change) -> Grows:
     """Anything where light from the sky has it alone, nothing behind."""
-    return Grows((FIELD, EXPOSURE), None) if _is_ahead(instrument, change) else Grows()
+    tried = (
+        Combinations(("tilt", "r2")),  # the same everywhere it is diattenuation
+        Combinations(("even", "tilt", "r2"), SLOW),
+        Combinations(along=(*SINGLE, "kind")),
+    )
+    return Grows((FIELD, EXPOSURE), None, tried) if _is_ahead(instrument, change) else Grows()
 
 
 def _displaced(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -270,11 +305,9 @@ def _slots_of_fringes(instrument: Instrument, change: Change) -> list[SlotTerm]:
     return [SlotTerm(("fringes", change.place, change.gap), 1.0, factors)]
 
 
-_OPTICAL = {f"retardance {axis}": "retardance" for axis in AXES} | {
-    "depolarisation": "share",
-    "turn": "angle",
-}
+_OPTICAL = {f"retardance {axis}": "retardance" for axis in AXES} | {"turn": "angle"}
 _OPTICAL |= {f"diattenuation {axis}": "share" for axis in AXES}
+_OPTICAL |= {f"depolarisation{axis}": "share" for axis in ("", " q", " u", " v")}
 KINDS |= {
     name: Kind(amplitude, _optics, _at, grows=_grows, slots=_slots) for name, amplitude in _OPTICAL.items()
 }
@@ -286,12 +319,16 @@ KINDS |= {
         _displaced,
         lambda change: change.place,
         _OF_FIELD,
-        lambda *_: Grows((FIELD, EXPOSURE)),
+        lambda *_: Grows((FIELD, EXPOSURE), tried=(Combinations(("even", "tilt", "r2"), ("steady", *SLOW)),)),
         slots=itself("whole"),
     )
     for name in DISPLACEMENTS
 }
 _OF_FRINGES = "narrow bands a nanometre apart, or the same band at another temperature"
 KINDS["fringes"] = Kind(
-    "share", _fringes, test=_OF_FRINGES, grows=lambda *_: Grows((SHAPE,)), slots=_slots_of_fringes
+    "share",
+    _fringes,
+    test=_OF_FRINGES,
+    grows=lambda *_: Grows((SHAPE,), tried=(Combinations(among=("alone", "all")),)),
+    slots=_slots_of_fringes,
 )
