@@ -49,6 +49,7 @@ PATTERNS: Mapping[str, tuple[str, ...]] = {
     "r2": ("r2",),
     "astigmatic": ("x2-y2", "xy"),
     "focus": ("", "r2"),
+    "smooth": ("", "x", "y", "r2"),
     "rings": tuple(f"ring {degree}" for degree in thresholds.RINGS),
 }
 """Patterns over the field (`Combinations.over`): factors that have an amplitude each."""

@@ -183,6 +183,7 @@ _CAMERA = (
     Combinations(("tilt",), ("harmonics to 1",), ("alone", "all")),  # an image that goes in a circle
     Combinations(("tilt", "focus"), SLOW),
     Combinations(("tilt",), (*SINGLE, "kind", "side"), ("alone", "arm")),
+    Combinations(("smooth",), (*SLOW, *SINGLE, "kind", "side"), ("alone", "arm")),
 )
 _ARM = (
     Combinations(along=(*SLOW, *SINGLE, "night")),
