@@ -277,7 +277,7 @@ def test_batches_change_nothing(block, likelihood, values):
     batched = likelihood_of(block, batch=3)
     assert len(batched.points) == 3
     same(batched.expand(values), likelihood.expand(values))
-    assert (batched.dof, batched.census.n_data) == (likelihood.dof, likelihood.census.n_data)
+    assert (batched.independent, batched.census.n_data) == (likelihood.independent, likelihood.census.n_data)
 
 
 def test_order_of_the_points_changes_nothing(block, likelihood, values):
@@ -298,7 +298,7 @@ def test_row_that_is_not_used_is_as_good_as_removed(block, values):
         changed(block, **{name: getattr(block, name)[:, keep] for name in names}), [ROWS[i] for i in keep]
     )
     same(masked.expand(values), removed.expand(values))
-    assert (masked.dof, masked.census.n_data) == (removed.dof, removed.census.n_data)
+    assert (masked.independent, masked.census.n_data) == (removed.independent, removed.census.n_data)
     flux, residual = masked.residuals(values)
     np.testing.assert_array_equal(residual[:, gone], 0.0)
     assert np.isfinite(flux).all()
@@ -323,14 +323,13 @@ def test_known_flux_is_not_eliminated(block, values):
     assert twice > 2 * likelihood_of(alone).expand(values).data
 
 
-def test_degrees_of_freedom(block, likelihood):
-    """Three per row, four with known flux, one per prior, minus the free parameters; counted by hand."""
+def test_independent_data(block, likelihood):
+    """Three per row, four with known flux, one per prior; counted by hand."""
     rows = block.used.sum()
     flux_rows = block.used[:, -1].sum()
-    # priors: collimator 3, calibration plate 2, pupil 2, each half 4, two standards 4; throughput 4 × 6; δ
-    priors, free = 3 + 2 + 2 + 8 + 4, 3 + 2 + 2 + 8 + 4 + 24 + 1
+    priors = 3 + 2 + 2 + 8 + 4  # collimator, calibration plate, pupil, each half four, two standards
     assert likelihood.census.n_data == 4 * rows
-    assert likelihood.dof == 3 * rows + flux_rows + priors - free
+    assert likelihood.independent == 3 * rows + flux_rows + priors
 
 
 def test_eliminated_flux_is_the_least_squares_one():

@@ -120,7 +120,7 @@ def test_expansion_and_counts_agree(calset, streaming):
     # What an expansion has counted on its way is what a pass of its own counts.
     for found in (a, b):
         np.testing.assert_array_equal(found.census.rows, one.census.rows)
-        assert (found.n_data, found.dof) == (other.census.n_data, other.dof)
+        assert (found.n_data, found.dof) == (other.census.n_data, a.dof)
     assert a.n_data == 4 * other.used.sum() == 4 * calset.intensities.rows
     used = np.arange(81) % 17 != 3
     x, y = calset.points.x[used], calset.points.y[used]

@@ -10,6 +10,7 @@ import pytest
 from walop_jax.diagnosis.design import Design
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
+from walop_jax.likelihood.inverses import determined
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.posterior.target import Target
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
@@ -104,7 +105,8 @@ def test_fit_sampler_and_diagnosis_have_one_posterior(calset, model):
         p.free and p.tie is None and p.prior is None and p.loose is not None for p in model.parameters
     )
     fluxes = int(result.likelihood.used.sum())
-    assert design.eliminated == fluxes + pulls
+    assert fluxes < design.eliminated <= fluxes + pulls
+    assert design.projector.free == posterior.dof
 
 
 def test_a_frozen_parameter_is_taken_as_it_is(calset, model):
@@ -123,4 +125,44 @@ def test_degrees_of_freedom_count_free_parameters_alone(calset, model):
     assert len(varied) <= len(model.parameters) - 3
     likelihood = Likelihood.of(calset, model)
     priors = sum(p.prior is not None for p in varied)
-    assert likelihood.dof == 3 * likelihood.used.sum() + priors - len(varied)
+    assert likelihood.independent == 3 * likelihood.used.sum() + priors
+    # Where all are equal, the two slopes over the field that cameras have in common are fluxes.
+    assert likelihood.expand(model.start).dof == likelihood.independent - (len(varied) - 2)
+
+
+def test_terms_that_no_data_determine_are_no_lost_degrees_of_freedom(calset):
+    """59 terms of the series at 13 places, where four cameras have three ratios: 39, the rank of the derivatives."""
+    model = base_model(calset)
+    likelihood = Likelihood.of(calset, model)
+    pulled = [model.parameters[i].loose is not None for i in model.free]
+    columns = likelihood.jacobian(model.start)[:, pulled] * [
+        model.parameters[i].loose for i in model.free[pulled]
+    ]
+    rank = np.linalg.matrix_rank(columns, tol=1.0)  # singular values: how much better data know than pulls
+    assert (sum(pulled), rank) == (59, 3 * len(calset.points))
+    others = len(pulled) - sum(pulled)
+    assert likelihood.expand(model.start).dof == likelihood.independent - others - rank
+
+
+def test_parameters_that_data_determine_in_closed_form():
+    """Alone a share a / (a + w); of two that are seen as a sum one; of what nothing pulls, all."""
+    a, w = np.array([3.0, 0.0, 5.0]), np.array([1.0, 2.0, 0.0])
+    assert determined(np.diag(a + w), w) == pytest.approx(3.0 / 4.0 + 0.0 + 1.0)
+    seen, pull = 1e6 * np.ones((2, 2)), np.full(2, 1e-3)
+    assert determined(seen + np.diag(pull), pull) == pytest.approx(1.0)
+    assert determined(np.zeros((2, 2)), np.zeros(2)) == 2.0
+    assert determined(np.diag([0.0, 4.0]), np.array([0.0, 1.0])) == pytest.approx(1.75)
+
+
+def test_expected_chi_square_of_a_linear_model_is_its_degrees_of_freedom():
+    """Ten data, six parameters of which the data see three, drawn from their pulls: mean χ² of 20 000 fits."""
+    rng = np.random.default_rng(5)
+    rows = rng.standard_normal((10, 3)) @ np.eye(3, 6)
+    weak = np.full(6, 0.2)
+    matrix = rows.T @ rows + np.diag(weak)
+    data = rows @ (rng.standard_normal((6, 20_000)) / np.sqrt(weak)[:, None])
+    data += rng.standard_normal(data.shape)
+    chi2 = np.sum((data - rows @ np.linalg.solve(matrix, rows.T @ data)) ** 2, axis=0)
+    dof = 10 - determined(matrix, weak)
+    assert 7.0 < dof < 7.5
+    assert chi2.mean() == pytest.approx(dof, abs=5 * chi2.std() / np.sqrt(chi2.size))

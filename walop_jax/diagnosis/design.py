@@ -50,7 +50,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import cut, states
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.flux import project_flux
-from walop_jax.likelihood.inverses import unit_columns, whitening
+from walop_jax.likelihood.inverses import determined, unit_columns, whitening
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.effects.free_form import FINE, HARMONICS, SMOOTH, WIDTH
@@ -325,10 +325,11 @@ class Design:
 
     @property
     def eliminated(self) -> int:
-        """Rows that carry no noise: one for every flux that was solved for, one for every weak pull."""
+        """Rows that carry no noise: one for every flux that was solved for, for every weak pull that does nothing."""
         likelihood = self.fit.likelihood
         fluxes = round(float(self.measured.used.sum(axis=0) @ (likelihood.cameras - likelihood.data_per_row)))
-        return fluxes + int((~self.fit.likelihood.priors.known).sum())
+        fitted = determined(self.jacobian.T @ self.jacobian, likelihood.weak)
+        return fluxes + int((~likelihood.priors.known).sum()) - (len(likelihood.weak) - round(fitted))
 
     def _columns_of(self, name: str) -> Bool[np.ndarray, " f"]:
         """True for the columns of the Jacobian that are those of an effect."""

@@ -336,6 +336,16 @@ class ScoreSpace:
             first += rank
         return smallest
 
+    def smallest_of(self, drawn: Float[np.ndarray, "a d"]) -> Vector:
+        """ln of the smallest p among all candidates in each draw of the scores C̃ᵀr, for noise of unit size."""
+        smallest = np.zeros(drawn.shape[1])
+        for name, at in self.places().items():
+            w = self.whitened[name]
+            if w.shape[1]:
+                statistic = np.sum((w.T @ np.where(self.alive[at][:, None], drawn[at], 0.0)) ** 2, axis=0)
+                np.minimum(smallest, _log_survival(statistic, w.shape[1]), out=smallest)
+        return smallest
+
 
 class _Root:
     """L of a Gram matrix G = L Lᵀ (`whole`) of some `rank`: Cholesky's method, the column with most left coming next.

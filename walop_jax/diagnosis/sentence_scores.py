@@ -1,13 +1,14 @@
-"""The scores of all descriptions against a fit, each by itself: what a diagnosis would find, the fit is asked as well.
+"""The scores of all effects and descriptions against a fit: what a diagnosis would find, the fit is asked as well.
 
-A description is one group of sentences (`grammar`). Its score needs of the design the products of its own columns
-with each other, the residuals and the projection alone; so the columns are made some at a time, and nothing is kept of
-them. All descriptions count as trials (Šidák), which is more than there are in effect: what has a corrected p here has
-no larger one in a diagnosis.
+The list is that of a diagnosis (`grammar.hypotheses`). The score of a candidate needs of the design the products of its
+own columns with each other, the residuals and the projection alone; so the columns are made some at a time, and nothing
+is kept of them but their scores in draws of noise. These give the number of independent trials, as in a diagnosis, so
+that both correct p alike.
 """
 
 from __future__ import annotations
 
+import collections
 from collections.abc import Iterator
 
 import numpy as np
@@ -17,22 +18,28 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates
-from walop_jax.diagnosis.score import ScoreSpace, ScoreTable
+from walop_jax.diagnosis.score import ScoreSpace, ScoreTable, effective_trials
+from walop_jax.model.effects import Described
 
 TOGETHER = 1e8  # numbers of columns that are there at a time
+DRAWS = 200  # of noise: a fifth of them give the number of trials to 16 %
 _SHOWN = 3
 
 
-def sentence_scores(design: Design) -> ScoreTable:
-    """The scores of all descriptions that an instrument and its exposures allow, with their corrected p."""
+def sentence_scores(design: Design, seed: int = 0) -> ScoreTable:
+    """The scores of all that a model may lack, effects and descriptions, with their corrected p."""
     fit = design.fit
     calset: CalibrationSet = fit.calset
-    every = grammar.sentences(fit.model.template, calset.exposures, len(calset.points))
+    listed = grammar.hypotheses(fit.model.catalogue, fit.model.template, calset.exposures, len(calset.points))
+    absent = [probe for probe in listed.names if probe.effect.name not in fit.model.effect_names]
+    every = (*absent, *listed.sentences, *(probe for probe, _ in listed.parts))
     residual = design.projector(design.residual)
     noise = float(np.sqrt(residual @ residual / max(design.projector.free, 1))) or 1.0
     names: list[str] = []
     sizes: list[int] = []
     parts: list[tuple[np.ndarray, ...]] = []
+    normal = np.random.default_rng(seed).standard_normal((len(residual), DRAWS), dtype=np.float32)
+    normal -= (design.projector.basis @ (design.projector.basis.T @ normal)).astype(np.float32)
     for some in _batches(every, len(design.residual)):
         for probe, columns in _columns(design, some):
             own = columns.astype(float) / fit.noise_scale
@@ -40,15 +47,17 @@ def sentence_scores(design: Design) -> ScoreTable:
             square = own.T @ own
             names.append(probe.name)
             sizes.append(own.shape[1])
+            drawn = own.T.astype(np.float32) @ normal[: len(own)]
             parts.append(
-                (probe.widths, np.diag(square), own.T @ residual[: len(own)], square - along.T @ along)
+                (probe.widths, np.diag(square), own.T @ residual[: len(own)], drawn, square - along.T @ along)
             )
     if not names:
         return ScoreTable((), noise, 1.0, 1.0)
-    widths, before, scores = (np.concatenate(each) for each in list(zip(*parts, strict=True))[:3])
+    widths, before, scores, drawn = (np.concatenate(each) for each in list(zip(*parts, strict=True))[:4])
     gram = np.asarray(linalg.block_diag(*(block for *_, block in parts)))
     space = ScoreSpace(tuple(names), tuple(sizes), widths, before, gram, design.projector.free)
-    return space.table_after(ScoreTable((), noise, 1.0, float(len(names))), scores)
+    trials = effective_trials(space.smallest_of(drawn))
+    return space.table_after(ScoreTable((), noise, 1.0, trials), scores)
 
 
 def _batches(every: tuple[Probe, ...], rows: int) -> Iterator[list[Probe]]:
@@ -64,13 +73,16 @@ def _batches(every: tuple[Probe, ...], rows: int) -> Iterator[list[Probe]]:
 
 
 def _columns(design: Design, some: list[Probe]) -> Iterator[tuple[Probe, np.ndarray]]:
-    said = all_candidates(design.columns, (), some)[1]
-    yield from ((probe, said[probe.name].columns) for probe in some if probe.name in said)
+    names, sentences = (
+        [p for p in some if (p.effect is Described) == described] for described in (False, True)
+    )
+    candidates = collections.ChainMap(*all_candidates(design.columns, names, sentences))
+    yield from ((probe, candidates[probe.name].columns) for probe in some if probe.name in candidates)
 
 
-def described_doubts(design: Design) -> Iterator[str]:
-    """A sentence if descriptions of what may be missing explain more than noise does."""
-    table = sentence_scores(design)
+def described_doubts(design: Design, seed: int = 0) -> Iterator[str]:
+    """A sentence if effects or descriptions of what may be missing explain more than noise does."""
+    table = sentence_scores(design, seed)
     if table.p_global >= thresholds.ALARM:
         return
     names = table.significant(thresholds.ALARM, _SHOWN)

@@ -105,7 +105,7 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
         doubts = (
             *stated_conditions(design, singles),
             *_patterns(table),
-            *described_doubts(design),
+            *described_doubts(design, seed),
             *in_words(components),
             *_groups(design),
             *repeated_noise(design),

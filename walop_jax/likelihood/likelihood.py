@@ -15,6 +15,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
 from walop_jax.likelihood.flux import Sharing
+from walop_jax.likelihood.inverses import determined
 from walop_jax.likelihood.layout import (
     Layout,
     MeasuredPoints,
@@ -89,7 +90,7 @@ class Posterior:
     errors of the data times `noise_scale`; `data` and `chi2` are with the errors as given. `loose` is the
     share of the weak pulls that are no prior knowledge; it is in the gradient and the matrix, not in
     `chi2`. `dof` counts the independent data of every used row (`Likelihood.data_per_row`), one per prior, less the
-    free parameters.
+    parameters that these determine (`determined`).
     """
 
     data: float
@@ -262,6 +263,13 @@ class Likelihood:
         """Prior knowledge of the free parameters, from the model."""
         return prior_rows(self.model)
 
+    @cached_property
+    def weak(self) -> Float[np.ndarray, " f"]:
+        """Precision of the weak pull of every free parameter; 0 where there is none."""
+        rows, precision = self.priors, np.zeros(len(self.model.parameters))
+        precision[rows.index[~rows.known]] = rows.width[~rows.known] ** -2
+        return precision[self.model.free]
+
     def nodes(
         self, instrument: Instrument, near: Posterior | None = None
     ) -> tuple[FieldTable | None, OpticsUsed]:
@@ -309,24 +317,21 @@ class Likelihood:
         gradient[rows.index] += pull / rows.width
         matrix = terms.matrix / noise_scale**2
         matrix[rows.index, rows.index] += rows.width**-2
+        matrix = select.T @ matrix @ select
         return Posterior(
             data=terms.data,
             priors=float(np.sum(pull[rows.known] ** 2)),
             loose=float(np.sum(pull[~rows.known] ** 2)),
             noise_scale=noise_scale,
             gradient=select.T @ gradient,
-            matrix=select.T @ matrix @ select,
+            matrix=matrix,
             census=terms.census,
-            dof=self._degrees_of_freedom(terms.census),
+            dof=self._independent(terms.census) - round(determined(matrix, self.weak)),
             optics=optics,
         )
 
-    def _degrees_of_freedom(self, census: Census) -> int:
-        return (
-            round(float(census.rows @ self.data_per_row))
-            + int(self.priors.known.sum())
-            - len(self.model.free)
-        )
+    def _independent(self, census: Census) -> int:
+        return round(float(census.rows @ self.data_per_row)) + int(self.priors.known.sum())
 
     # ----------------------------------------------------------------------------------- a pass over the points
 
@@ -352,9 +357,9 @@ class Likelihood:
         return self._joined("counting", self._counted)
 
     @property
-    def dof(self) -> int:
-        """Per used row its independent data (`data_per_row`), one per prior, less the free parameters."""
-        return self._degrees_of_freedom(self.census)
+    def independent(self) -> int:
+        """Number of independent data: those of every used row (`data_per_row`), and one per prior."""
+        return self._independent(self.census)
 
     @cached_property
     def used(self) -> Bool[np.ndarray, "p e"]:

@@ -1,0 +1,34 @@
+"""The verdict of a fit and a diagnosis ask the same list, and correct for it alike."""
+
+import numpy as np
+import pytest
+from small_run import small_fit
+
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.examination import examine
+from walop_jax.diagnosis.grammar import hypotheses
+from walop_jax.diagnosis.score import corrected_p
+from walop_jax.diagnosis.sentence_scores import sentence_scores
+from walop_jax.model.effects import EFFECTS
+
+
+def test_a_fit_and_a_diagnosis_score_alike():
+    """Candidate by candidate; the number of independent trials by draws of both, to what the draws allow."""
+    result = small_fit()
+    model, calset = result.model, result.calset
+    listed = hypotheses(EFFECTS, model.template, calset.exposures, len(calset.points))
+    diagnosed = examine(
+        result, listed.names, np.random.default_rng(0), None, listed.sentences, listed.parts
+    ).table
+    fitted = sentence_scores(Design.of(result))
+    assert {score.name for score in fitted.scores} <= {score.name for score in diagnosed.scores}
+    assert len(fitted.scores) > 0.9 * len(diagnosed.scores)  # patterns have scores of their own
+    assert fitted.trials == pytest.approx(diagnosed.trials, rel=0.5)
+    smallest = min(score.log_p for score in fitted.scores if score.testable)
+    assert fitted.p_global == pytest.approx(corrected_p(smallest, fitted.trials))
+    apart = [
+        score.statistic * fitted.noise_scale**2 - diagnosed[score.name].statistic * diagnosed.noise_scale**2
+        for score in fitted.scores
+        if score.rank == diagnosed[score.name].rank
+    ]
+    assert np.max(np.abs(apart)) < 1.0  # a diagnosis allows single exposures a disturbance of their own
