@@ -1,4 +1,4 @@
-"""One file for each command: the Python function, what it shows, and what makes it a command of the program.
+"""One file for each command: the Python function, its output, and its options as a command of the program.
 
 The list of commands is all that help needs: the file of a command is read when it is asked for. Nothing heavy is
 imported at its head, so that its options appear at once.
@@ -93,7 +93,7 @@ def main() -> None:
 
 
 def _open_streams() -> None:
-    """Open what is closed (`>&-`, daemons) to nowhere: the next file would take its number, and get what is printed."""
+    """Open closed streams (`>&-`, daemons) to nowhere: the next file would take their number, and the printed text."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)

@@ -152,12 +152,12 @@ def _nights(opened: OpenFile) -> list[Night]:
         EffectAmplitude.read(p) if beyond and p.start == 0.0 else p  # others are gauges of the model
         for p, beyond in zip(parameters, table["CANDIDATE"], strict=True)
     )
-    lower, found = np.tril_indices(n), []
+    lower, nights = np.tril_indices(n), []
     for k in range(len(rows["NIGHT"])):
         matrix = np.zeros((n, n))
         matrix[lower] = rows["MATRIX"][k]
         matrix = matrix + np.tril(matrix, -1).T
-        found.append(
+        nights.append(
             Night(
                 instrument=str(header.get("INSTRUME", "")),
                 model=str(header.get("MODEL", "")),
@@ -168,7 +168,7 @@ def _nights(opened: OpenFile) -> list[Night]:
                 **{field: kind(rows[name][k]) for name, (field, kind) in _PLAIN.items()},
             )
         )
-    return found
+    return nights
 
 
 def nights_in(place: str | os.PathLike[str]) -> list[Night]:
@@ -178,9 +178,5 @@ def nights_in(place: str | os.PathLike[str]) -> list[Night]:
         return read_nights(path)
     files = [path / NIGHTS] if (path / NIGHTS).exists() else sorted(path.glob("night*.fits"))
     if not files:
-        raise fail(
-            "holds no nights",
-            file=place,
-            advice="give sets, RUNs of walop-jax refit or a SURVEY",
-        )
+        raise fail("holds no nights", file=place, advice="give sets, RUNs of walop-jax refit or a SURVEY")
     return [night for file in files for night in read_nights(file)]
