@@ -1,17 +1,14 @@
 """Sentences on all that an instrument may lack: kind × place × dependence, from its own train and its exposures.
 
 A *group* of sentences is one candidate of the score test: a linear retarder has two axes, a harmonic a cosine and a
-sine, a gradient two directions. Groups are short: at most two things are free beside the kind.
+sine, a gradient two directions.
 
-    kinds         diattenuation, retardance (linear: q and u; circular: v), depolarisation; turn of the polariser; gain
-                  of a camera or of an arm; light of one camera in another, of the opposite field point, scattered
-                  light, afterglow; numbers of wave plates (axis, cut, thickness, thermal); fringes of the air ahead of
-                  them; displacement of the field; shift of the band; polarisation of the Moon sky or of a star
+    kinds         those of `model.effects`, in the groups of `optics.GROUPS`
     places        ahead of and behind every element that acts on polarisation, in the common train and in the arms; of
-                  the polariser; of a moving element; of a source
-    dependence    none; gradient, r², radial, diagonal, astigmatic over the field; wavelength; time, temperature, hour
-                  angle; harmonics of the angles; one night; from a time on; a spell; one exposure; a kind of
-                  exposures; the counts; the exposure before
+                  the polariser, another moving element, a wave plate, a camera, an arm, a source
+    dependence    those that `Kind.grows` names of a kind at a place: patterns over the field, each with every
+                  dependence on wavelength, time, temperature, hour angle, angles, exposures and counts (`Combinations`), of those
+                  that the exposures can tell apart (`Dependences`)
 
 Each sentence pays the logarithm of their number; longer ones pay by their evidence. `beside_names` tells which
 groups an effect of the catalogue already is, or holds.
@@ -55,8 +52,8 @@ ROUNDED = 1e-4  # hours, of times that are written into a description
 
 def sentences(instrument: Instrument, exposures: Exposures, points: int) -> tuple[Probe, ...]:
     """All groups that an instrument and its exposures allow, short ones first; `points` counts the field points."""
-    found = dict.fromkeys(_groups(dataclasses.replace(instrument, effects=()), exposures, points))
-    return tuple(_probe(group) for group in sorted(found, key=len))
+    groups = dict.fromkeys(_groups(dataclasses.replace(instrument, effects=()), exposures, points))
+    return tuple(_probe(group) for group in sorted(groups, key=len))
 
 
 def _probe(group: tuple[Sentence, ...]) -> Probe:
@@ -106,19 +103,19 @@ def beside_names(
 
     A part is a group that effects hold, none of them as a whole: one patch of all, the light in one camera.
     """
-    known = []  # what the effects are in sentences, shape by shape, each with an amplitude of its own
+    effects_as_sentences = []  # shape by shape, where each sentence has an amplitude
     for effect in catalogue:
         for group in effect.probes(context):
             texts = frozenset(group[0].in_sentences(instrument))
             if len(texts) <= sum(
                 np.size(getattr(one, name)) for one in group for name in effect.amplitudes()
             ):
-                known.append((texts, effect))
+                effects_as_sentences.append((texts, effect))
     alone, parts = [], []
     for probe in every:
-        said = frozenset(said_by(probe))
-        holders = frozenset(effect for texts, effect in known if texts > said)
-        if any(texts == said for texts, _ in known):
+        texts_of_probe = frozenset(said_by(probe))
+        holders = frozenset(effect for texts, effect in effects_as_sentences if texts > texts_of_probe)
+        if any(texts == texts_of_probe for texts, _ in effects_as_sentences):
             continue
         if holders:
             parts.append((probe, holders))

@@ -139,22 +139,22 @@ def all_candidates(
     }
     kept = {number: some for number, some in changes.items() if number not in blurred}
     exact = sum(len(some) for number, some in kept.items() if number < len(shown))
-    found = columns.rounded([change for some in kept.values() for change in some], exact)
+    computed = columns.rounded([change for some in kept.values() for change in some], exact)
     named: dict[str, Candidate] = {}
-    said: dict[str, Candidate] = {}
+    described: dict[str, Candidate] = {}
     first = [0, 0]
     for number, probe in enumerate([*shown, *sentences]):
         of_sentence = number >= len(shown)
         if number in kept:
-            own = found[of_sentence][:, first[of_sentence] : first[of_sentence] + len(probe.widths)]
+            part = computed[of_sentence][:, first[of_sentence] : first[of_sentence] + len(probe.widths)]
             first[of_sentence] += len(probe.widths)
         elif number in blurred:
             continue
         else:
-            own = own_columns(likelihood, values, probe.group)
-        into = said if of_sentence else named
-        into[probe.name] = Candidate(probe.name, own, probe.widths)
-    return named, said
+            part = own_columns(likelihood, values, probe.group)
+        into = described if of_sentence else named
+        into[probe.name] = Candidate(probe.name, part, probe.widths)
+    return named, described
 
 
 def fringes_of(change: Change) -> Iterator[Sentence]:

@@ -194,23 +194,23 @@ class ScoreSpace:
         amplitudes are taken in single precision: 10⁻⁷ of the lengths of two columns, where a part of 10⁻³ counts. The
         projected columns of all rows are never there at once.
         """
-        sizes = [own.shape[1] for own in columns]
+        sizes = [block.shape[1] for block in columns]
         stop = np.cumsum([0, *sizes])
         places = [slice(first, last) for first, last in itertools.pairwise(stop.tolist())]
         basis, count = projector.basis, int(stop[-1])
         before, along = np.empty(count), np.empty((basis.shape[1], count))
-        for at, own in zip(places, columns, strict=True):
-            before[at] = np.einsum("dk,dk->k", own, own, dtype=float) / scale**2
-            along[:, at] = basis[: len(own)].T @ own / scale
+        for at, block in zip(places, columns, strict=True):
+            before[at] = np.einsum("dk,dk->k", block, block, dtype=float) / scale**2
+            along[:, at] = basis[: len(block)].T @ block / scale
         products, alone = np.zeros((count, count)), [np.zeros((size, size)) for size in sizes]
         for first in range(0, len(basis), limits.PRODUCT_ROWS):
             rows = slice(first, first + limits.PRODUCT_ROWS)
-            left = basis[rows] @ -along
-            for at, own, square in zip(places, columns, alone, strict=True):
-                here = own[rows]
-                left[: len(here), at] += here / scale
-                square += left[:, at].T @ left[:, at]
-            products += gram(left, exact)
+            remainder = basis[rows] @ -along
+            for at, block, square in zip(places, columns, alone, strict=True):
+                rows_of_block = block[rows]
+                remainder[: len(rows_of_block), at] += rows_of_block / scale
+                square += remainder[:, at].T @ remainder[:, at]
+            products += gram(remainder, exact)
         for at, square in zip(places, alone, strict=True):
             products[at, at] = square
         return cls(
@@ -250,11 +250,11 @@ class ScoreSpace:
     @functools.cached_property
     def whitened(self) -> Mapping[str, Matrix]:
         """By candidate its `whitening`, with no part in it of amplitudes that are not alive."""
-        alive, found = self.alive, {}
+        alive, maps = self.alive, {}
         for name, at in self.places().items():
             mask = alive[at]
-            found[name] = whitening(np.where(np.outer(mask, mask), self.gram[at, at], 0.0))
-        return found
+            maps[name] = whitening(np.where(np.outer(mask, mask), self.gram[at, at], 0.0))
+        return maps
 
     def with_base(self, names: Sequence[str], widths: Vector | None = None) -> tuple[ScoreSpace, Reduction]:
         """The space when some candidates have joined the base, and what takes (C̃ᵀr, r·r) there.
@@ -285,23 +285,25 @@ class ScoreSpace:
         """The table of a space that is part of an earlier one, with the noise and the number of trials found there."""
         noise, trials = earlier.noise_scale, earlier.trials
         table = tuple(self._score(name, at, scores, noise) for name, at in self.places().items())
-        found = min((score.log_p for score in table if score.testable), default=0.0)
-        return ScoreTable(table, noise, corrected_p(found, trials), trials)
+        smallest = min((score.log_p for score in table if score.testable), default=0.0)
+        return ScoreTable(table, noise, corrected_p(smallest, trials), trials)
 
     def table(self, scores: Vector, square: float, smallest: Vector | None = None) -> ScoreTable:
         """The table from s = C̃ᵀr and r·r, both behind the projection; `smallest` are draws of `smallest_p`."""
-        rest = max(square - self._root.explained(scores), 0.0)
-        left = self.free - self._root.rank
-        if left < LEAST_REST * self.free:  # candidates that could explain anything say nothing of the noise
-            rest, left = square, self.free
-        noise = float(np.sqrt(rest / max(left, 1))) or 1.0
+        noise_square = max(square - self._root.explained(scores), 0.0)
+        freedom = self.free - self._root.rank
+        if (
+            freedom < LEAST_REST * self.free
+        ):  # candidates that could explain anything say nothing of the noise
+            noise_square, freedom = square, self.free
+        noise = float(np.sqrt(noise_square / max(freedom, 1))) or 1.0
         table = tuple(self._score(name, at, scores, noise) for name, at in self.places().items())
         if smallest is None or not len(smallest):
             return ScoreTable(table, noise, 1.0, 1.0)
-        found = min((score.log_p for score in table if score.testable), default=0.0)
-        trials, below = effective_trials(smallest), int(np.sum(smallest <= found))
+        best = min((score.log_p for score in table if score.testable), default=0.0)
+        trials, below = effective_trials(smallest), int(np.sum(smallest <= best))
         often = below >= TAIL * len(smallest)
-        p = (1 + below) / (1 + len(smallest)) if often else corrected_p(found, trials)
+        p = (1 + below) / (1 + len(smallest)) if often else corrected_p(best, trials)
         return ScoreTable(table, noise, p, trials)
 
     def _score(self, name: str, at: slice, scores: Vector, noise: float) -> Score:
@@ -416,11 +418,11 @@ def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, f
 
     `scores` are C̃ᵀD and `square` D·D, both behind the projection (Atkinson & Fedorov 1975, Biometrika 62, 57).
     """
-    found = {}
+    distances = {}
     for name, at in space.places().items():
         z = space.whitened[name].T @ scores[at]
-        found[name] = float(np.sqrt(max(square - float(z @ z), 0.0)))
-    return found
+        distances[name] = float(np.sqrt(max(square - float(z @ z), 0.0)))
+    return distances
 
 
 # ------------------------------------------------------------------------------------------- products of large matrices
@@ -430,18 +432,18 @@ def gram(columns: Float[np.ndarray, "d n"], exact: int | None = None) -> Float[n
     """CᵀC; in single precision where a column beyond the first `exact` takes part, if that is said."""
     count = columns.shape[1]
     single = columns if exact is None or exact >= count else columns.astype(np.float32)
-    found = np.empty((count, count))
+    products = np.empty((count, count))
     starts = {*range(0, count, limits.COLUMNS_TOGETHER), count, min(exact or 0, count)}
     pieces = [slice(first, stop) for first, stop in itertools.pairwise(sorted(starts))]
 
     def product(pair: tuple[slice, slice]) -> None:
         one, other = pair
         source = columns if exact is None or other.stop <= exact else single
-        found[one, other] = source[:, one].T @ source[:, other]
-        found[other, one] = found[one, other].T
+        products[one, other] = source[:, one].T @ source[:, other]
+        products[other, one] = products[one, other].T
 
     _on_all_cores(product, [(one, other) for i, one in enumerate(pieces) for other in pieces[i:]])
-    return found
+    return products
 
 
 def _on_all_cores(work: Callable[..., None], pieces: Iterable[object]) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy import linalg
 
 Matrix = Float[np.ndarray, "_ _"]
 
@@ -39,16 +38,7 @@ def determined(matrix: Matrix, weak: Float[np.ndarray, " _"]) -> float:
     G is the matrix of data, priors and the weak pulls whose precisions L (a diagonal) are no knowledge: a parameter
     that only its weak pull determines counts as none.
     """
-    if not weak.any():
-        return float(len(weak))
-    size = np.sqrt(np.diag(matrix))
-    size = np.where(size > 0, size, 1.0)
-    try:
-        factor = linalg.cho_factor(matrix / np.outer(size, size))
-        variance = np.diag(linalg.cho_solve(factor, np.eye(len(weak)))) / size**2
-    except linalg.LinAlgError:  # nothing at all determines some of them
-        variance = np.diag(pseudo_inverse(matrix, 1e-15))
-    return len(weak) - float(np.clip(weak * variance, 0.0, 1.0).sum())
+    return len(weak) - float(weak @ np.sum(whitening(matrix, 1e-15) ** 2, axis=1))
 
 
 def unit_columns(matrix: Matrix) -> tuple[Matrix, Float[np.ndarray, " _"]]:

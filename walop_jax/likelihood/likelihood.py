@@ -373,9 +373,7 @@ class Likelihood:
     def residuals(self, values: Vector) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e k"]]:
         """Best flux and normalised residuals (data − model)/σ of every (point, exposure); 0 where unused.
 
-        The flux is the mean over the arms where each has its own.
-
-        All of them at once: for whole frames take a sample (`layout.thinned`).
+        The flux is the mean over the arms where each has its own. For whole frames take a sample (`layout.thinned`).
         """
         instrument = self.model.instrument(values)
         nodes, _ = self.nodes(instrument)
