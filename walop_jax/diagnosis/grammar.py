@@ -7,8 +7,8 @@ sine, a gradient two directions.
     places        ahead of and behind every element that acts on polarisation, in the common train and in the arms; of
                   the polariser, another moving element, a wave plate, a camera, an arm, a source
     dependence    those that `Kind.grows` names of a kind at a place: patterns over the field, each with every
-                  dependence on wavelength, time, temperature, hour angle, angles, exposures and counts (`Combinations`), of those
-                  that the exposures can tell apart (`Dependences`)
+                  dependence on wavelength, time, temperature, hour angle, angles, exposures and counts
+                  (`Combinations`), of those that the exposures can tell apart (`Dependences`)
 
 Each sentence pays the logarithm of their number; longer ones pay by their evidence. `beside_names` tells which
 groups an effect of the catalogue already is, or holds.
