@@ -85,10 +85,6 @@ def follow_physics(probe: Probe, score: Score) -> bool:
     return bool(np.all((score.amplitudes >= -thresholds.SEPARATION * sigma)[probe.one_sided]))
 
 
-MANY = 18
-"""Members of a group above which no more than pairs of them are compared with its rest. Time alone decides."""
-
-
 def shortest(item: Ranked, most: int = thresholds.MOST_TOGETHER) -> Described:
     """The sentences of a group that are worth their length, with the amplitudes of a linear step.
 
@@ -102,7 +98,6 @@ def shortest(item: Ranked, most: int = thresholds.MOST_TOGETHER) -> Described:
         return log_bayes(information[np.ix_(some, some)], scores[some], widths[some])
 
     subset = list(range(len(widths)))
-    most = most if len(subset) <= MANY else 2
     subsets = [list(some) for n in subset for some in itertools.combinations(subset, n + 1) if n < most]
     while len(subset) > most:
         subsets.append(subset)

@@ -204,10 +204,7 @@ def _beside(instrument: Instrument, element: Element, change: Change) -> Instrum
 
 _FIELD = ("even", "tilt", "r2", "astigmatic")
 _NOT_IN_OTHER_KINDS = {"q": _FIELD[:3], "u": _FIELD[:3], "radial": _FIELD[:1], "diagonal": _FIELD[:1]}
-_ANYTHING = (
-    Combinations(_FIELD[:3], ("steady", "hours", "kelvin"), ("anything",)),
-    Combinations(("smooth",), among=("anything",)),
-)
+_ANYTHING = Combinations(_FIELD[:3], ("steady", "hours", "kelvin"), ("anything",))
 _TURN = (
     Combinations(_FIELD, ("steady", *SLOW)),
     Combinations(along=("harmonics to 6", *SINGLE, "side", "night", "step", "spell", "exposure")),
@@ -221,9 +218,9 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     over = _NOT_IN_OTHER_KINDS.get(kind.rpartition(" ")[2], _FIELD)
     always = Combinations(over, ("steady", *SLOW))
     if _is_ahead(instrument, change):
-        return Grows((FIELD, EXPOSURE), None, (always, Combinations(along=(*SINGLE, "kind")), *_ANYTHING))
+        return Grows((FIELD, EXPOSURE), None, (always, Combinations(along=(*SINGLE, "kind")), _ANYTHING))
     if change.where != "of":
-        more = Combinations(over, ("colour",)), Combinations(among=("all",)), *_ANYTHING
+        more = Combinations(over, ("colour",)), Combinations(among=("all",)), _ANYTHING
         return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=(always, *more))
     if polariser is not None and change.place == polariser.name:
         film = always, Combinations(over, ("harmonics to 2",)), Combinations(along=(*SINGLE, "side"))
