@@ -409,13 +409,13 @@ def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationS
     return found
 
 
-def _in_memory(tables: Mapping[str, Mapping[str, Any]], **said: Any) -> CalibrationSet:
-    """A checked set of columns in memory; `said` as for `assembled`."""
+def _in_memory(tables: Mapping[str, Mapping[str, Any]], **header: Any) -> CalibrationSet:
+    """A checked set of columns in memory; `header` as for `assembled`."""
     filled = {}
     for name, columns in tables.items():
         place = Place(NAME, name)
         filled[name] = table_of(columns, table_rules(name, list(columns), place), place)
-    return assembled(filled, Path(NAME), **said)
+    return assembled(filled, Path(NAME), **header)
 
 
 def _spoilt(counts: np.ndarray) -> Iterator[str]:
