@@ -53,17 +53,17 @@ TURNING = ObservingPlan(
 COMBINED = (  # a pattern over the field with a dependence of the exposures, by kinds and places
     "retardance radial behind collimator * kelvin",
     "diattenuation diagonal ahead of polariser * hours",
-    "retardance q behind half1.plate * kelvin * x; retardance q behind half1.plate * kelvin * y; "
-    "retardance u behind half1.plate * kelvin * x; retardance u behind half1.plate * kelvin * y",
+    "retardance q behind half1.plate * x * kelvin; retardance q behind half1.plate * y * kelvin; "
+    "retardance u behind half1.plate * x * kelvin; retardance u behind half1.plate * y * kelvin",
     "retardance radial of polariser * cos 1 CLP; retardance radial of polariser * sin 1 CLP",
     "depolarisation of chwp * cos 2 CHWP * r2; depolarisation of chwp * sin 2 CHWP * r2",
     "diattenuation radial of chwp * cos 1 CHWP; diattenuation radial of chwp * sin 1 CHWP",
-    "added polarisation q ahead of polariser * hours * r2; added polarisation u ahead of polariser * hours * r2",
+    "added polarisation q ahead of polariser * r2 * hours; added polarisation u ahead of polariser * r2 * hours",
     "light in E2 * kind moon",
     "gain of O2 * side CHWP",
     "gain of E1 * side CHWP * x; gain of E1 * side CHWP * y",
     "turn of polariser * kelvin * r2",
-    "displacement x ahead of pupil * kelvin * r2; displacement y ahead of pupil * kelvin * r2",
+    "displacement x ahead of pupil * r2 * kelvin; displacement y ahead of pupil * r2 * kelvin",
     "axis of half2.plate * kelvin * x; axis of half2.plate * kelvin * y",
     "thickness of half1.plate.quartz * r2; thickness of half1.plate.mgf2 * r2",
 )
