@@ -69,6 +69,7 @@ def test_there_are_notebooks():
         "posteriors",
         "two_retarders",
         "walop_north_design",
+        "year_in_ten_minutes",
         "year_of_an_instrument",
         "your_own_effect",
     ]

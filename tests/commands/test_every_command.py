@@ -78,7 +78,7 @@ LINES = {
     "certify": [Line("certify RUN"), Line("certify RUN -o NIGHT", "commissioning")],
     "epoch": [Line("epoch RUN set.fits -o LATER", "epoch", "seconds"), Line("epoch RUN set.fits")],
     "watch": [Line("watch RUN stars.fits -o WATCHED", "watch")],
-    "affected": [Line("affected RUN RUN stars.fits", takes="seconds")],
+    "affected": [Line("affected RUN RUN stars.fits -o AFFECTED", "affected", "seconds")],
     "quality": [Line("quality RUN -o QUALITY.ecsv --figure quality.png", takes="seconds")],
     "stack": [Line("stack RUN -o SURVEY", "survey", "seconds")],
     "model": [Line("model set.fits --effect clp_zero -o model.toml", takes="seconds")],

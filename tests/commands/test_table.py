@@ -146,7 +146,10 @@ CASES = {
     "epoch": Case(lambda g: (g.run, g.calset), lambda g, **k: walop.epoch(g.run, g.calset, **k), "RUN", True),
     "watch": Case(lambda g: (g.run, g.stars), lambda g, **k: walop.watch(g.run, g.stars, **k), "RUN", True),
     "affected": Case(
-        lambda g: (g.run, g.run, g.stars), lambda g, **k: walop.affected(g.run, g.run, g.stars, **k), "", True
+        lambda g: (g.run, g.run, g.stars),
+        lambda g, **k: walop.affected(g.run, g.run, g.stars, **k),
+        "RUN",
+        True,
     ),
     "quality": Case(lambda g: (g.run,), lambda g, **k: walop.quality(g.run, **k), "q.ecsv", True),
     "model": Case(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
+from walop_jax.likelihood.inverses import of_low_rank
 
 
 @pytest.mark.parametrize("cameras", [2, 4, 5])
@@ -84,3 +85,22 @@ def test_what_a_shared_flux_can_follow_is_taken_out_and_nothing_else():
     expected = columns.reshape(2, -1) @ (np.eye(12) - a @ np.linalg.pinv(a))
     found = project_flux(columns, along, np.zeros(3, bool), Sharing(TOGETHER, GROUPS))
     np.testing.assert_allclose(found.reshape(2, -1), expected, rtol=0, atol=1e-13)
+
+
+def test_what_exposures_have_in_common_is_taken_out_of_their_covariance():
+    """1 − U Uᵀ squared is the inverse of 1 + A Aᵀ, for columns of any size side by side, and for none; and back."""
+    rng = np.random.default_rng(4)
+    responses = rng.normal(size=(3, 5, 4, 2)) * np.array([1e-3, 30.0])
+    responses[2] = 0.0
+    shared = Sharing(stars=of_low_rank(responses))
+    values = rng.normal(size=(7, 3, 5, 4))
+    found = shared.independent(values)
+    for point in range(3):
+        a = responses[point].reshape(20, 2)
+        value, vector = np.linalg.eigh(np.eye(20) + a @ a.T)
+        root = vector / np.sqrt(value) @ vector.T
+        np.testing.assert_allclose(
+            found[:, point].reshape(7, 20), values[:, point].reshape(7, 20) @ root, atol=1e-12
+        )
+    np.testing.assert_allclose(shared.independent(found, inverse=True), values, atol=1e-9)
+    assert not shared.single

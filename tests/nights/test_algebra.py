@@ -221,18 +221,6 @@ def test_a_walk_is_a_gaussian_process():
         value, covariance = found.predict(float(time))
         assert value[0] == pytest.approx(wanted[k], abs=1e-6 * np.sqrt(variance[k]))
         assert covariance[0, 0] == pytest.approx(variance[k], rel=1e-6)
-    # The evidence is that of the process, up to a constant: compared between two rates.
-    other = algebra.solve(
-        algebra.System.of(
-            equations, (Law(("walk",), rate=0.3),), np.zeros(1), np.full(1, width), np.ones(1, bool)
-        )
-    )
-
-    def evidence(rate):
-        matrix = width**2 + rate**2 * (np.minimum(mjd[:, None], mjd[None]) - mjd[0]) + np.diag(noise**2)
-        return -0.5 * (data @ np.linalg.solve(matrix, data) + np.linalg.slogdet(matrix)[1])
-
-    assert found.evidence - other.evidence == pytest.approx(evidence(0.1) - evidence(0.3), abs=1e-7)
 
 
 def test_what_nothing_determines_is_named():

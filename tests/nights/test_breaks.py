@@ -12,7 +12,7 @@ from walop_jax.model.laws import Law
 from walop_jax.model.parameters import Parameter
 from walop_jax.nights import breaks
 from walop_jax.nights.algebra import Equations
-from walop_jax.nights.equations import Night, Together
+from walop_jax.nights.equations import EffectAmplitude, Night, Together
 
 N, NIGHTS, RATE = 6, 60, 0.05
 LAWS = (Law(("walk",), rate=RATE), Law(), Law(), Law(), Law(("night",), spread=0.2), None)
@@ -132,12 +132,9 @@ def test_a_model_holds_one_shape_of_an_effect():
     """Where a law or the model has one shape of an effect, the others are no breaks."""
     names = ("half1.wedge", "ghost.depth", "cut#0.angle", "cut#1.angle", "ghost#1.depth", "drift#1.rate")
     one = series(0)
-    nights = tuple(
-        dataclasses.replace(
-            n, parameters=tuple(Parameter(name, "deg", "", "", 0.0) for name in names), candidates=4
-        )
-        for n in one.nights
-    )
+    every = [Parameter(name, "deg", "", "", 0.0, part=name.partition(".")[0]) for name in names]
+    parameters = (*every[:2], *map(EffectAmplitude.read, every[2:]))
+    nights = tuple(dataclasses.replace(n, parameters=parameters, candidates=4) for n in one.nights)
     data = dataclasses.replace(one, nights=nights, parameters=nights[0].parameters, candidates=4)
     laws = (Law(), Law(), None, Law(("night",)), None, None)
     assert breaks._other_shapes(data, laws) == [names.index("cut#0.angle"), names.index("ghost#1.depth")]

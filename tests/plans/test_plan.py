@@ -286,3 +286,19 @@ def test_the_distance_of_two_effects_is_that_of_a_fit():
     own = with_effects(base_model(calset, throughput_degree=2), (effect.name,), context)
     chi2 = [fit.posterior.objective for fit in (refit(calset, rival), refit(calset, own))]
     assert np.sqrt(chi2[0] - chi2[1]) == pytest.approx(plan.value, rel=0.05)
+
+
+def test_stars_of_a_field_tell_no_more_of_their_mean_than_their_scatter_allows():
+    """Information of an exposure with the covariance 1 + A Aᵀ of its stars; of many electrons 1/s² a star."""
+    rng = np.random.default_rng(1)
+    size, unit = 1e-3, np.full((6, 1, 4), 0.25)
+    slopes = np.zeros((6, 1, 4, 3))
+    slopes[..., 0], slopes[..., 1] = [0.25, -0.25, 0.0, 0.0], [0.0, 0.0, 0.25, -0.25]
+    slopes[..., 2] = rng.normal(size=(6, 1, 4)) * 0.1
+    light = Illumination(np.full(6, 4e10), PhotonNoise(30.0), 0.0, Sharing(), 1.0, {0: size, 1: size})
+    found = light.information(unit, slopes)[0]
+    np.testing.assert_allclose(np.diag(found)[:2], 6.0 / size**2, rtol=1e-3)
+    alone = light._replace(scatter={}).information(unit, slopes)[0]
+    assert alone[0, 0] > 1e3 * found[0, 0]
+    # What is of no star is known as well as before: given q and u of each.
+    assert found[2, 2] < alone[2, 2]

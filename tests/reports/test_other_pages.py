@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import pytest
 from astropy.table import Table
 from html_page import Page
 
+import walop_jax as walop
+from walop_jax.io import names
 from walop_jax.io.display import Display
 from walop_jax.io.errors import DataError
 from walop_jax.reports.page import OTHERS, kind_of_run, render, render_other
@@ -46,6 +49,7 @@ DOCUMENTS: dict[str, dict[str, Any]] = {
         "by_night": [{"night": 1, "mjd": 1.9, "chi2": 9.0, "dof": 9, "excess": 0.0}],
     },
     "watch": {"holds": True},
+    "affected": {},
 }
 
 
@@ -64,6 +68,17 @@ def test_displayed_text_is_on_the_page(tmp_path: Path, kind: str):
         assert 'class="verdict good"' not in html
         assert "χ²/dof = 5.99" in html.partition("<main>")[0].replace("\N{NO-BREAK SPACE}", " ")
         assert ('class="untrusted"' in html) == (kind != "watch")
+
+
+@pytest.mark.parametrize("name", [name for name in names.DOCUMENTS if name != "summary"])
+def test_every_folder_is_read_and_says_what_was_displayed(tmp_path: Path, name: str):
+    """Of whichever command: the document as it is, and its verdict."""
+    document = {"shown": SHOWN.document()}
+    (tmp_path / names.DOCUMENTS[name]).write_text(json.dumps(document))
+    run = walop.read(tmp_path)
+    assert isinstance(run, walop.Run)
+    assert run.documents == {name: json.loads(json.dumps(document))}
+    assert re.search(rf"{name} +{SHOWN.title}", repr(run))
 
 
 def test_a_document_that_holds_nothing_displayed_is_refused(tmp_path: Path):

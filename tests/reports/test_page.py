@@ -231,7 +231,6 @@ def test_a_sampled_run_shows_its_posterior(tmp_path):
     (run / "posterior.nc").write_bytes(b"")
     assert [s.split()[0] for s in read_run(run).missing] == [
         "sample.json",
-        "posterior.ecsv",
         "posterior_corner.png",
         "Residuals",
     ]

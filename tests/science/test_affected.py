@@ -14,7 +14,7 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.user_tables import in_memory
 from walop_jax.fit.verdict import Structure
-from walop_jax.science.affected import shift
+from walop_jax.science.affected import affected, shift
 from walop_jax.science.apply import results_of
 from walop_jax.science.catalogue import read_catalogue
 
@@ -84,6 +84,20 @@ def test_what_must_be_made_again_is_named(old, table):
     document = found.document()
     assert document["again"] == ["catalogue 1", "catalogue 2"]
     assert "again" in found.display().text()
+
+
+def test_stars_that_are_hardly_measured_do_not_make_the_mean(old, table, monkeypatch):
+    """Half of the stars shift by 0.001, the others, with errors a hundred times as large, by 0.1."""
+    catalogue = read_catalogue(in_memory(table), old.model.template.patched())
+    before = results_of(old, catalogue)
+    poor = np.arange(len(before.qu)) % 2 == 1
+    size = np.where(poor, 100.0, 1.0)[:, None]
+    before = dataclasses.replace(before, photon=1e-4 * size[:, :, None] ** 2 * np.eye(2))
+    after = dataclasses.replace(before, qu=before.qu + 1e-3 * size)
+    results = iter((before, after))
+    monkeypatch.setattr("walop_jax.science.affected.results_of", lambda *_: next(results))
+    for night in affected(old, old, catalogue, "catalogue"):
+        assert (night.q, night.u) == pytest.approx((1e-3, 1e-3), rel=0.02)
 
 
 def test_results_that_are_lost_are_made_again(old, table):

@@ -150,6 +150,14 @@ def test_other_tables_are_left_alone(row, tmp_path: Path):
     assert file.read_bytes() == before
 
 
+def test_a_table_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path):
+    """Before the run, which is not there, is asked for."""
+    with pytest.raises(DataError, match="QUALITY: has no extension of a table"):
+        walop.quality(tmp_path / "NO-RUN", output=tmp_path / "QUALITY")
+    with pytest.raises(DataError, match="does not exist; create it first"):
+        walop.quality(tmp_path / "NO-RUN", output=tmp_path / "there" / "q.ecsv")
+
+
 def test_the_figure_shows_every_night(row):
     table = judge(table_of_nights([night(row, k) for k in range(5)]), read_limits())
     figure = quality_figure(table, read_limits())

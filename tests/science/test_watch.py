@@ -13,7 +13,7 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.data.user_tables import in_memory
 from walop_jax.reports.survey_figures import watch_figure
 from walop_jax.science.catalogue import read_catalogue
-from walop_jax.science.star_residuals import noise_scale, normal_matrix
+from walop_jax.science.star_residuals import Weights, noise_scale, normal_matrix
 from walop_jax.science.watch import Watching, dated, grouped, with_rivals
 
 
@@ -229,10 +229,8 @@ def test_a_change_that_nothing_within_its_range_describes_has_no_name(monkeypatc
 def test_what_single_exposures_cannot_see_is_nothing_and_not_rounding(vectors):
     """q and u of the stars are free: whatever does to all counts what q does has no information, of either sign."""
     stars = study.watching(120, 3, study.step(0.01), plates=(None,)).stars
-    ones, like_q = np.ones(len(stars.photon)), stars.tangent[:, 0]
-    matrix, score = normal_matrix(
-        stars, stars.residual, lambda part, _: part.tangent.swapaxes(1, 2), ones, ones
-    )
+    ones, like_q = Weights(*np.ones((2, len(stars.photon)))), stars.tangent[:, 0]
+    matrix, score = normal_matrix(stars, stars.residual, lambda part, _: part.tangent.swapaxes(1, 2), ones)
     assert not matrix.any()
     assert not score.any()
     # The same as a number of the optics: it is not seen, in no group, and no history of it is a change.
@@ -240,7 +238,7 @@ def test_what_single_exposures_cannot_see_is_nothing_and_not_rounding(vectors):
     number = int(np.flatnonzero(np.abs(plain).max(axis=(0, 1)) > 0)[0])
     plain[..., number] = 1e-3 * like_q
     watching = Watching(dataclasses.replace(stars, plain=plain), vectors)
-    size, error, _ = watching.answers(*watching.scan(stars.residual, ones, ones))
+    size, error, _ = watching.answers(*watching.scan(stars.residual, ones))
     column = [reading.name for reading in watching.readings.listed].index(vectors.named[number][0])
     assert np.isinf(error[:, column]).all()
     assert not size[:, column].any()

@@ -510,7 +510,7 @@ def passes(count: int, start: int = 0) -> None:
     print(f"  one set as large: {alike:.1f} s of CPU, {size:.2f} GB: ratio {used / alike:.2f}", flush=True)
     rng = np.random.default_rng(start)
     for kill in range(KILLS):  # by turns one process, and two workers whose parent dies
-        after = float(rng.uniform(0.3, 1.5) * wall / KILLS) + 3.0
+        after = float(rng.uniform(0.2, 0.9) * wall)
         stacked("KILLED", *(("--workers", "2") if kill % 2 else ()), kill_after=after)
     more, _, _ = stacked("KILLED")
     print(

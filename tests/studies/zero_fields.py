@@ -44,7 +44,7 @@ def shortened(run: Simulated, share: float, seed: int) -> walop.CalibrationSet:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sets", type=int, default=10)
     parser.add_argument("--stars", type=int, default=100)
     parser.add_argument("--exposures", type=int, nargs="+", default=[1, 4])

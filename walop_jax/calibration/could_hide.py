@@ -143,7 +143,7 @@ def as_text(effect: Effect) -> str:
 
 
 def acting_effects(calibration: Calibration) -> Mapping[int, Effect]:
-    """The effects of `Hidden.acts` by their number; without those that the catalogue of the calibration has not."""
+    """The effects of `Hidden.acts` by number, as far as the catalogue of the calibration has them."""
     hidden, model = calibration.hidden, calibration.model
     context = effect_context(model.template, calibration.exposures)
     known = {kind.name for kind in model.catalogue}

@@ -1,4 +1,4 @@
-"""One file for each command: the Python function, what it shows, and what makes it a command of the program.
+"""One file for each command: the Python function, its output, and its options as a command of the program.
 
 The list of commands is all that help needs: the file of a command is read when it is asked for. Nothing heavy is
 imported at its head, so that its options appear at once.
@@ -17,31 +17,31 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
         "docs": "Print a reference page, or the list of pages.",
     },
     "Calibrate": {
-        "exposures": "Make the table EXPOSURES of a calibration set from what an observatory writes down.",
-        "inspect": "Say what is in calibration sets and what is wrong with them.",
+        "exposures": "Make the table EXPOSURES of a calibration set from the records of an observatory.",
+        "inspect": "List the contents and the faults of calibration sets.",
         "refit": "Fit all field points of calibration sets jointly.",
         "clip": "Flag single intensities that lie far from a fit of all others.",
-        "diagnose": "Say what is missing from the model, add it, and fit again.",
+        "diagnose": "Find the effects that the model lacks, add them, and fit again.",
         "sample": "Sample the posterior.",
         "report": "Write one HTML page about a run, figures inside.",
         "plot": "Draw a figure of a run, by name, as a file.",
     },
     "Correct stars": {
-        "matrix": "Say what the instrument matrix is at a field point, or at every point of a table.",
+        "matrix": "Give the instrument matrix at a field point, or at every point of a table.",
         "gather": "Make one catalogue, a row a star, of those of the cameras.",
         "apply": "Turn the intensities of stars into Stokes parameters.",
     },
     "Check a calibration": {
         "certify": "Check a calibration from its checksums to its physics and its accuracy.",
-        "limits": "Say at which size every effect of the catalogue would be detected and named in calibration sets.",
+        "limits": "Compute the size at which every effect would be detected and named in calibration sets.",
         "compare": "Compare the method of Paper II, as it is published, with the joint fit.",
     },
     "Many nights": {
         "epoch": "Fit new calibration sets and compare with an old calibration.",
-        "watch": "Say when a calibration ceased to hold, from the stars of many nights.",
-        "affected": "Say which catalogues a new calibration changes, and by how much.",
-        "quality": "Add a row of quality numbers for each night to a table, and say which lie outside their limits.",
-        "stack": "Fit many nights at once, each parameter under a law that says how it may change.",
+        "watch": "Find when a calibration became invalid, from the stars of many nights.",
+        "affected": "List the catalogues that a new calibration changes, and by how much.",
+        "quality": "Add a row of quality numbers for each night to a table, and list those outside their limits.",
+        "stack": "Fit many nights at once, each parameter under a law of its change with time.",
     },
     "Plan and rehearse": {
         "plan": "Plan the calibration exposures of a night.",
@@ -93,7 +93,7 @@ def main() -> None:
 
 
 def _open_streams() -> None:
-    """Open what is closed (`>&-`, daemons) to nowhere: the next file would take its number, and get what is printed."""
+    """Open closed streams (`>&-`, daemons) to nowhere: the next file would take their number, and the printed text."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)

@@ -2,35 +2,36 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.apply import calibration_for
 from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command
-from walop_jax.commands.products import Diagnosed, Effects, table_of
+from walop_jax.commands.products import Effects, Product, named_tables
+from walop_jax.io.names import AFFECTED
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Run
     from walop_jax.science.affected import Affected
 
 OLD = Argument("Calibration that the catalogues were reduced with, or its run.", "OLD", Path)
 NEW = Argument("Calibration that takes its place.", "NEW", Path)
 CATALOGUES = Argument("Catalogues, as apply reads or writes them.", "CATALOGUE...", list[Path])
+FOLDER = Option(f"Folder for {AFFECTED}.", "RUN", Path, "-o")
 LIMIT = Option("Shift (standard errors) from which a result is made again (default: 0.5).", "SIGMA", float)
 
 
-@command(stages=("reading", "tabulating"))
+@command(stages=("reading", "tabulating"), writes=(AFFECTED,))
 def affected(
     job: Job,
-    old: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike, OLD],
-    new: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike, NEW],
+    old: Annotated[Product, OLD],
+    new: Annotated[Product, NEW],
     catalogues: Annotated[Any, CATALOGUES],
     *,
+    output: Annotated[PathLike | None, FOLDER] = None,
     limit: Annotated[float, LIMIT] = 0.5,
     effects: Effects = None,
 ) -> Outcome[Affected]:
-    """Say which catalogues a new calibration changes, and by how much.
+    """List the catalogues that a new calibration changes, and by how much.
 
     The stars are reduced from their rows by both calibrations; the shift of q and u is told in standard errors of the
     old result, by catalogue and night. A night must be made again where more than 5 % of its stars shift by more than
@@ -50,12 +51,9 @@ def affected(
 
     if not limit > 0:
         raise UsageError(f"{limit} must be above 0 standard errors", "limit")
-    given = list(catalogues) if isinstance(catalogues, list | tuple) else [catalogues]
     nights, warnings, replaced, replacing = [], [], list[str](), list[str]()
-    for number, entry in enumerate(given, start=1):
-        job.tell(f"catalogue {number} of {len(given)}", "reading")
-        name = str(entry) if isinstance(entry, str | os.PathLike) else f"catalogue {number}"
-        table = table_of(entry, {})
+    job.begin("reading")
+    for name, table in named_tables(catalogues):
         before, after = (calibration_for(one, table, effects, force=True) for one in (old, new))
         replaced.append(before.content_hash())
         replacing.append(after.content_hash())
@@ -69,12 +67,12 @@ def affected(
             warnings.append(f"{name}: was made with a calibration that is neither the old nor the new one")
         job.tell(f"{len(rows)} rows of {name}", "tabulating")
         with errors_naming(table.path):
-            here = list(nights_of(before, after, rows, name, limit))
-        nights += here
-        if beyond := sum(night.beyond for night in here):
+            shifts_here = list(nights_of(before, after, rows, name, limit))
+        nights += shifts_here
+        if beyond := sum(night.beyond for night in shifts_here):
             warnings.append(
                 f"{name}: {beyond} stars have a filter or temperature that the new one does not cover"
             )
     first, second = (", ".join(dict.fromkeys(one)) for one in (replaced, replacing))
-    found = Affected(first, second, limit, tuple(nights), tuple(warnings))
-    return Outcome(found, warnings=found.warnings, trusted=not found.again)
+    shifts = Affected(first, second, limit, tuple(nights), tuple(warnings))
+    return Outcome(shifts, saved_as=AFFECTED, warnings=shifts.warnings, trusted=not shifts.again)

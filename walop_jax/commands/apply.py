@@ -18,6 +18,7 @@ from walop_jax.commands.products import (
     Product,
     calibration_of,
     catalogue_of,
+    several,
     table_of,
     table_outcome,
 )
@@ -110,17 +111,16 @@ def apply(
     if saturation is not None and not saturation > 0:
         raise UsageError(f"{saturation} must be above 0 electrons", "saturation")
     if each:
-        files = list(catalogue) if isinstance(catalogue, list | tuple) else [catalogue]
         options = {
             "calibration": calibration, "debias": debias, "saturation": saturation, "posterior": posterior,
             "effects": effects, "force": force, "common": common,
         }  # fmt: skip
-        return for_each(job, apply, files, output, options, workers, scheduler)
+        return for_each(job, apply, several(catalogue), output, options, workers, scheduler)
     if output is not None:
         check_output(output, overwrite=job.overwrite)
         table_format(output)
     job.begin("reading")
-    table, said = _table_of(catalogue)
+    table, gathering_remarks = _table_of(catalogue)
     held = calibration_for(calibration, table, effects, force=force)
     instrument, limit = held.model.template.patched(), math.inf if saturation is None else saturation
     rows = read_catalogue(table, instrument, limit, always_in=held.always_in, never_in=held.never_in)
@@ -149,7 +149,7 @@ def apply(
         output,
         counted=_counted(alone),
         warnings=[
-            *said,
+            *gathering_remarks,
             *doubts,
             *_about_noise(rows.counts, rows.sigma),
             *_about_places(rows, stars.flag),
@@ -165,9 +165,8 @@ def apply(
         },
     )
     crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
-    text = f"{output}: {table.rows} rows, {len(stars.qu)} stars, {job.seconds:.1f} s{_errors(columns)}"
-    if crossed:
-        text += f"; {crossed} in zones of high cross-talk (FLAG 16)"
+    zones = f"; {crossed} in zones of high cross-talk (FLAG 16)" if crossed else ""
+    text = f"{output}: {table.rows} rows, {len(stars.qu)} stars, {job.seconds:.1f} s{_errors(columns)}{zones}"
     return dataclasses.replace(outcome, text=text, next=(f"topcat {output}",) if common else ())
 
 
@@ -222,7 +221,7 @@ def _counted(alone: bool) -> dict[Any, str]:
 
 
 def _about_noise(counts: Any, sigma: Any) -> Iterator[str]:
-    """A sentence where errors of bright stars are as large as what they count."""
+    """A sentence where errors of bright stars are as large as their counts."""
     import numpy as np
 
     bright = counts > BRIGHT
@@ -232,17 +231,10 @@ def _about_noise(counts: Any, sigma: Any) -> Iterator[str]:
 
 def _about_places(rows: Any, flag: Any) -> Iterator[str]:
     """A sentence where rows of one star disagree, and lie at different places of the field."""
-    import numpy as np
-
     from walop_jax.fit.verdict import Quality
+    from walop_jax.science.overlaps import extents
 
-    apart = np.zeros(len(flag))
-    for place in (rows.points.x, rows.points.y):
-        low, high = np.full(len(flag), np.inf), np.full(len(flag), -np.inf)
-        np.minimum.at(low, rows.star, place)
-        np.maximum.at(high, rows.star, place)
-        apart = np.maximum(apart, high - low)
-    if number := int(((apart > APART) & (flag & Quality.DISAGREES > 0)).sum()):
+    if number := int(((extents(rows) > APART) & (flag & Quality.DISAGREES > 0)).sum()):
         yield f"{number} of the stars that disagree have rows at different places: is their ID that of one star?"
 
 
@@ -251,11 +243,11 @@ def _errors(columns: Mapping[str, tuple[Any, ...]]) -> str:
     import numpy as np
 
     error, q, u, *photons = (columns[name][0] for name in ("P_ERR", "Q_ERR", "U_ERR", "Q_PHOTON", "U_PHOTON"))
-    known = error > 0
-    if not known.any():
+    measured = error > 0
+    if not measured.any():
         return ""
-    share = sum(values[known] ** 2 for values in photons) / (q[known] ** 2 + u[known] ** 2)
+    share = sum(values[measured] ** 2 for values in photons) / (q[measured] ** 2 + u[measured] ** 2)
     return (
-        f"; error of p {100 * float(np.median(error[known])):.2g} % (median), photons make "
+        f"; error of p {100 * float(np.median(error[measured])):.2g} % (median), photons make "
         f"{100 * float(np.median(share)):.0f} % of its variance"
     )

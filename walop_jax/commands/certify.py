@@ -1,4 +1,4 @@
-"""`walop-jax certify`: is this calibration fit for use? Go or no-go, with what is missing."""
+"""`walop-jax certify`: is this calibration fit for use? Go or no-go, with advice."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FOLDER = Option(f"Folder for {DOCUMENT}; it may be that of the fit.", "RUN", Pat
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Certificate(Displayed):
-    """The checks of a product and what is asked of it for stars, its range of application, hash, and parents.
+    """The checks of a product and its requirements for stars, its range of application, hash, and parents.
 
     `content` is its content hash, `parents` are the SHA-256 of its inputs.
     """
@@ -51,7 +51,7 @@ class Certificate(Displayed):
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Advice on requirements that are not met, what is needed first."""
+        """Advice on requirements that are not met, the needed ones first."""
         from walop_jax.science.commissioning import requirement_advice
 
         return requirement_advice(self.requirements)
@@ -63,7 +63,7 @@ class Certificate(Displayed):
         return {
             "product": str(self.path),
             "go": self.go,
-            "requirements": [dataclasses.asdict(one) for one in self.requirements],
+            "requirements": [dataclasses.asdict(requirement) for requirement in self.requirements],
             "valid": not self.failed,
             "schema": PRODVERS,
             "content": self.content,
@@ -73,7 +73,7 @@ class Certificate(Displayed):
         }
 
     def display(self) -> Display:
-        """Go or no-go, a line for each check and requirement, and what is missing."""
+        """Go or no-go, a line for each check and requirement, and advice on those that are not met."""
         from walop_jax.science.commissioning import requirement_rows
 
         rows = [("ok" if check.passed else "FAILED", check.name, check.found) for check in self.checks]
@@ -112,25 +112,25 @@ def certify(
     from walop_jax.calibration.product import product_path, read_product
 
     job.tell("checking")
-    given: Any = fit_of(calibration)
-    if isinstance(given, Calibration | FitResult):
-        there = Calibration.from_fit(given) if isinstance(given, FitResult) else given
-        path, product, catalogue = Path(IN_MEMORY), there.product, there.model.catalogue
+    source: Any = fit_of(calibration)
+    if isinstance(source, Calibration | FitResult):
+        held = Calibration.from_fit(source) if isinstance(source, FitResult) else source
+        path, product, catalogue = (Path(IN_MEMORY), held.product, held.model.catalogue)
     else:
-        path = product_path(folder_of(given))
+        path = product_path(folder_of(source))
         product, catalogue = read_product(path), catalogue_of(effects)
     with errors_naming(path):
         checks = tuple(checks_of(product, catalogue))
     rebuilt = any(check.name == "model" and check.passed for check in checks)
-    asked = _requirements(job, given, path, catalogue) if rebuilt else ()
+    needs = _requirements(job, source, path, catalogue) if rebuilt else ()
     parents = tuple(entry.sha256 for entry in product.inputs)
-    made = Certificate(path, checks, asked, validity(product), product.content_hash(), parents)
-    why = "; ".join(f"{check.name} ({check.found})" for check in made.failed)
+    certificate = Certificate(path, checks, needs, validity(product), product.content_hash(), parents)
+    why = "; ".join(f"{check.name} ({check.found})" for check in certificate.failed)
     return Outcome(
-        made,
+        certificate,
         saved_as=DOCUMENT,
-        failure=f"{path}: not valid: {why}" if made.failed else "",
-        trusted=made.go,
+        failure=f"{path}: not valid: {why}" if certificate.failed else "",
+        trusted=certificate.go,
     )
 
 

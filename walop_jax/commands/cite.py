@@ -6,12 +6,11 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command
-from walop_jax.commands.products import Diagnosed, Effects, calibration_of, catalogue_of
+from walop_jax.commands.command import Argument, Job, Option, Outcome, command
+from walop_jax.commands.products import Effects, OptionalProduct, calibration_of, catalogue_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Run
     from walop_jax.model.references import Reference
 
 RUN = Argument("Run, or its calibration.fits; default: the base model.", "[RUN]", Path)
@@ -20,7 +19,7 @@ RUN = Argument("Run, or its calibration.fits; default: the base model.", "[RUN]"
 @command()
 def cite(
     job: Job,
-    run: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike | None, RUN] = None,
+    run: Annotated[OptionalProduct, RUN] = None,
     *,
     bibtex: Annotated[bool, Option("As BibTeX entries.")] = False,
     effects: Effects = None,

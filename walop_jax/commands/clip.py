@@ -33,12 +33,12 @@ def clip(
     SET.fits holds the same rows, with FLAG 2 where a camera lies more than N standard errors off; flagged rows are not
     used by any command. The set is fitted anew until nothing lies off any more.
 
-    What the model lacks lies off as well, but in many rows: if these are more than 5 %, or the fit of what is left is
+    Gaps of the model lie off as well, but in many rows: if these are more than 5 %, or the fit of the remaining rows is
     not to be trusted, the set is written with a warning, exit code 3. Look for the cause with walop-jax diagnose then,
     on the set as it was.
 
     In Python: the set (`calset`), the fit (`result`) and the number of `rows` that were flagged. Raises `DataError` for
-    frames and for what was compressed, ValueError for `sigma` below 3.
+    frames and for compressed sets, ValueError for `sigma` below 3.
 
     >>> flagged = walop.clip("night.fits")  # doctest: +SKIP
     """
@@ -59,8 +59,8 @@ def clip(
         say(Stage("fitting", "fitting"))
         flagged = clipped(calset, chosen, sigma)
         # Of too many rows the model lacks something: no need to ask what.
-        left = flagged.result
-        result = left.judged() if flagged.too_many else examined(left, job.seed, as_written=True)
+        remaining = flagged.result
+        result = remaining.judged() if flagged.too_many else examined(remaining, job.seed, as_written=True)
     job.begin("writing")
     if output is not None:
         write_calibration_set(output, flagged.calset, overwrite=job.overwrite)

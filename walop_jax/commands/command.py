@@ -42,7 +42,7 @@ PathLike = str | os.PathLike[str]
 class Option:
     """A parameter as an option of the program: `--name VALUE`, or `-o` as well; a `bool` is a switch.
 
-    `kind` is the type of what is typed (default: that of the annotation). `required` holds on the command line only,
+    `kind` is the type of the typed text (default: that of the annotation). `required` holds on the command line only,
     where results that are not written would be lost.
     """
 
@@ -74,7 +74,7 @@ def _silent(text: str) -> None:
 class Job:
     """Working conditions of a command, apart from its own arguments.
 
-    `overwrite`: replace outputs that exist. `seed`: of random numbers. `progress` is told what is being done. `folder`
+    `overwrite`: replace outputs that exist. `seed`: of random numbers. `progress` is called with each step. `folder`
     is the reserved folder of results (None: nothing is written). `typed`: on the command line, not from Python.
     """
 
@@ -86,7 +86,7 @@ class Job:
     began: float = dataclasses.field(default_factory=time.perf_counter)
 
     def tell(self, text: str, stage: str = "") -> None:
-        """Say what is being done; `stage` is the one of the command that begins with it."""
+        """Report a step; `stage` is the one of the command that begins with it."""
         self.progress(Stage(text, stage) if stage else text)
 
     def begin(self, stage: str) -> None:
@@ -121,24 +121,29 @@ class Job:
             switch_on()
 
 
+def several(given: Any) -> list[Any]:
+    """Items that were given one by one or in a list."""
+    return list(given) if isinstance(given, list | tuple) else [given]
+
+
 def text_file(text: str) -> Callable[[Path], object]:
     """Writer of a text file."""
     return lambda path: path.write_text(text, encoding="utf-8")
 
 
-def figure_file(figure: Any) -> Callable[[Path], object]:
-    """Writer of a figure as a picture."""
-    return lambda path: figure.savefig(path, dpi=130)
+def figure_file(draw: Callable[..., Any], *data: Any) -> Callable[[Path], object]:
+    """Writer of the figure `draw(*data)` as a picture."""
+    return lambda path: draw(*data).savefig(path, dpi=130)
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome(Generic[T]):
-    """Result of a command: `value` for Python, and what the program prints and writes of it.
+    """Result of a command: `value` for Python, and the output of the program.
 
-    `document` is plain data (None: what the value gives), to which `extra` is added; `display` is shown on a terminal
+    `document` is plain data (None: that of the value), to which `extra` is added; `display` is shown on a terminal
     (None: that of the value), with the text `below` it; `text` is printed in its place. `files` write the files of the
-    output folder, each given its path; the document is written as the file `saved_as`, with what is displayed.
-    `warnings` are sentences to bear in mind. `failure` says what has gone wrong (exit code 1), `trusted` whether the
+    output folder, each given its path; the document is written as the file `saved_as`, with the display.
+    `warnings` are sentences to bear in mind. `failure` is the error (exit code 1), `trusted` whether the
     result can be used (exit code 3 if not). `next` are command lines that one might want to type next. `markdown`: the
     text is laid out on a terminal.
     """
@@ -150,7 +155,7 @@ class Outcome(Generic[T]):
     extra: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     display: Display | None = None
     below: str = ""
-    files: Callable[[], Writers] = dict
+    files: Writers = dataclasses.field(default_factory=dict)
     saved_as: str = ""
     warnings: Sequence[str] = ()
     failure: str = ""
@@ -178,7 +183,7 @@ class Outcome(Generic[T]):
         return "\n".join(filter(None, (self.shown.text(), self.below)))
 
     def saved_document(self) -> dict[str, Any]:
-        """The document with what is displayed, if anything is."""
+        """The document with the display, if there is one."""
         displayed = self.display is not None or hasattr(self.value, "display")
         return {**self.content, **({"shown": self.shown.document()} if displayed else {})}
 
@@ -187,12 +192,11 @@ class Outcome(Generic[T]):
         from walop_jax.io.folder import NotWrittenError
         from walop_jax.io.text import json_text
 
-        files = self.files()
-        absent = [name for name, write in files.items() if write is None]
+        absent = [name for name, write in self.files.items() if write is None]
         names = [name for name in folder.names if name not in absent]
         try:
             with folder.filled(names, (*drop, *absent)) as temporary:
-                for name, write in files.items():
+                for name, write in self.files.items():
                     if write is not None:
                         write(temporary / name)
                 if self.saved_as:
@@ -220,7 +224,7 @@ IN_THE_MODEL = (
 
 
 class _Names(dict[str, Any]):
-    """The names of an annotation; what is imported for type checkers alone stands in as a class of that name."""
+    """The names of an annotation; imports of type checkers alone stand in as classes of that name."""
 
     def __missing__(self, name: str) -> Any:
         return getattr(builtins, name, None) or type(name, (), {"__module__": "walop_jax"})
@@ -239,7 +243,7 @@ def _annotation(function: Callable[..., Any], parameter: inspect.Parameter) -> t
 
 @dataclasses.dataclass
 class Command(Generic[T]):
-    """A command: `function` is the Python function, `run` is what the program calls.
+    """A command: `function` is the Python function, `run` the call of the program.
 
     `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
     "file" if `output` is a single file; () if the body looks after its outputs itself. `random`: its seed matters.
@@ -283,7 +287,7 @@ class Command(Generic[T]):
         return inspect.Signature([*self.own, *added])
 
     def bound(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> dict[str, Any]:
-        """The arguments of a call by name, with defaults. Raises TypeError, in a sentence, for what does not fit."""
+        """The arguments of a call by name, with defaults. Raises TypeError, in a sentence, for others."""
         names = self.signature.parameters
         for key in kwargs:
             if key not in names:

@@ -6,19 +6,18 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Job, Option, Outcome, PathLike, Writers, command, figure_file
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, figure_file
 from walop_jax.commands.inputs import Folder, InstrumentLike, ModelLike, Sets, set_and_model, set_of
 from walop_jax.commands.products import (
     NOT_CARRIED_OVER,
-    Diagnosed,
     Effects,
+    OptionalProduct,
     calibration_of,
     left_out_cards,
     left_out_sentences,
 )
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Run
     from walop_jax.paper.comparison import Comparison
     from walop_jax.science.star_errors import Truth
 
@@ -32,7 +31,7 @@ TRUTH = Option("True X, Y, M21 … M33 (FITS, CSV), for simulated sets.", "TABLE
 def compare(
     job: Job,
     data: Sets,
-    calibration: Calibration | FitResult | Diagnosed | Run | PathLike | None = None,
+    calibration: OptionalProduct = None,
     *,
     output: Folder = None,
     truth: Annotated[Truth | PathLike | None, TRUTH] = None,
@@ -88,19 +87,17 @@ def compare(
     job.tell("fitting and judging the polynomials", "judging")
     compared = comparison_of(calset, joint, truth, filter, job.seed)
     lost = joint.left_behind
-
-    def files() -> Writers:
-        drawn = {name: getattr(paper_figures, f"{name}_figure")(compared) for name in FIGURES}
-        columns = {name: (values, "", about) for name, (values, about) in compared.columns().items()}
-        table = astropy_table(columns, left_out_cards(lost))
-        pictures = {f"comparison_{name}.png": figure_file(figure) for name, figure in drawn.items()}
-        return {TABLE: lambda path: write_table(path, table), **pictures}
-
+    columns = {name: (values, "", about) for name, (values, about) in compared.columns().items()}
+    table = astropy_table(columns, left_out_cards(lost))
+    pictures = {
+        f"comparison_{name}.png": figure_file(getattr(paper_figures, f"{name}_figure"), compared)
+        for name in FIGURES
+    }
     return Outcome(
         compared,
         extra={"trusted": trusted, NOT_CARRIED_OVER: list(lost)},
         below="" if output is None else f"Written to {output}.",
-        files=files,
+        files={TABLE: lambda path: write_table(path, table), **pictures},
         saved_as=DOCUMENT,
         trusted=trusted,
         warnings=(

@@ -39,11 +39,11 @@ def conformance(
     if (make is None) == (check is None):
         raise UsageError("give either --make FOLDER or --check FOLDER")
     if make is not None:
-        with output_folder(make, (*SHIPPED, RESULTS), overwrite=job.overwrite) as out, out.filled() as there:
+        with output_folder(make, (*SHIPPED, RESULTS), overwrite=job.overwrite) as out, out.filled() as folder:
             for name in SHIPPED:
-                (there / name).write_text((PACK / name).read_text("utf-8"), encoding="utf-8")
+                (folder / name).write_text((PACK / name).read_text("utf-8"), encoding="utf-8")
             blank = "".join(f"{case},{quantity},\n" for case, quantity in values("answers.csv"))
-            (there / RESULTS).write_text(f"CASE,QUANTITY,VALUE\n{blank}", encoding="utf-8")
+            (folder / RESULTS).write_text(f"CASE,QUANTITY,VALUE\n{blank}", encoding="utf-8")
         number = len({case for case, _ in values("answers.csv")})
         return Outcome(number, {"output": str(make), "cases": number}, f"{number} questions: {make}")
     assert check is not None

@@ -1,4 +1,4 @@
-"""`walop-jax diagnose`: find what the model lacks, name it, add it, show the gap shrink."""
+"""`walop-jax diagnose`: find effects missing from the model, name and add them, show the gap shrink."""
 
 from __future__ import annotations
 
@@ -6,16 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import (
-    Job,
-    Option,
-    Outcome,
-    PathLike,
-    UsageError,
-    Writers,
-    command,
-    text_file,
-)
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command, text_file
 from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, paths_of, set_and_model
 from walop_jax.commands.products import Effects
 from walop_jax.io.names import DIAGNOSIS, FIGURE_DATA, MODEL, PRODUCT, SUMMARY
@@ -27,16 +18,12 @@ if TYPE_CHECKING:
     from walop_jax.io.display import Display
 
 OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA, MODEL)
-
-
 MINUTES = Option(
     "Minutes after which no further name is looked for (default: none; the search ends by itself).",
     "MINUTES",
     float,
     least=0.0,
 )
-
-
 WHY = Option(
     "Answer why an effect, or a description, was not named by a diagnosis that has been made; give its RUN.",
     "NAME",
@@ -57,7 +44,7 @@ def diagnose(
     minutes: Annotated[float | None, MINUTES] = None,
     why: Annotated[str | None, WHY] = None,
 ) -> Outcome[Diagnosis]:
-    """Say what is missing from the model, add it, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
+    """Find the effects that the model lacks, add them, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
 
     The verdict is consistent, effect_found or unexplained. Effects that the data cannot tell apart are listed
     together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and RUN/summary.json
@@ -81,8 +68,8 @@ def diagnose(
     job.begin("reading")
     calset, chosen = set_and_model(data, model, instrument, effects, output=output)
     with job.repeated() as say:
-        found = diagnosis_of(calset, chosen, seed=job.seed, minutes=minutes, progress=say)
-    return outcome_of(job, found, output)
+        diagnosis = diagnosis_of(calset, chosen, seed=job.seed, minutes=minutes, progress=say)
+    return outcome_of(job, diagnosis, output)
 
 
 def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[Diagnosis]:
@@ -98,24 +85,23 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
     product, after = found.calibration(), answered(found.after)
     usable = after.trusted and found.verdict != "unexplained"
 
-    def files() -> Writers:
+    def write_summary(path: Path) -> None:
         job.tell("mapping the field", "mapping")
-        drawn_from = figure_data(found)
         misfit = None if after.explains_data else describe(after)
         fitted = summary(after, seconds=found.seconds, misfit=misfit) | {"seed": job.seed}
-        return {
-            PRODUCT: lambda path: write_calibration(path, product),
-            SUMMARY: text_file(json_text(fitted | {"shown": after.display().document()})),
-            FIGURE_DATA: lambda path: write_figure_data(path, drawn_from),
-            MODEL: text_file(render(after.model)),
-        }
+        text_file(json_text(fitted | {"shown": after.display().document()}))(path)
 
     return Outcome(
         found,
         document(found),
         display=_with_answer(found, after),
         below=f"The calibration can{'' if usable else 'not'} be trusted; written to {output}.",
-        files=files,
+        files={
+            SUMMARY: write_summary,
+            PRODUCT: lambda path: write_calibration(path, product),
+            FIGURE_DATA: lambda path: write_figure_data(path, figure_data(found)),
+            MODEL: lambda path: path.write_text(render(after.model), encoding="utf-8"),
+        },
         saved_as=DIAGNOSIS,
         warnings=after.warnings,
         trusted=usable,
@@ -147,6 +133,9 @@ def write(found: Diagnosis, folder: PathLike, *, overwrite: bool = False) -> Non
 
 def _with_answer(found: Diagnosis, after: FitResult) -> Display:
     """The findings, and how well stars are known with the extended model."""
-    shown, known = found.display(), after.answer() if after.answer is not None and after.converged else None
-    more = () if known is None else known.facts(complete=found.verdict != "unexplained")
-    return dataclasses.replace(shown, facts=(*shown.facts, *more))
+    shown, accuracy = (
+        found.display(),
+        after.answer() if after.answer is not None and after.converged else None,
+    )
+    answer = () if accuracy is None else accuracy.facts(complete=found.verdict != "unexplained")
+    return dataclasses.replace(shown, facts=(*shown.facts, *answer))

@@ -23,26 +23,26 @@ def docs(
 
     Recipes, conventions, file formats, the model, effects, how to add an effect or an instrument, vocabulary, sources;
     and `effect NAME` or `element NAME` for a page about a single one: equation, parameters, at what size it is found,
-    what it can be confused with.
+    its rivals.
 
     In Python: its text.
 
     >>> print(walop.docs("conventions").splitlines()[0])
     # Conventions
     """
-    found = pages()
+    texts = pages()
     if name is not None and topic not in SINGLE:
         raise UsageError(f"{name!r} follows neither effect nor element", "name")
     if topic in SINGLE:
         text = _single(job, topic, name)
     elif topic is None:
-        listed = {key: about(text) for key, text in found.items()}
+        listed = {key: about(text) for key, text in texts.items()}
         listed |= {f"{key} NAME": words for key, words in SINGLE.items()}
         width = max(map(len, listed))
         text = "\n".join(f"{key:<{width}}   {words}" for key, words in listed.items())
-    elif (text := found.get(topic.lower().removesuffix(".md"), "")) == "":
+    elif (text := texts.get(topic.lower().removesuffix(".md"), "")) == "":
         raise UsageError(
-            f"there is no page {topic!r}; {nearest(topic, (*found, *SINGLE))} (walop-jax docs lists all)",
+            f"there is no page {topic!r}; {nearest(topic, (*texts, *SINGLE))} (walop-jax docs lists all)",
             "topic",
         )
     return Outcome(
@@ -71,8 +71,8 @@ def pages() -> dict[str, str]:
     from importlib.resources import files
 
     folder = files("walop_jax") / "docs"
-    found = (entry for entry in folder.iterdir() if entry.name.endswith(".md") and entry.name != "index.md")
-    texts = {entry.name.removesuffix(".md"): entry.read_text(encoding="utf-8") for entry in found}
+    entries = (entry for entry in folder.iterdir() if entry.name.endswith(".md") and entry.name != "index.md")
+    texts = {entry.name.removesuffix(".md"): entry.read_text(encoding="utf-8") for entry in entries}
     return dict(sorted(texts.items()))
 
 

@@ -1,7 +1,7 @@
 """A command for each of many files, in this process or by the workers of an executor (`nights.making.executor_of`).
 
-An output appears whole or not at all, and one that is there is not made again, so that what was interrupted goes on
-with the same command.
+An output appears whole or not at all, and one that is there is not made again, so that an interrupted command goes on
+when it is typed again.
 """
 
 from __future__ import annotations
@@ -54,32 +54,34 @@ def for_each(
     if any(place.resolve() == Path(file).resolve() for place, file in zip(places, files, strict=True)):
         raise UsageError("the tables would replace the catalogues: give another folder", "output")
     Path(output).mkdir(parents=True, exist_ok=True)
-    asked = [
+    calls = [
         {**arguments, "catalogue": file, "output": place}
         for file, place in zip(files, places, strict=True)
         if job.overwrite or not place.exists()
     ]
     ended = []
     with executor_of(workers, scheduler) as executor:
-        tasks = [(command.__name__, job.overwrite, one) for one in asked]
-        for number, one in enumerate(mapped(_run, tasks, executor), start=1):
-            job.tell(f"{number} of {len(asked)} catalogues")
-            ended.append(one)
-    failed = [one.error for one in ended if one.error]
-    there = len(files) - len(asked)
-    remark = f"{there} of {len(files)} tables were there already, and are left; --overwrite makes them again"
+        tasks = [(command.__name__, job.overwrite, end) for end in calls]
+        for number, end in enumerate(mapped(_run, tasks, executor), start=1):
+            job.tell(f"{number} of {len(calls)} catalogues")
+            ended.append(end)
+    failed = [end.error for end in ended if end.error]
+    existing = len(files) - len(calls)
+    remark = (
+        f"{existing} of {len(files)} tables were there already, and are left; --overwrite makes them again"
+    )
     return Outcome(
         places,
         {
             "outputs": [str(place) for place in places],
             "made": len(ended) - len(failed),
-            "left": there,
+            "left": existing,
             "failed": failed,
-            "catalogues": [one.document for one in ended if not one.error],
+            "catalogues": [end.document for end in ended if not end.error],
         },
-        "\n".join(one.text for one in ended if one.text) or f"{output}: nothing was left to do",
+        "\n".join(end.text for end in ended if end.text) or f"{output}: nothing was left to do",
         warnings=list(
-            dict.fromkeys([*(w for one in ended for w in one.warnings), *([remark] if there else [])])
+            dict.fromkeys([*(w for end in ended for w in end.warnings), *([remark] if existing else [])])
         ),
         failure="; ".join(failed),
     )

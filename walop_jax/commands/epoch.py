@@ -1,41 +1,39 @@
-"""`walop-jax epoch`: does last month's calibration still fit, and what has moved?"""
+"""`walop-jax epoch`: does last month's calibration still fit, and which parameters have moved?"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, Writers, command
-from walop_jax.commands.inputs import SETS, set_of
-from walop_jax.commands.products import Diagnosed, Effects, calibration_of, catalogue_of
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command
+from walop_jax.commands.inputs import Sets, set_of
+from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, CalibrationSet, FitResult, Run
     from walop_jax.science.epoch import Epoch
 
 OLD = Argument("Old calibration product, or folder of a run.", "OLD", Path)
-FOLDER = Option("Folder for the new calibration and what was found.", "RUN", Path, "-o")
+FOLDER = Option("Folder for the new calibration and the comparison.", "RUN", Path, "-o")
 OUTPUTS = ("calibration.fits", "epoch.json")
 
 
 @command(stages=("reading", "fitting", "lacking"), writes=OUTPUTS, random=True)
 def epoch(
     job: Job,
-    old: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike, OLD],
-    new: Annotated[CalibrationSet | PathLike | Sequence[PathLike], SETS],
+    old: Annotated[Product, OLD],
+    new: Sets,
     *,
     output: Annotated[PathLike | None, FOLDER] = None,
     effects: Effects = None,
 ) -> Outcome[Epoch]:
     """Fit new calibration sets and compare with an old calibration: is the instrument still the same?
 
-    Says what has changed by how much, and how far off stars would be if the old calibration were still used; lists the
-    parameters by how far they have moved, and tests all of them together. The new fit is that of the old model: plates,
-    effects, priors and what is held. Where that does not explain the new data and did explain the old ones, what is
-    missing is looked for as walop-jax diagnose does, and the old calibration is compared with the model found.
+    Reports the changes with their sizes, and how far off stars would be if the old calibration were still used; lists
+    the parameters by how far they have moved, and tests all of them together. The new fit is that of the old model:
+    plates, effects, priors and what is held. Where that does not explain the new data and did explain the old ones,
+    what is missing is looked for as walop-jax diagnose does, and the old calibration is compared with the model found.
 
     Exit code 0 only where the old calibration still holds; 3 where something has moved, or where the new data are not
     explained.
@@ -57,9 +55,9 @@ def epoch(
     job.tell("fitting the new set", "fitting")
     with errors_naming(held.path):
         result = examined(fit_like(held, calset), job.seed)
-        found = compared(held, result)
+        comparison = compared(held, result)
     lacking = None
-    if found.fits is None:
+    if comparison.fits is None:
         job.tell("looking for what the new fit lacks", "lacking")
         # Other readings of the data have been tried when its fit was examined.
         lacking = diagnose(
@@ -72,31 +70,26 @@ def epoch(
         )
         if lacking is not None and lacking.after.trusted:
             result = lacking.after
-            found = compared(held, result)
-    shown = found.display()
+            comparison = compared(held, result)
+    shown = comparison.display()
     if lacking is not None:
         named = ", ".join(step.effect for step in lacking.steps) or "nothing that has a name"
         lacks = f"what the old model lacks: {named} ({lacking.verdict})"
         shown = dataclasses.replace(shown, notes=(*shown.notes, lacks))
-
-    def files() -> Writers:
-        product = Calibration.from_fit(result)
-        return {OUTPUTS[0]: lambda path: write_calibration(path, product)}
-
     return Outcome(
-        found,
+        comparison,
         {
             "old": held.content_hash(),
             "old_file": held.path,
             "old_date": held.date,
             "new": [entry.sha256 for entry in calset.inputs],
             "new_files": [str(entry.path) for entry in calset.inputs],
-            **found.document(),
+            **comparison.document(),
             "diagnosis": None if lacking is None else document(lacking),
         },
         display=shown,
-        files=files,
+        files={OUTPUTS[0]: lambda path: write_calibration(path, Calibration.from_fit(result))},
         saved_as=OUTPUTS[1],
-        warnings=[f"the new fit: {w}" if w in result.warnings else w for w in found.warnings],
-        trusted=found.holds,
+        warnings=[f"the new fit: {w}" if w in result.warnings else w for w in comparison.warnings],
+        trusted=comparison.holds,
     )

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command, several
 from walop_jax.commands.inputs import TableFile
 
 FILES = Argument(
@@ -26,7 +25,7 @@ def exposures(
     words: Annotated[PathLike | None, WORDS] = None,
     output: TableFile = None,
 ) -> Outcome[Any]:
-    """Make the table EXPOSURES of a calibration set from what an observatory writes down.
+    """Make the table EXPOSURES of a calibration set from the records of an observatory.
 
     WORDS.toml says which header word (or key of a log, or column of a table) is which column, in which unit, and what
     is made of it (walop-jax docs files). Words that are missing, units that do not fit and values that cannot be meant
@@ -46,22 +45,22 @@ def exposures(
 
     if words is None:
         raise UsageError("give the file that says which word is which column", "words")
-    given = [files] if isinstance(files, str | os.PathLike) else list(files)
-    known = read_words(words)
-    first = Path(given[0])
+    paths = several(files)
+    rules = read_words(words)
+    first = Path(paths[0])
     content = None
-    if first.suffix.lower() == ".json" and len(given) == 1:
+    if first.suffix.lower() == ".json" and len(paths) == 1:
         try:
             content = json.loads(read_text(first))
         except json.JSONDecodeError:
             content = None  # an error of the reader below
     if is_schedule(content):
-        made, names, remarks = read_schedule(first, known.filters)
+        executed, names, remarks = read_schedule(first, rules.filters)
         import numpy as np
 
-        columns = {**made.columns(), "TARGET": np.array(names)}
+        columns = {**executed.columns(), "TARGET": np.array(names)}
     else:
-        columns, remarks = exposures_table(given, known)
+        columns, remarks = exposures_table(paths, rules)
     units = {name: "deg" for name in columns if name.endswith(("_ANGLE", "_TURN"))}
     units |= {name: rule.unit for name, rule in EXPOSURES.items()}
     table = astropy_table({name: (values, units.get(name, ""), "") for name, values in columns.items()})

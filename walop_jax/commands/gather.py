@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command, several
 from walop_jax.commands.inputs import InstrumentLike, TableFile, design_of
 
 if TYPE_CHECKING:
@@ -60,39 +59,38 @@ def gather(
 
     if output is not None:
         table_format(output)
-    if isinstance(catalogues, str | os.PathLike):
-        catalogues = [catalogues]
+    catalogues = several(catalogues)
     design = design_of(instrument) or nominal_instrument()
     names = design.cameras.names
     if len(catalogues) != len(names):
         what = f"{len(catalogues)} catalogues for the {len(names)} cameras of {design.name}"
         raise UsageError(f"{what}: give those of {', '.join(names)}, in this order", "catalogues")
     job.begin("reading")
-    each = [read_camera_catalogue(path, columns, gain) for path in catalogues]
-    pointing, said = _pointing(each, {"RA": ra, "DEC": dec, "ROTATOR": rotator})
+    cameras = [read_camera_catalogue(path, columns, gain) for path in catalogues]
+    pointing, pointing_remarks = _pointing(cameras, {"RA": ra, "DEC": dec, "ROTATOR": rotator})
     job.begin("matching")
-    made = gathered(each, names, pointing, tolerance)
+    gathered_stars = gathered(cameras, names, pointing, tolerance)
     if gaia is not None:
-        made = identified(made, gaia, tolerance)
-    remarks = [*said, *made.remarks]
+        gathered_stars = identified(gathered_stars, gaia, tolerance)
+    remarks = [*pointing_remarks, *gathered_stars.remarks]
     job.begin("writing")
     cards = {"INSTRUME": design.name, "RA": pointing.ra, "DEC": pointing.dec, "ROTATOR": pointing.rotator}
-    table = astropy_table(made.columns, {**cards, "RADESYS": "ICRS"})
+    table = astropy_table(gathered_stars.columns, {**cards, "RADESYS": "ICRS"})
     if output is not None:
         write_table(output, table, overwrite=job.overwrite)
-    seen = [int((made.matched == count).sum()) for count in range(len(names) + 1)]
+    by_cameras = [int((gathered_stars.matched == count).sum()) for count in range(len(names) + 1)]
     document = {
         "output": output,
         "stars": len(table),
-        "in_all_cameras": seen[-1],
+        "in_all_cameras": by_cameras[-1],
         "pointing": cards,
         "registrations": [
             {"camera": name, "shift_arcsec": move.shift.tolist(), "rotation_deg": move.rotation}
-            for name, move in zip(names, made.registrations, strict=True)
+            for name, move in zip(names, gathered_stars.registrations, strict=True)
         ],
         "remarks": remarks,
     }
-    text = f"{output}: {len(table)} stars, {seen[-1]} of them in all {len(names)} cameras"
+    text = f"{output}: {len(table)} stars, {by_cameras[-1]} of them in all {len(names)} cameras"
     return Outcome(
         table, document, text, warnings=remarks, next=(f"walop-jax apply RUN {output} -o OUT.fits",)
     )
@@ -111,9 +109,9 @@ def _pointing(
         name: _number(first.header.get(name)) if value is None else value for name, value in given.items()
     }
     missing = [name for name, value in numbers.items() if value is None]
-    if missing and (seen := centre_of(first.header)) is not None:
-        numbers |= {name: seen[name] for name in missing}
-        stated = ", ".join(f"{name} {seen[name]:.6g}" for name in missing)
+    if missing and (from_wcs := centre_of(first.header)) is not None:
+        numbers |= {name: from_wcs[name] for name in missing}
+        stated = ", ".join(f"{name} {from_wcs[name]:.6g}" for name in missing)
         remarks.append(f"{first.path}: {stated} deg from the WCS: centre of the image, and its axis x as +X")
         missing = []
     if missing:

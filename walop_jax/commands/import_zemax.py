@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from walop_jax import CalibrationSet
 
 FOLDER = Argument('Folder of "Polarization Transmission" text exports.', "FOLDER", Path)
-INSTRUMENT = Option("Which instrument; default: what the titles say.", kind=str)
+INSTRUMENT = Option("Which instrument; default: that of the titles.", kind=str)
 CAMERAS = Option("Configurations of the design that are the cameras.", "O1,E1,O2,E2", str)
 ERROR = Option("Error of a transmission, as a share of it: how far to trust the design.")
 
@@ -36,7 +36,7 @@ def import_zemax(
 
     Rows that lack a camera are left out, transmissions of 0 are flagged, with a warning in both cases.
 
-    In Python: the set; its `remarks` say what was left out.
+    In Python: the set; its `remarks` name the rows that were left out.
 
     >>> design = walop.import_zemax("exports")  # doctest: +SKIP
     """
@@ -46,7 +46,7 @@ def import_zemax(
 
     try:
         configurations = tuple(
-            int(part) for part in (cameras.split(",") if isinstance(cameras, str) else cameras)
+            int(text_of_one) for text_of_one in (cameras.split(",") if isinstance(cameras, str) else cameras)
         )
     except ValueError:
         configurations = ()
@@ -56,23 +56,23 @@ def import_zemax(
         raise UsageError(f"{error} is not a share, as in 0.001", "error")
     if instrument is not None and instrument.upper() not in shipped():
         raise UsageError(f"there is no {instrument!r}; {nearest(instrument, shipped())}", "instrument")
-    made = import_transmissions(
+    design = import_transmissions(
         folder, instrument=instrument, configurations=configurations, error=error, tell=job.tell
     )
     job.tell("writing")
     if output is not None:
-        write_calibration_set(output, made, overwrite=job.overwrite)
+        write_calibration_set(output, design, overwrite=job.overwrite)
     document = {
         "output": output,
-        "instrument": made.instrument,
-        "wavelengths": [float(curve.wavelength[0]) for curve in made.filters.values()],
-        "exposures": len(made.exposures),
-        "points": len(made.points),
-        "rows": made.intensities.rows,
-        "remarks": list(made.remarks),
+        "instrument": design.instrument,
+        "wavelengths": [float(curve.wavelength[0]) for curve in design.filters.values()],
+        "exposures": len(design.exposures),
+        "points": len(design.points),
+        "rows": design.intensities.rows,
+        "remarks": list(design.remarks),
     }
     text = (
-        f"{output}: {made.instrument}, {len(document['wavelengths'])} wavelengths, {document['exposures']} exposures "
+        f"{output}: {design.instrument}, {len(document['wavelengths'])} wavelengths, {document['exposures']} exposures "
         f"of {document['points']} points, {document['rows']} rows to use"
     )
-    return Outcome(made, document, text, warnings=made.remarks)
+    return Outcome(design, document, text, warnings=design.remarks)

@@ -1,7 +1,7 @@
 """Arguments that several commands take, on the command line and in Python, and their readers.
 
 Sets, models, calibrations and tables may be given in memory or as files; `read` reads whatever the program has written.
-What is given in place of one of them is a TypeError: what it is, and what to give.
+Anything else is a TypeError with advice.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ GIGABYTE = 1e9
 SETS = Argument("Calibration sets (FITS), fitted as one.", metavar="CALSET...", kind=list[Path])
 Sets = Annotated["CalibrationSet | PathLike | Sequence[PathLike]", SETS]
 ModelLike = Annotated[
-    "Model | PathLike | None", Option("Model file: what is free, tied, known, added.", "MODEL.toml", Path)
+    "Model | PathLike | None",
+    Option("Model file: parameters free, tied, held; effects added.", "MODEL.toml", Path),
 ]
 InstrumentLike = Annotated[
     "Instrument | PathLike | None",
@@ -118,11 +119,11 @@ def paths_of(data: Sets) -> tuple[PathLike, ...]:
         if not paths:
             raise ValueError("a run is made from files: write the set first, walop_jax.write_calibration_set")
         return paths
-    given: Any = data if isinstance(data, list | tuple) else (data,)
+    candidates: Any = data if isinstance(data, list | tuple) else (data,)
     advice = "a set, the path of one (FITS), or several paths in a list"
-    for one in given:
-        path_of(one, "a calibration set", advice)
-    return tuple(given)
+    for candidate in candidates:
+        path_of(candidate, "a calibration set", advice)
+    return tuple(candidates)
 
 
 def set_of(data: Sets, instrument: Instrument | None = None) -> CalibrationSet:
@@ -150,7 +151,7 @@ def set_and_model(
     """Calibration sets as one, and the model to fit to them.
 
     `model` is one, or a model file (None: the base model); `instrument` as designed, or its name or description file
-    (None: what the sets say); `effects` are those that a model file may name. With `output` the folder of a
+    (None: that of the sets); `effects` are those that a model file may name. With `output` the folder of a
     run is written: it is made from files, so that it can be made again.
 
     Raises `DataError` for files that cannot be read, ValueError, naming the file, for a model that does not fit.
@@ -201,11 +202,11 @@ def save(
         raise fail("holds no calibration", file=getattr(result, "folder", ""), advice="give a fit")
     product = Calibration.from_fit(held) if isinstance(held, FitResult) else held
     names = (PRODUCT, SUMMARY) if isinstance(held, FitResult) else (PRODUCT,)
-    with output_folder(folder, names, overwrite=overwrite) as out, out.filled() as there:
-        write_calibration(there / PRODUCT, product)
+    with output_folder(folder, names, overwrite=overwrite) as out, out.filled() as temporary:
+        write_calibration(temporary / PRODUCT, product)
         if isinstance(held, FitResult):
             content = summary(held, seconds=held.seconds) | {"shown": held.display().document()}
-            (there / SUMMARY).write_text(json_text(content), encoding="utf-8")
+            (temporary / SUMMARY).write_text(json_text(content), encoding="utf-8")
 
 
 def goal_of(percent: float | None) -> float | None:

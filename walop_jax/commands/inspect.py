@@ -1,4 +1,4 @@
-"""`walop-jax inspect`: what is in calibration sets, and what is wrong with them."""
+"""`walop-jax inspect`: contents and faults of calibration sets."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ class InspectedSets(Displayed):
     @property
     def inspections(self) -> tuple[Inspection, ...]:
         """Those that could be made, that of all sets together the last."""
-        found = [one for _, one in self.sets if not isinstance(one, DataError)]
-        return (*found, *(() if self.joint is None else (self.joint,)))
+        readable = [inspection for _, inspection in self.sets if not isinstance(inspection, DataError)]
+        return (*readable, *(() if self.joint is None else (self.joint,)))
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
         return {
             "sets": [
-                {"files": [path], "error": str(found)}
-                if isinstance(found, DataError)
-                else dataclasses.asdict(found)
-                for path, found in self.sets
+                {"files": [path], "error": str(inspection)}
+                if isinstance(inspection, DataError)
+                else dataclasses.asdict(inspection)
+                for path, inspection in self.sets
             ],
             "joint": None if self.joint is None else dataclasses.asdict(self.joint),
         }
@@ -47,20 +47,19 @@ class InspectedSets(Displayed):
 
     def displays(self) -> list[Display]:
         """Every inspection."""
-        return [one.display() for one in self.inspections]
+        return [inspection.display() for inspection in self.inspections]
 
 
 @command(jax=False)
 def inspect(
-    job: Job,
-    data: Annotated[Sets, Argument(SETS.help.partition(",")[0] + ".", SETS.metavar, SETS.kind)],
+    job: Job, data: Annotated[Sets, Argument(SETS.help.partition(",")[0] + ".", SETS.metavar, SETS.kind)]
 ) -> Outcome[InspectedSets]:
-    """Say what is in calibration sets and what is wrong with them.
+    """List the contents and the faults of calibration sets.
 
     Each file by itself; then whether they can be fitted as one. Exit code 1 if any cannot be read or fitted.
 
-    In Python: an `InspectedSets`. Raises `DataError` only if the sets cannot be one: what is wrong with a single file
-    is among its faults.
+    In Python: an `InspectedSets`. Raises `DataError` only if the sets cannot be one: errors of a single file are
+    among its faults.
 
     >>> walop.inspect("night.fits").faults
     ()
@@ -71,29 +70,33 @@ def inspect(
     from walop_jax.instruments.description import shipped
 
     if isinstance(data, CalibrationSet):
-        one = inspection_of(data)
-        bad = tuple(str(entry) for entry in one.findings if entry.severity == "fault")
-        made = InspectedSets(((", ".join(one.files) or IN_MEMORY, one),), None, bad)
-        return Outcome(made, failure="; ".join(bad))
+        inspection = inspection_of(data)
+        bad = tuple(str(entry) for entry in inspection.findings if entry.severity == "fault")
+        whole_set = InspectedSets(((", ".join(inspection.files) or IN_MEMORY, inspection),), None, bad)
+        return Outcome(whole_set, failure="; ".join(bad))
     sets: list[tuple[str, Inspection | DataError]] = []
     faults: list[str] = []
     paths = paths_of(data)
     for path in paths:
         job.tell(f"reading {path}")
         try:
-            one = inspection_of(read_calibration_set(path))
+            inspection = inspection_of(read_calibration_set(path))
         except DataError as error:
             faults.append(str(error))
             sets.append((str(path), error))
             continue
-        faults += [f"{path}: {entry}" for entry in one.findings if entry.severity == "fault"]
-        sets.append((str(path), one))
-    strange = [one for _, one in sets if not isinstance(one, DataError) and one.instrument not in shipped()]
+        faults += [f"{path}: {entry}" for entry in inspection.findings if entry.severity == "fault"]
+        sets.append((str(path), inspection))
+    strange = [
+        inspection
+        for _, inspection in sets
+        if not isinstance(inspection, DataError) and inspection.instrument not in shipped()
+    ]
     joint = inspection_of(read_calibration_set(*paths)) if len(paths) > 1 and not faults else None
-    found = InspectedSets(tuple(sets), joint, tuple(faults))
+    inspected = InspectedSets(tuple(sets), joint, tuple(faults))
     return Outcome(
-        found,
-        text="\n".join(one.text() for one in found.displays()),
+        inspected,
+        text="\n".join(inspection.text() for inspection in inspected.displays()),
         failure="; ".join(faults),
         next=("walop-jax refit CALSET --instrument FILE.toml -o RUN",) if strange else (),
     )

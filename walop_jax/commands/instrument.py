@@ -13,19 +13,16 @@ TEXT = Option("Print the description itself, to start one's own from.")
 
 @command(jax=False, elements=True)
 def instrument(
-    job: Job,
-    source: Annotated[PathLike | None, SOURCE] = None,
-    *,
-    text: Annotated[bool, TEXT] = False,
+    job: Job, source: Annotated[PathLike | None, SOURCE] = None, *, text: Annotated[bool, TEXT] = False
 ) -> Outcome[Any]:
     """Print and check an instrument: its elements, cameras and parameters, from its description file.
 
     The description is read, every element is made, and light is sent through it on the axis and at the edge of the
     field. Without a name the instruments that come with the package are listed.
 
-    In Python: a `CheckedInstrument`, whose `instrument` is the instrument; without a name, what each is, by name; with
-    `text`, the description. Raises `DataError` for a description that is wrong, and for optics that are not finite or
-    give more light than came in.
+    In Python: a `CheckedInstrument`, whose `instrument` is the instrument; without a name, a line about each, by name;
+    with `text`, the description. Raises `DataError` for a description that is wrong, and for optics that are not finite
+    or give more light than came in.
 
     >>> print(walop.instrument("WALOP-SOUTH"))
     WALOP-SOUTH: 4 cameras (O1, E1, O2, E2)
@@ -36,11 +33,7 @@ def instrument(
     if source is None:
         names = {name: described(name).about for name in shipped()}
         width = max(map(len, names))
-        return Outcome(
-            names,
-            names,
-            "\n".join(f"{name:<{width}}  {about}" for name, about in names.items()),
-        )
+        return Outcome(names, names, "\n".join(f"{name:<{width}}  {about}" for name, about in names.items()))
     if text:
         written = read_description(source).text
         return Outcome(written, {"name": str(source), "text": written}, written)
@@ -48,5 +41,5 @@ def instrument(
     from walop_jax.calibration.checked_instrument import checked
 
     with errors_naming(source):
-        found = checked(source)
-    return Outcome(found)
+        checked_instrument = checked(source)
+    return Outcome(checked_instrument)

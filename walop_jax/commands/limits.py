@@ -1,4 +1,4 @@
-"""`walop-jax limits`: what a calibration set can show, before anything is found in it."""
+"""`walop-jax limits`: sizes of effects that a calibration set can show, before anything is found in it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def limits(
     instrument: InstrumentLike = None,
     effects: Effects = None,
 ) -> Outcome[DetectionLimits]:
-    """Say at which size every effect of the catalogue would be detected and named in calibration sets.
+    """Compute the size at which every effect would be detected and named in calibration sets.
 
     And what those may be that are too small: the largest error of q and u that a single effect can make over
     the field without being detected. An observing plan (TOML, see walop-jax docs files) says the same before any
@@ -75,14 +75,14 @@ def limits(
         result = examined(refit(calset, chosen, progress=job.progress), job.seed)
     if not result.converged:
         raise ValueError(f"the fit did not converge ({result.minimum.message})")
-    asked = None if effects is None else catalogue_of(effects)
-    found = detection_limits(result, catalogue=asked, seed=job.seed, progress=job.progress)
+    effect_kinds = None if effects is None else catalogue_of(effects)
+    limits_of_data = detection_limits(result, catalogue=effect_kinds, seed=job.seed, progress=job.progress)
     suggested = output is not None and (
         f"walop-jax report {output}",
         *_plan(data, output, instrument, result),
     )
     return Outcome(
-        found,
+        limits_of_data,
         extra={
             "instrument": result.model.name,
             "effects_of_the_model": list(result.model.effect_names),
@@ -91,9 +91,9 @@ def limits(
             "trusted": result.trusted,
             "seed": job.seed,
         },
-        files=lambda: {
-            OUTPUTS[1]: figure_file(protection_figure(found)),
-            OUTPUTS[2]: figure_file(separation_figure(found)),
+        files={
+            OUTPUTS[1]: figure_file(protection_figure, limits_of_data),
+            OUTPUTS[2]: figure_file(separation_figure, limits_of_data),
         },
         saved_as=OUTPUTS[0],
         next=suggested or (),

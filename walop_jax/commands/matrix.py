@@ -40,7 +40,7 @@ def matrix(
     teff: Annotated[Any, TEFF] = None,
     filter: Annotated[Any, FILTER] = None,
 ) -> Outcome[Any]:
-    """Say what the instrument matrix is at a field point, or at every point of a table.
+    """Give the instrument matrix at a field point, or at every point of a table.
 
     Added are M21, M22, M23, M31, M32, M33 and their errors (three for each arm), and P_ERR: the standard error of p of
     a star with p ≤ 5 %, from the calibration alone.
@@ -87,14 +87,14 @@ def matrix(
     columns |= {name: value for name, value in (("TEFF", teff), ("FILTER", filter)) if value is not None}
     table = table_of({"X": x, "Y": y} if points is None else points, columns)
     never = [prefix for prefix in held.never_in if f"{prefix}_ANGLE" not in columns]
-    wanted = field_points(table, instrument, held.always_in, never)
-    if points is None and wanted.outside.all():
+    places = field_points(table, instrument, held.always_in, never)
+    if points is None and places.outside.all():
         what = f"beyond the field of {instrument.name} (±{instrument.field_limit:g}°)"
         raise fail(what, column="X, Y", advice="give degrees; are these arcmin?")
     job.tell("working out the matrix")
     used = held if posterior is None else with_draws(held, posterior)
     with errors_naming(table.path):
-        added = used.matrix_columns(wanted.x, wanted.y, wanted.settings, wanted.outside)
+        added = used.matrix_columns(places.x, places.y, places.settings, places.outside)
     outcome = table_outcome(
         job,
         held,
@@ -109,9 +109,11 @@ def matrix(
         },
         extra={} if x is None else {"matrix": {name: column[0].tolist() for name, column in added.items()}},
     )
-    made = MatrixTable(outcome.value, copy=False)
-    made.meanings = {int(bit): bit.meaning for bit in Quality}
+    result = MatrixTable(outcome.value, copy=False)
+    result.meanings = {int(bit): bit.meaning for bit in Quality}
     crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
     text = f"{output}: {table.rows} rows, {crossed} of them in zones of high cross-talk"
     advice = ("walop-jax matrix RUN --points TABLE -o OUT.fits",) if output is None else ()
-    return dataclasses.replace(outcome, value=made, text=str(made) if output is None else text, next=advice)
+    return dataclasses.replace(
+        outcome, value=result, text=str(result) if output is None else text, next=advice
+    )

@@ -77,12 +77,12 @@ def model(
     changes = effects_text(effect or ())
     design = design_of(instrument)
     if calsets:
-        made = model_for(set_of(calsets, design), changes, design, catalogue)
+        base = model_for(set_of(calsets, design), changes, design, catalogue)
     else:
-        made = model_without_data(design or nominal_instrument(), changes, catalogue=catalogue)
-    text = render(made)
+        base = model_without_data(design or nominal_instrument(), changes, catalogue=catalogue)
+    text = render(base)
     if output is not None:
         with atomic_path(output, overwrite=job.overwrite) as temporary:
             temporary.write_text(text, encoding="utf-8")
-    found = ModelFile(made, text, None if output is None else Path(output))
-    return Outcome(found, text=text if output is None else None)
+    model_file = ModelFile(base, text, None if output is None else Path(output))
+    return Outcome(model_file, text=text if output is None else None)

@@ -36,12 +36,12 @@ FOLDER = Option(f"Folder for {PLAN} and plan.json; without it the plan is printe
 What = Annotated[
     "ObservingPlan | FitResult | Calibration | Diagnosis | Run | PathLike",
     Argument(
-        "What could be observed: a plan file, an instrument by name, or the RUN to add to.",
+        "Candidate exposures: a plan file, an instrument by name, or the RUN to add to.",
         "PLAN.toml|INSTRUMENT|RUN",
         Path,
     ),
 ]
-More = Annotated[Any, Option("What could be observed, of a RUN or an instrument.", "PLAN.toml", Path)]
+More = Annotated[Any, Option("Candidate exposures of a RUN or an instrument.", "PLAN.toml", Path)]
 After = Annotated[Any, Option("A calibration that is there already: plan what to add to it.", "RUN", Path)]
 Minutes = Annotated[
     float,
@@ -50,7 +50,7 @@ Minutes = Annotated[
 Criterion = Annotated[
     Any,
     Option(
-        "What is to be known best: worst (default: the largest error of p over field and colour), mean, a parameter, "
+        "Quantity to be known best: worst (default: the largest error of p over field and colour), mean, a parameter, "
         "a table of stars (X, Y in degrees, Q, U), or apart: effects that --apart names, or those that a diagnosis of "
         "RUN could not tell apart.",
         "NAME|TABLE",
@@ -94,10 +94,10 @@ def plan(
 ) -> Outcome[ExposurePlan]:
     """Plan the calibration exposures of a night: those that make the error of p smallest where it is largest.
 
-    What could be observed is said by a plan file (see `walop-jax docs files`): filters, settings of the calibration
+    Candidate exposures are given by a plan file (see `walop-jax docs files`): filters, settings of the calibration
     plate, Moon patches, standards, exposure times, costs. The polariser may stand at any angle; so may the plate, of an
     INSTRUMENT, of a RUN, or where the file says so. Printed are the exposures in order, the errors that they promise,
-    and what no plan of the same time could undercut, which is proven. RUN/plan.toml is the plan for `simulate` and
+    and a proven bound that no plan of the same time undercuts. RUN/plan.toml is the plan for `simulate` and
     `limits`, RUN/plan.json holds all numbers; --schedule writes it for the telescope.
 
     In Python: the plan. Raises ValueError for a time that pays for nothing or determines nothing.
@@ -118,23 +118,23 @@ def plan(
         available != "" and Path(str(available)).is_dir()
     ):
         after, available = available, ""
-    known = None if after is None else calibration_of(after, effects)
-    catalogue = catalogue_of(effects) if effects is not None or known is None else known.model.catalogue
+    prior = None if after is None else calibration_of(after, effects)
+    catalogue = catalogue_of(effects) if effects is not None or prior is None else prior.model.catalogue
     alike = (apart,) if isinstance(apart, str) else tuple(apart or ())
     if criterion == "apart" and not alike:
-        if known is None:
+        if prior is None:
             raise UsageError("give the effects that are to be told apart, or a RUN of diagnose", "apart")
-        alike = _alike(after, known)
+        alike = _alike(after, prior)
     if candidates is not None:
         available = candidates
-    elif available == "" and known is not None:
+    elif available == "" and prior is not None:
         moving = {
-            prefix: _stood_at(known.exposures, prefix)
-            for prefix in known.design.moving()
+            prefix: _stood_at(prior.exposures, prefix)
+            for prefix in prior.design.moving()
             if prefix != CALIBRATION_PLATE
         }
         available = ObservingPlan(
-            known.design if known.design.description else known.instrument, moving=moving
+            prior.design if prior.design.description else prior.instrument, moving=moving
         )
     chosen = (
         read_input_table(criterion)
@@ -144,11 +144,11 @@ def plan(
     possible = Available.of(available)  # pyright: ignore[reportArgumentType]
     job.tell("information of exposures", "information")
     with job.repeated() as say:
-        found = plan_exposures(
+        planned = plan_exposures(
             possible if schedule is None else possible.in_whole_seconds(),
             minutes,
             criterion=chosen,
-            known=known,
+            known=prior,
             goal=goal,
             draws=draws,
             apart=alike,
@@ -156,14 +156,13 @@ def plan(
             seed=job.seed,
             progress=say,
         )
-
-    described = found.observing_plan.design.description
+    described = planned.observing_plan.design.description
     files: Writers = {
-        PLAN: text_file(plan_text(found.observing_plan, INSTRUMENT if described else None)),
+        PLAN: text_file(plan_text(planned.observing_plan, INSTRUMENT if described else None)),
         INSTRUMENT: text_file(described) if described else None,
     }
-    remarks = () if schedule is None else _scheduled(job, found.observing_plan, schedule, words)
-    return Outcome(found, extra={"seed": job.seed}, files=lambda: files, saved_as=PLANNED, warnings=remarks)
+    remarks = () if schedule is None else _scheduled(job, planned.observing_plan, schedule, words)
+    return Outcome(planned, extra={"seed": job.seed}, files=files, saved_as=PLANNED, warnings=remarks)
 
 
 def _scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike | None) -> Sequence[str]:
@@ -173,8 +172,8 @@ def _scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike
     from walop_jax.io.atomic import atomic_path
     from walop_jax.io.text import json_text
 
-    said = Words({}) if words is None else read_words(words)
-    numbers = said.filters or {name: k for k, name in enumerate(planned.filter_names, start=1)}
+    rules = Words({}) if words is None else read_words(words)
+    numbers = rules.filters or {name: k for k, name in enumerate(planned.filter_names, start=1)}
     exposures = planned.exposures()
     _, star = planned.layout()
     stars = star.max(axis=0)
@@ -186,10 +185,10 @@ def _scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike
         else "calibration"
         for s, kind, ra, dec in zip(stars, exposures.kind, exposures.ra, exposures.dec, strict=True)
     ]
-    made, remarks = schedule_of(exposures, planned.site, numbers, facts=said.schedule, names=names)
+    document, remarks = schedule_of(exposures, planned.site, numbers, facts=rules.schedule, names=names)
     with atomic_path(path, overwrite=job.overwrite) as temporary:
-        temporary.write_text(json_text(made), encoding="utf-8")
-    if not said.filters:
+        temporary.write_text(json_text(document), encoding="utf-8")
+    if not rules.filters:
         listed = ", ".join(f"{name} {number}" for name, number in numbers.items())
         remarks.append(f"{path}: filters are numbered in their order ({listed}); --words gives other numbers")
     return remarks
@@ -215,17 +214,17 @@ def _alike(after: Any, known: Calibration) -> tuple[Any, ...]:
     from walop_jax.io.names import DIAGNOSIS
     from walop_jax.io.run_folder import RunFolder
 
-    there, path = document(after) if isinstance(after, Diagnosis) else None, None
+    diagnosis, path = document(after) if isinstance(after, Diagnosis) else None, None
     if isinstance(after, RunFolder | str | os.PathLike):
         folder = after if isinstance(after, RunFolder) else RunFolder(Path(after))
-        there, path = folder.documents.get("diagnosis"), folder.folder / DIAGNOSIS
-    if there is None:
+        diagnosis, path = folder.documents.get("diagnosis"), folder.folder / DIAGNOSIS
+    if diagnosis is None:
         advice = "run diagnose first, or name the effects with --apart (apart= in Python)"
         raise fail("no diagnosis", file=path, advice=advice)
-    found = {effect.name: effect for effect in known.model.instrument(known.values).effects}
-    for step in there["steps"]:
-        if step["equivalent"] and step["effect"] in found:
-            return (found[step["effect"]], *step["equivalent"])
+    effects_of_model = {effect.name: effect for effect in known.model.instrument(known.values).effects}
+    for step in diagnosis["steps"]:
+        if step["equivalent"] and step["effect"] in effects_of_model:
+            return (effects_of_model[step["effect"]], *step["equivalent"])
     raise fail(
         "the diagnosis left no effects that look alike",
         file=path,

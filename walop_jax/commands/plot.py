@@ -52,10 +52,10 @@ def plot(
     half-wave plates, camera transmissions, corner plots, and others. The format follows the name of the file.
 
     In Python: the matplotlib figure, of a run or of a fit, calibration, diagnosis or posterior in memory, written if
-    `output` is given; without a name, what each figure shows, by name. `figsize` (inches) is its size; with `ax` it is
-    drawn there (one of several panels in a subfigure that takes the room of these axes). `width` is that in print (mm,
-    "column" or "page"): panels are arranged for it. `reference` holds values by name that a corner plot marks.
-    Raises `DataError`, with the nearest names, for a figure that does not exist and for what the run lacks.
+    `output` is given; without a name, a line about each figure, by name. `figsize` (inches) is its size; with `ax` it
+    is drawn there (one of several panels in a subfigure that takes the room of these axes). `width` is that in print
+    (mm, "column" or "page"): panels are arranged for it. `reference` holds values by name that a corner plot marks.
+    Raises `DataError`, with the nearest names, for a figure that does not exist and for data that the run lacks.
 
     >>> walop.plot()["modulation"]
     'q_m and u_m against polariser angle'
@@ -77,8 +77,8 @@ def plot(
             advice="give the RUN of walop-jax refit or diagnose",
         )
     if held is None or name is None:
-        found = FIGURES if held is None else possible(FigureSource.of(held))
-        listed = {key: entry.about for key, entry in found.items()}
+        figures = FIGURES if held is None else possible(FigureSource.of(held))
+        listed = {key: entry.about for key, entry in figures.items()}
         width = max(map(len, listed), default=0)
         lines = [f"{key:<{width}}  {about}" for key, about in listed.items()]
         return Outcome(listed, listed, "\n".join(lines))
@@ -89,7 +89,7 @@ def plot(
             raise fail("is no picture that can be written", file=path, advice=f"use {', '.join(FORMATS)}")
         check_output(path, overwrite=job.overwrite)
     if isinstance(parameters, str):
-        parameters = [part.strip() for part in parameters.split(",") if part.strip()]
+        parameters = [word.strip() for word in parameters.split(",") if word.strip()]
     job.tell(f"drawing {name}")
     source = FigureSource.of(
         held,

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, several
 from walop_jax.fit.parameter_table import Fitted
 from walop_jax.io.text import in_ascii
 
@@ -53,6 +53,8 @@ Product = Annotated[
     "Calibration | FitResult | Diagnosed | Run | PathLike",
     Argument("Calibration product, or the folder of a run.", "RUN/calibration.fits", Path),
 ]
+OptionalProduct = Annotated["Calibration | FitResult | Diagnosed | Run | PathLike | None", None]
+"""Of commands that do without one; each adds its own option."""
 Posterior = Annotated[
     "PosteriorSample | Any | PathLike | None",
     Option("Use draws of walop-jax sample, not the covariance.", "posterior.nc", Path),
@@ -142,6 +144,16 @@ def table_of(given: Any, columns: Mapping[str, Any]) -> InputTable:
     made.table.meta.update(read.table.meta)
     made.remarks.extend(read.remarks)
     return made
+
+
+def named_tables(given: Any) -> list[tuple[str, InputTable]]:
+    """Tables, of files or in memory, with the names by which messages call them."""
+    if not several(given):
+        raise UsageError("give at least one table", "catalogues")
+    return [
+        (str(entry) if isinstance(entry, str | os.PathLike) else f"catalogue {number}", table_of(entry, {}))
+        for number, entry in enumerate(several(given), start=1)
+    ]
 
 
 def left_out_sentences(names: Sequence[str], source: PathLike | None = None) -> tuple[str, ...]:

@@ -18,16 +18,7 @@ import typer
 from typer.core import TyperGroup
 
 from walop_jax.commands import COMMANDS, GROUPS, INTERRUPTED
-from walop_jax.commands.command import (
-    COMMON,
-    Argument,
-    Command,
-    Job,
-    Option,
-    Outcome,
-    UsageError,
-    command_of,
-)
+from walop_jax.commands.command import COMMON, Argument, Command, Job, Option, Outcome, UsageError, command_of
 from walop_jax.io.progress import interrupts_answered
 
 STARTED = time.perf_counter()
@@ -121,8 +112,8 @@ def _program(
 def _paragraphs(function: Callable[..., Any]) -> str:
     """The docstring of a command without its line ends: the terminal wraps paragraphs, not the source."""
     text = inspect.cleandoc(function.__doc__ or "").partition("\n\nIn Python:")[0]
-    parts = (part for part in text.split("\n\n") if not part.startswith(">>>"))
-    return "\n\n".join(" ".join(part.split()) for part in parts)
+    paragraphs = (paragraph for paragraph in text.split("\n\n") if not paragraph.startswith(">>>"))
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 
 
 def _parameter(name: str, option: Option, default: Any, hidden: bool = False) -> inspect.Parameter:
@@ -223,12 +214,12 @@ def _run(command: Command[Any], given: dict[str, Any]) -> None:
 
         switch_on()
     with progress(quiet or json, command.stages) as tell:
-        found = command.run(Job(progress=tell, typed=True, **common), given)
-    _show(dataclasses.replace(found, next=found.next or _next_steps(command, given)), quiet, json)
+        outcome = command.run(Job(progress=tell, typed=True, **common), given)
+    _show(dataclasses.replace(outcome, next=outcome.next or _next_steps(command, given)), quiet, json)
 
 
 def _next_steps(command: Command[Any], given: dict[str, Any]) -> tuple[str, ...]:
-    """The lines of `NEXT` for what was given; those that need an output which was not written are left out."""
+    """The lines of `NEXT` for the given arguments; those that need an output which was not written are left out."""
     words = {
         name: " ".join(map(str, value)) if isinstance(value, list) else str(value)
         for name, value in given.items()
@@ -250,7 +241,7 @@ def _show(found: Outcome[Any], quiet: bool, json: bool) -> None:
     for sentence in found.warnings:
         warn(sentence)
     if text and found.next and not found.failure:
-        # On stderr: what is on stdout may be redirected into a file.
+        # On stderr: stdout may be redirected into a file.
         typer.echo(f"Done in {seconds_since_start():.0f} s. Next: {' or '.join(found.next)}", err=True)
     if found.failure:
         sys.stdout.flush()
@@ -308,7 +299,7 @@ def warn(message: str) -> None:
 
 @contextlib.contextmanager
 def progress(quiet: bool, stages: Sequence[str] = ()) -> Iterator[Callable[[str], None]]:
-    """Give a function that shows on stderr what is being done and for how long: on a terminal in a line that goes.
+    """Give a function that shows progress and time on stderr: on a terminal in a line that goes.
 
     Elsewhere a line is printed when there has been none for `LINE_EVERY` seconds. `stages` are those of the work, in
     their order: they are counted. A message that knows its share of the work (`share`) moves a bar.
@@ -322,13 +313,13 @@ def progress(quiet: bool, stages: Sequence[str] = ()) -> Iterator[Callable[[str]
     console = Console(stderr=True)
     numbered = step_counter(stages)
     if not console.is_terminal:
-        told = time.monotonic()
+        last_line = time.monotonic()
 
         def line(message: str) -> None:
-            nonlocal told
-            now, text = time.monotonic(), numbered(message)
-            if now - told >= LINE_EVERY:
-                told = now
+            nonlocal last_line
+            moment, text = time.monotonic(), numbered(message)
+            if moment - last_line >= LINE_EVERY:
+                last_line = moment
                 typer.echo(f"{seconds_since_start():.0f} s: {text}", err=True)
 
         yield line

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command, several
 from walop_jax.commands.products import Diagnosed, Effects, calibration_of
 from walop_jax.io.display import Display
 
@@ -33,11 +33,11 @@ def quality(
     figure: Annotated[PathLike | None, FIGURE] = None,
     effects: Effects = None,
 ) -> Outcome[Any]:
-    """Add a row of quality numbers for each night to a table, and say which lie outside their limits.
+    """Add a row of quality numbers for each night to a table, and list those outside their limits.
 
     Angle and p of polarised standards and q, u of unpolarised ones against their catalogue (each as all other data see
-    it), χ², gains of the cameras, the accuracy of p and what could hide. A night that is there already is replaced, the
-    same calibration is not added twice; the table is whole whenever it is read.
+    it), χ², gains of the cameras, the accuracy of p and undetectable errors. A night that is there already is
+    replaced, the same calibration is not added twice; the table is whole whenever it is read.
 
     Exit code 3 if a number of these nights is outside its limits, or a fit is not trusted.
 
@@ -47,6 +47,7 @@ def quality(
     """
     from walop_jax import Run
     from walop_jax.io.atomic import check_output
+    from walop_jax.io.plain_tables import table_format
     from walop_jax.io.run_folder import RunFolder
     from walop_jax.reports.posterior_figures import save_figure
     from walop_jax.reports.survey_figures import quality_figure
@@ -61,15 +62,18 @@ def quality(
     )
 
     allowed = read_limits(limits)
+    if output is not None:
+        check_output(output, overwrite=True)
+        table_format(output)
     if figure is not None:
         check_output(figure, overwrite=True)
-    given: list[Any] = list(runs) if isinstance(runs, list | tuple) else [runs]
+    sources = several(runs)
     rows, remarks = [], []
-    for number, one in enumerate(given, start=1):
-        job.tell(f"run {number} of {len(given)}", "reading")
-        held = calibration_of(one, effects)
+    for number, run in enumerate(sources, start=1):
+        job.tell(f"run {number} of {len(sources)}", "reading")
+        held = calibration_of(run, effects)
         folder = (
-            one.folder if isinstance(one, Run) else Path(one) if isinstance(one, str | os.PathLike) else None
+            run.folder if isinstance(run, Run) else Path(run) if isinstance(run, str | os.PathLike) else None
         )
         documents = RunFolder(folder).documents if folder is not None and folder.is_dir() else {}
         rows.append(
@@ -82,10 +86,10 @@ def quality(
     job.begin("writing")
     new = table_of_nights(rows)
     if output is None:
-        table, more = joined(new[:0], new)
+        table, table_remarks = joined(new[:0], new)
         table = judge(table, allowed)
     else:
-        table, more = append(output, new, allowed)
+        table, table_remarks = append(output, new, allowed)
     if figure is not None:
         save_figure(figure, quality_figure(table, allowed), overwrite=True)
     hashes = {row["CALHASH"] for row in rows}
@@ -102,9 +106,9 @@ def quality(
             "nights": [{name: row[name] for name in table.colnames} for row in mine],
             "limits": {name: list(pair) for name, pair in allowed.items()},
             "outside": out,
-            "remarks": [*remarks, *more],
+            "remarks": [*remarks, *table_remarks],
         },
         display=Display(title, head=("night", *(f">{name}" for name in SHOWN), "outside"), rows=shown),
-        warnings=(*remarks, *more, *out),
+        warnings=(*remarks, *table_remarks, *out),
         trusted=not out,
     )

@@ -57,10 +57,10 @@ def refit(
     not; the calibration may make half of the goal.
 
     Sets of more than 65536 points (whole frames) are read in slabs on every pass. The calibration then holds a map of
-    what the smooth model leaves. --compress makes of them a set of some hundred field points, a megabyte: refit,
+    the residuals of the smooth model. --compress makes of them a set of some hundred field points, a megabyte: refit,
     diagnose, limits, epoch and sample read it like any other set and answer in seconds as from all pixels, near the
-    values that were fitted; they say when these have moved too far. What is smaller than a twentieth of the field is
-    not in it.
+    values that were fitted; they say when these have moved too far. Structure smaller than a twentieth of the field
+    is not in it.
 
     In Python: the fit. Raises `DataError` for data that cannot be trusted, ValueError for a model that does not fit.
 
@@ -94,10 +94,10 @@ def refit(
             result = answered(examined(fitted, job.seed), goal=goal_of(goal) or GOAL)
         if compress is not None:
             write_calibration_set(compress, _compressed(result), overwrite=job.overwrite)
-        wanted = output is not None
-        mapped = wanted and result.likelihood.layout.large and result.converged
+        is_written = output is not None
+        mapped = is_written and result.likelihood.layout.large and result.converged
         residuals = residual_map(result) if mapped else None
-        misfit = describe(result) if wanted and not result.explains_data else None
+        misfit = describe(result) if is_written and not result.explains_data else None
         brief = dataclasses.replace(result.display(), rows=(), notes=())
         judged = f"The calibration can{'' if result.trusted else 'not'} be trusted; written to {output}."
         outcome = Outcome(
@@ -107,9 +107,7 @@ def refit(
             display=dataclasses.replace(result.display(), notes=result.notes),
             text=None if result.trusted else f"{brief.text()}\n{judged}",
             below=judged,
-            files=lambda: {
-                PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result, residuals))
-            },
+            files={PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result, residuals))},
             saved_as=SUMMARY,
             next=next_steps(result.trusted, output, data, instrument=instrument, effects=effects),
             warnings=result.warnings if misfit is None else misfit.reasons(result.warnings, output),
@@ -153,5 +151,5 @@ def next_steps(trusted: bool, output: PathLike | None, data: Sets, **options: ob
     if trusted:
         return (f"walop-jax report {output}", f"walop-jax apply {output} STARS.fits -o OUT.fits")
     sets = " ".join(str(path) for path in paths_of(data)) if output is not None else "CALSET"
-    more = "".join(f" --{name} {value}" for name, value in options.items() if isinstance(value, str | Path))
-    return (f"walop-jax report {output}", f"walop-jax diagnose {sets}{more} -o {output}_diagnosis")
+    typed = "".join(f" --{name} {value}" for name, value in options.items() if isinstance(value, str | Path))
+    return (f"walop-jax report {output}", f"walop-jax diagnose {sets}{typed} -o {output}_diagnosis")

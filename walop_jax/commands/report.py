@@ -32,7 +32,7 @@ FILE = Option("Page to write (default: RUN/report.html).", "FILE", Path, "-o")
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Page(Displayed):
-    """A page that was written: where, its length in bytes, and in words what the run lacked for it."""
+    """A page that was written: where, its length in bytes, and in words the files that the run lacked for it."""
 
     path: Path
     length: int
@@ -43,7 +43,7 @@ class Page(Displayed):
         return {"page": str(self.path), "bytes": self.length, "missing": list(self.missing)}
 
     def display(self) -> Display:
-        """Its file and size, and what the run lacked for it."""
+        """Its file and size, and the files that the run lacked for it."""
         return Display(f"{self.path}: {self.length / 1e6:.1f} MB", notes=self.missing)
 
 
@@ -61,9 +61,9 @@ def report(
     printed.
 
     First whether the calibration is good enough for --goal (default: that of the fit), and what to do if not. The
-    verdict, the accuracy of p over the field, what the data were, what was found, residuals before and after, maps
+    verdict, the accuracy of p over the field, the data, the findings, residuals before and after, maps
     of the matrix and of its errors, pulls from the priors, all parameters, warnings, inputs and versions, as far as RUN
-    holds them; the page says what is missing. What sample and limits have put into RUN is there as well; compare,
+    holds them; the page names missing files. Results of sample and limits in RUN are there as well; compare,
     epoch, limits, plan, stack, watch and certify have pages of their own. A page that exists is made anew; another file
     of that name is left alone unless --overwrite is given.
 
@@ -91,11 +91,11 @@ def report(
     target = folder / PAGE if output is None else Path(output)
     job.begin("reading")
     kind = kind_of_run(folder)
-    found = read_run(Run(folder, catalogue_of(effects), tuple(data or ()))) if kind == "fit" else None
+    contents = read_run(Run(folder, catalogue_of(effects), tuple(data or ()))) if kind == "fit" else None
     overwrite = job.overwrite or _is_page(target)
     check_output(target, overwrite=overwrite)
     job.tell("drawing", "drawing")
-    text, missing = render_other(folder, kind) if found is None else render(found, goal_of(goal))
+    text, missing = render_other(folder, kind) if contents is None else render(contents, goal_of(goal))
     text = encodable(text)
     with atomic_path(target, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")

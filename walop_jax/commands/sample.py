@@ -54,10 +54,10 @@ def sample(
     priors, sampler, settings or versions have changed. Other samplers start anew. A chain that has not converged is
     written and marked so, with exit code 1; the covariance of the fit then stays in calibration.fits.
 
-    In Python: a `PosteriorSample`, of a fit in memory or of a run, which is then written. `parameters` names what is
-    sampled (None: the physics coefficients); `options` (`walop.Options`) are all settings at once, with those that the
-    command line does not have, in place of the others and of `seed`.
-    Raises `DataError` if the run is no folder of a fit, holds a posterior already, or does not fit its data any more.
+    In Python: a `PosteriorSample`, of a fit in memory or of a run, which is then written. `parameters` names the
+    sampled ones (None: the physics coefficients); `options` (`walop.Options`) are all settings at once, with those that
+    the command line does not have, in place of the others and of `seed`. Raises `DataError` if the run is no folder of
+    a fit, holds a posterior already, or does not fit its data any more.
 
     >>> walop.sample(result, seed=1).to_arviz()  # doctest: +SKIP
     """
@@ -119,9 +119,11 @@ def _sampled_run(
     if isinstance(model, Model):
         raise ValueError("with a run, give the model as a file, so that the run can be made again")
     text = None if model is None else read_text(model)
-    found = [name for name in OUTPUTS if (folder / name).exists()]
-    if found and not (job.overwrite or resume):
-        raise fail(f"holds {found[0]} already", file=folder, advice="go on with --resume, or --overwrite it")
+    existing = [name for name in OUTPUTS if (folder / name).exists()]
+    if existing and not (job.overwrite or resume):
+        raise fail(
+            f"holds {existing[0]} already", file=folder, advice="go on with --resume, or --overwrite it"
+        )
     with output_folder(folder, OUTPUTS, overwrite=True) as out:
         product = read_calibration(folder / PRODUCT, run.catalogue)
         result = run.fit(text)

@@ -56,8 +56,9 @@ def simulate(
 ) -> Outcome[Simulated]:
     """Make a calibration set of an instrument whose as-built values are drawn from their priors.
 
-    The light path is the one that a fit uses; noise is that of photons and of the detectors (30 electrons). What is
-    observed is said by a plan file (see walop-jax docs files): field points, angles, Moon patches, standards, filters.
+    The light path is the one that a fit uses; noise is that of photons and of the detectors (30 electrons). The
+    exposures are those of a plan file (see walop-jax docs files): field points, angles, Moon patches, standards,
+    filters.
 
     Nights of one instrument, to rehearse epoch, stack and watch on: --like TRUTH.json --night 10. Each night has
     noise and weather of its own, also with the same seed.
@@ -112,24 +113,24 @@ def simulate(
     drawn: dict[str, Any] = {"instrument": true, "effects": hidden, "catalogue_seed": catalogue_seed}
     drawn["catalogue"] = None if template is None else template.catalogue
     about: dict[str, Any] = {"output": output, "instrument": plan.name, "seed": job.seed, "truth": truth}
-    about["effects"] = [one.name for one in hidden]
+    about["effects"] = [hidden_effect.name for hidden_effect in hidden]
     job.tell("following the light", "following")
-    made: Any
+    data: Any
     if stars is not None:
         if "standard" not in plan.design.kinds:
             raise UsageError(f"{plan.name} sees no stars", "stars")
         sources, true = true_instrument(plan, job.seed, **drawn)
-        seen = simulated_stars(plan, true, stars, job.seed, night=night or 0, noiseless=noiseless)
-        made = astropy_table(seen.columns, {"INSTRUME": plan.name})
-        known = truth_document(plan, job.seed, sources, true) | {"stars": seen.document()}
+        field = simulated_stars(plan, true, stars, job.seed, night=night or 0, noiseless=noiseless)
+        data = astropy_table(field.columns, {"INSTRUME": plan.name})
+        content = truth_document(plan, job.seed, sources, true) | {"stars": field.document()}
         about["stars"] = stars
         which = f"seed {job.seed}" if like is None or isinstance(like, tuple) else str(like)
         text = f"{output}: {plan.name}, {stars} stars of the instrument of {which}"
-        suggested, times = (f"walop-jax apply RUN {output} -o OUT.fits",), made["MJD"]
+        suggested, times = (f"walop-jax apply RUN {output} -o OUT.fits",), data["MJD"]
     else:
-        made = simulated(plan, job.seed, noiseless=noiseless, night=night, **drawn)
-        calset, true = made
-        known = truth_document(plan, job.seed, calset.sources, true)
+        data = simulated(plan, job.seed, noiseless=noiseless, night=night, **drawn)
+        calset, true = data
+        content = truth_document(plan, job.seed, calset.sources, true)
         about |= {"exposures": len(calset.exposures), "points": len(calset.points)}
         about["rows"] = calset.intensities.rows
         text = f"{output}: {plan.name}, {about['exposures']} exposures of {about['points']} points"
@@ -140,18 +141,18 @@ def simulate(
     with contextlib.ExitStack() as stack:
         if truth is not None:
             temporary = stack.enter_context(atomic_path(truth, overwrite=job.overwrite))
-            temporary.write_text(json_text(known), encoding="utf-8")
-        if output is not None and isinstance(made, Simulated):
-            write_calibration_set(output, made.calset, overwrite=job.overwrite)
+            temporary.write_text(json_text(content), encoding="utf-8")
+        if output is not None and isinstance(data, Simulated):
+            write_calibration_set(output, data.calset, overwrite=job.overwrite)
         elif output is not None:
-            write_table(output, made, overwrite=job.overwrite)
+            write_table(output, data, overwrite=job.overwrite)
     text += f"; {'; '.join(map(_sized, true.effects)) or 'nothing'} beyond the base model"
     if template is not None:
         mjd = float(np.nanmin(times))
         text += f"; the night of {date_of(mjd)}"
         about |= {"like": None if isinstance(like, tuple) else str(like), "night": night, "mjd": mjd}
     return Outcome(
-        made,
+        data,
         about,
         text,
         warnings=left_out_sentences(lost, like if isinstance(like, str | os.PathLike) else None),
@@ -178,8 +179,8 @@ def _hidden(given: Any, plan: ObservingPlan, catalogue: Sequence[EffectKind]) ->
     from walop_jax.simulation.simulate import effect_from_text
 
     context, hidden = plan.context(), []
-    for one in _texts(given):
-        hidden.append(effect_from_text(one, context, catalogue) if isinstance(one, str) else one)
+    for entry in _texts(given):
+        hidden.append(effect_from_text(entry, context, catalogue) if isinstance(entry, str) else entry)
         try:
             hidden[-1].patch(plan.design)
         except NoSuchPlaceError as error:
@@ -192,10 +193,10 @@ def _texts(effect: str | Sequence[str | Effect] | Mapping[str, Any] | None) -> S
     if not isinstance(effect, Mapping):
         return (effect,) if isinstance(effect, str) else effect or ()
     return [
-        f"{name}={','.join(f'{key}:{value}' for key, value in given.items())}"
-        if isinstance(given, Mapping)
-        else f"{name}={given}"
-        for name, given in effect.items()
+        f"{name}={','.join(f'{key}:{value}' for key, value in sizes.items())}"
+        if isinstance(sizes, Mapping)
+        else f"{name}={sizes}"
+        for name, sizes in effect.items()
     ]
 
 

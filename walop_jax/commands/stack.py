@@ -1,23 +1,22 @@
-"""`walop-jax stack`: many nights of one instrument under laws of time, and what has changed between them."""
+"""`walop-jax stack`: many nights of one instrument under laws of time, and the changes between them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command
-from walop_jax.commands.products import Diagnosed, Effects, calibration_of, catalogue_of, fit_of
+from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, several
+from walop_jax.commands.products import Effects, OptionalProduct, calibration_of, catalogue_of, fit_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from walop_jax import Calibration, FitResult, Run
     from walop_jax.nights.survey import Survey
 
 NIGHTS = Argument("Calibration sets, folders of refit, or a SURVEY.", "NIGHT...", list[Path])
 LAWS = Option("Model file with [law] tables (default: that of the first fit).", "MODEL.toml", Path)
 LIKE = Option("Fit with the model of all nights (default: the first RUN or SURVEY given).", "RUN", Path)
-EVENTS = Option("Table of what was done to the instrument: MJD, WHAT.", "TABLE", Path)
+EVENTS = Option("Table of works on the instrument: MJD, WHAT.", "TABLE", Path)
 KNOWN = Option("Do not look for breaks.")
 WORKERS = Option("Make nights in so many processes of this machine, by Dask.", "N", int, least=1)
 SCHEDULER = Option("Make nights on the workers of a Dask cluster that share the files.", "ADDRESS", str)
@@ -30,7 +29,7 @@ def stack(
     nights: Annotated[Any, NIGHTS],
     laws: Annotated[Any, LAWS] = None,
     *,
-    like: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike | None, LIKE] = None,
+    like: Annotated[OptionalProduct, LIKE] = None,
     events: Annotated[Any, EVENTS] = None,
     no_breaks: Annotated[bool, KNOWN] = False,
     workers: Annotated[int | None, WORKERS] = None,
@@ -38,12 +37,13 @@ def stack(
     output: Annotated[Any, SURVEY] = None,
     effects: Effects = None,
 ) -> Outcome[Survey]:
-    """Fit many nights at once, each parameter under a law that says how it may change.
+    """Fit many nights at once, each parameter under a law of its change with time.
 
     Breaks of any parameter, or of an effect that the model lacks, are looked for, named and dated, and become laws.
     Laws stand in the [law] tables of a model file: a value for each night or file, a random walk, intervals, steps,
-    drifts, annual terms; what has none is shared by all nights (walop-jax docs nights). A night is linearised at the
-    values of a fit, and again at the common solution; its normal equations are kept, so that it need not be read again.
+    drifts, annual terms; parameters without one are shared by all nights (walop-jax docs nights). A night is linearised
+    at the values of a fit, and again at the common solution; its normal equations are kept, so that it need not be read
+    again.
 
     SURVEY holds the nights (nights.fits), every parameter against time (tracks.fits), the calibration of the last
     night (calibration.fits), that about which nights are linearised, with the laws (reference.fits), and survey.json.
@@ -67,12 +67,11 @@ def stack(
         raise UsageError(
             "workers and scheduler exclude each other: a cluster has its own workers", "scheduler"
         )
-    given: list[Any] = list(nights) if isinstance(nights, list | tuple) else [nights]
-    given = [fit_of(one) for one in given]
+    sources = [fit_of(night) for night in several(nights)]
     with job.reserved(output, FILES) as job, executor_of(workers, scheduler) as executor:
         job.begin("reading")
         survey = stacked(
-            given,
+            sources,
             laws,
             like=None if like is None else calibration_of(like, effects),
             find=not no_breaks,
@@ -83,12 +82,12 @@ def stack(
             catalogue=catalogue_of(effects),
         )
         stars = (f"walop-jax apply {output} STARS.fits -o OUT.fits",) if survey.trusted else ()
-        found = Outcome(
+        outcome = Outcome(
             survey,
-            files=lambda: writers(survey),
+            files=writers(survey),
             saved_as=FILES[-1],
             next=(f"walop-jax report {output}", *stars),
             warnings=survey.verdict.warnings,
             trusted=survey.trusted,
         )
-        return found if job.folder is None else found.save(job.folder, drop=(PARTIAL,))
+        return outcome if job.folder is None else outcome.save(job.folder, drop=(PARTIAL,))

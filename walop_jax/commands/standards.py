@@ -46,8 +46,8 @@ def standards(
         nearest = np.argsort(away, kind="stable")
         table, ra, dec = table[nearest], ra[nearest], dec[nearest]
     if up is not None:
-        given: Any = default_name() if instrument is None else instrument
-        place: Any = given.site if hasattr(given, "site") else read_description(given).place
+        described: Any = default_name() if instrument is None else instrument
+        place: Any = described.site if hasattr(described, "site") else read_description(described).place
         height = altitude(np.full(len(ra), up), ra, dec, Site(*place[:4]))
         order = np.arange(len(ra)) if near is not None else np.argsort(-height, kind="stable")
         table["ALTITUDE"] = height * table["RA"].unit
@@ -58,7 +58,7 @@ def standards(
 
 def _direction(near: str | tuple[float, float]) -> tuple[float, float]:
     try:
-        ra, dec = (float(part) for part in (near.split(",") if isinstance(near, str) else near))
+        ra, dec = (float(coordinate) for coordinate in (near.split(",") if isinstance(near, str) else near))
     except ValueError:
         raise UsageError(
             f"near = {near!r} must be right ascension and declination in degrees: 308.2,41.2"
@@ -69,7 +69,7 @@ def _direction(near: str | tuple[float, float]) -> tuple[float, float]:
 
 
 def _plain(value: Any) -> Any:
-    """A cell as JSON has it; what is not known is null."""
+    """A cell as JSON has it; unknown values are null."""
     plain = getattr(value, "value", value)
     plain = plain.item() if hasattr(plain, "item") else plain
     return None if plain != plain else plain

@@ -49,7 +49,7 @@ def trace(
     """Follow the light of one source through the instrument.
 
     Every line is the light at one place: Stokes vectors averaged over the band, then the cameras. The
-    last line is what a fit works with.
+    last line holds the counts of a fit.
 
     In Python: the stages; `at` is a dict, {"CHWP": 45}. Raises ValueError, with the nearest names, for an unknown
     instrument, filter or moving element.

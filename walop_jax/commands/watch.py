@@ -1,13 +1,12 @@
-"""`walop-jax watch`: when a calibration ceased to hold, as the stars of many nights tell it."""
+"""`walop-jax watch`: when a calibration became invalid, from the stars of many nights."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command, figure_file
-from walop_jax.commands.products import Effects, Product, calibration_of, table_of
+from walop_jax.commands.products import Effects, Product, calibration_of, named_tables
 
 if TYPE_CHECKING:
     from walop_jax.science.watch import Watch
@@ -28,13 +27,13 @@ def watch(
     effects: Effects = None,
     force: Annotated[bool, FORCE] = False,
 ) -> Outcome[Watch]:
-    """Say when a calibration ceased to hold, from the stars of many nights: no calibration exposures are needed.
+    """Find when a calibration became invalid, from the stars of many nights: no calibration exposures are needed.
 
     Four cameras have three unknowns: one number of every row is left. Rows of one MJD are an exposure group; catalogues
     without MJD are a group each, in their order. Steps, drifts and single exposures of cameras and arms are looked for,
     as a whole, growing over the field, or in a spot of it, with their size, date, and the smallest that would have been
     seen. Stars that are seen at several settings of the plate or the rotator tell which camera it is; others hardly
-    can. What the optics may have done as well is told.
+    can. Changes of the optics that explain the stars as well are reported.
 
     Exit code 0 only where the calibration still holds, 3 where it does not.
 
@@ -49,26 +48,20 @@ def watch(
 
     job.begin("reading")
     held = calibration_of(calibration, effects)
-    given = list(catalogues) if isinstance(catalogues, list | tuple) else [catalogues]
+    names, tables = zip(*named_tables(catalogues), strict=True)
     instrument, always_in = held.model.template.patched(), held.always_in
-    rows = [read_catalogue(table_of(entry, {}), instrument, always_in=always_in) for entry in given]
+    rows = [read_catalogue(table, instrument, always_in=always_in) for table in tables]
     job.tell("tabulating the analysis vectors", "tabulating")
-    names = [
-        str(entry) if isinstance(entry, str | os.PathLike) else f"catalogue {number}"
-        for number, entry in enumerate(given, start=1)
-    ]
-    files = [name for name, entry in zip(names, given, strict=True) if isinstance(entry, str | os.PathLike)]
-    with errors_naming(", ".join(files) or None):
-        found = watched(held, rows, names=names, force=force)
-
+    with errors_naming(", ".join(names)):
+        history = watched(held, rows, names=names, force=force)
     return Outcome(
-        found,
+        history,
         extra={"product": held.content_hash()},
-        files=lambda: {
-            OUTPUTS[1]: lambda path: found.to_table().write(path, format="fits"),
-            OUTPUTS[2]: figure_file(watch_figure(found)),
+        files={
+            OUTPUTS[1]: lambda path: history.to_table().write(path, format="fits"),
+            OUTPUTS[2]: figure_file(watch_figure, history),
         },
         saved_as=OUTPUTS[0],
         warnings=held.warnings,
-        trusted=found.holds,
+        trusted=history.holds,
     )

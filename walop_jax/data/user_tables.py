@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from walop_jax.data.schema import MISSING, Column, distinct, plain_column, values_of
 from walop_jax.data.table_files import read_table_file, table_of_hdu
@@ -224,52 +224,6 @@ def _side_by_side(source: InputTable, name: str, width: int, cameras: Sequence[s
         advice = f"add it, or {listed}; {_what_is_there(source)}"
         raise Place(source.path, "").fail("the column is missing", name, advice)
     return spelling
-
-
-_SEXAGESIMAL = re.compile(r"[+-]?\d+[:hd ]\s*\d.*")
-_FEWEST_STARS = 10  # from which on the shape of a field tells hours from degrees
-_FLAT = 0.25  # of the extent in declination: hours taken as degrees have a fifteenth
-
-
-def sky_positions(
-    source: InputTable, names: Sequence[str] = ("RA", "DEC")
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Right ascensions and declinations (deg) of a table; as sexagesimal texts they are in hours and degrees.
-
-    Raises `DataError` for values that are no angles, and for right ascensions without a unit that are hours: none
-    beyond 24, of a field that would be a fifteenth as wide as high.
-    """
-    ra, dec = (_angles(source, *pair) for pair in zip(names, "hd", strict=True))
-    column, finite = source.column(names[0]), np.isfinite(ra)
-    if unit_of(column) or column.dtype.kind not in "fiu" or not finite.any():
-        return ra, dec
-    low, high = float(ra[finite].min()), float(ra[finite].max())
-    if low >= 0.0 and high <= 24.0:
-        from_first = np.mod(ra[finite] - low + 12.0, 24.0)  # a field about 0 h is no wider than others
-        width = np.std(from_first) * np.cos(np.deg2rad(np.nanmedian(dec)))
-        if len(ra) < _FEWEST_STARS:
-            source.remarks.append(
-                f"{names[0]} has no unit: taken as degrees; hours need the unit hourangle, or texts hh:mm:ss"
-            )
-        elif width < _FLAT * np.nanstd(dec):
-            what = f"lies between {low:.4g} and {high:.4g}, has no unit, and looks like hours"
-            advice = "degrees are needed: multiply by 15, or give the unit hourangle"
-            raise Place(source.path, "").fail(what, names[0], advice)
-    return ra, dec
-
-
-def _angles(source: InputTable, name: str, unit: str) -> Float[np.ndarray, " n"]:
-    """A column of angles in degrees; sexagesimal ones are in hours (h) or degrees (d)."""
-    column = source.column(name)
-    texts = np.asarray(column).astype(str) if column is not None and column.dtype.kind in "OSU" else []
-    if not any(_SEXAGESIMAL.match(text.strip()) for text in texts):
-        return numeric_column(source, name, Column("float", "deg"))
-    from astropy.coordinates import Angle
-
-    try:
-        return np.asarray(Angle(list(texts), unit={"h": "hourangle", "d": "deg"}[unit]).deg, float)
-    except ValueError as error:
-        raise Place(source.path, "").fail(one_line(error), name, "write hh:mm:ss.s and ±dd:mm:ss") from None
 
 
 def empty_cells(source: InputTable, name: str, rule: Column) -> Bool[np.ndarray, " n"]:

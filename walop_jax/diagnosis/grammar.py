@@ -178,12 +178,15 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
     for bases, prefixes, inside in _subjects(instrument, exposures, over_field=over_field):
         shown = Dependences(exposures, over_field, prefixes, everything if inside is None else inside)
         first = bases["alone"][0][0]
+        order = (
+            -1 if first.where in ("behind", "ahead of") else 1
+        )  # of a place in the train the pattern comes first
         for over, along, among in KINDS[first.kind].grows(instrument, first).tried:
             patterns = [PATTERNS[name] for name in over if over_field or name == "even"]
             factors = itertools.chain(*map(shown.of, along))
             every = itertools.chain(*(bases.get(name, ()) for name in among))
             for group, pattern, base in itertools.product(factors, patterns, every):
-                pairs = [tuple(filter(None, pair)) for pair in itertools.product(group, pattern)]
+                pairs = [tuple(filter(None, pair[::order])) for pair in itertools.product(group, pattern)]
                 yield tuple(sentence.times(*pair) for sentence in base for pair in pairs)
 
 

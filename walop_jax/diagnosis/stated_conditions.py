@@ -11,11 +11,10 @@ of the whitened residuals r with respect to the number c that the set states, fl
 field only its own place, so that scale and angle are sums of X and Y, row by row.
 
 The coordinates and times of sky exposures, the site and ROTATOR are asked in the same way, and the share of the sky
-(SKY) that is left in the counts. A number of the instrument
-that is thought to be known, and is not, looks much like these: the prior of each parameter, and those of each element
-together, are rivals with the column (mean − value)/width. So are terms of one camera with one amplitude: a
-non-linearity (its counts squared), a pedestal, scattered light (the median counts of an exposure), light of another
-camera. What cannot be told apart is told together.
+(SKY) that is left in the counts. A number of the instrument that is thought to be known, and is not, looks much like
+these: the prior of each parameter, and those of each element together, are rivals with the column (mean −
+value)/width. So are terms of one camera with one amplitude: a non-linearity (its counts squared), a pedestal, scattered
+light (the median counts of an exposure), light of another camera. What cannot be told apart is told together.
 
 Limits      What the free parameters take up whole is told by no residual: with a single filter its displacement, the
             thicknesses of the plates look the same. One number at a time, by a linear step: the size is a hint.
@@ -66,7 +65,7 @@ _PLACES = {"x", "gap"}  # shapes of which there are so many that an effect is as
 _PRECESSION = (
     46.124 / 3600.0,
     20.043 / 3600.0,
-)  # deg a year: m and n, Capitaine et al. 2003, A&A 412, 567, J2000
+)  # deg a year: m, n, Capitaine et al. 2003, A&A 412, 567, J2000
 STEP = 1e-4  # of the width: what is left out of the derivative is its square
 
 
@@ -437,20 +436,17 @@ def _stated(calset: CalibrationSet) -> Iterator[_Stated]:
             yield _Stated(what, "K", remedy, "a measured spectrum of their light", typical, warmer, stated)
     yield from _of_sky(calset)
     table = calset.intensities
-    if isinstance(table, TableIntensities) and table.sky is not None and table.sky.any():
-        remedy, shown_by = "subtract the sky anew", "the same stars under a sky of another level"
-        less = functools.partial(_with_less_sky, calset, table)
-        yield _Stated(
-            "the light of the sky that is left, in units of SKY,", "", remedy, shown_by, 0.1, less, 0.0
+    if isinstance(table, TableIntensities) and (sky := table.sky) is not None and sky.any():
+
+        def less(share: float) -> CalibrationSet:
+            counts = table.counts - share * sky
+            return dataclasses.replace(calset, intensities=dataclasses.replace(table, counts=counts))
+
+        what, shown_by = (
+            "the light of the sky that is left, in units of SKY,",
+            "the same stars under another sky",
         )
-
-
-def _with_less_sky(calset: CalibrationSet, table: TableIntensities, share: float) -> CalibrationSet:
-    """The set from whose counts a further share of the sky is subtracted."""
-    assert table.sky is not None
-    return dataclasses.replace(
-        calset, intensities=dataclasses.replace(table, counts=table.counts - share * table.sky)
-    )
+        yield _Stated(what, "", "subtract the sky anew", shown_by, 0.1, less, 0.0)
 
 
 def _moved(

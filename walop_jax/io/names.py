@@ -5,14 +5,14 @@ from __future__ import annotations
 PRODUCT, MODEL = "calibration.fits", "model.toml"
 SUMMARY, FAILED = "summary.json", "summary.failed.json"
 DIAGNOSIS, FIGURE_DATA = "diagnosis.json", "diagnosis.fits"
-POSTERIOR, INTERVALS, CORNER, SAMPLE = "posterior.nc", "posterior.ecsv", "posterior_corner.png", "sample.json"
+POSTERIOR, CORNER, SAMPLE = "posterior.nc", "posterior_corner.png", "sample.json"
 COMPARISON, EPOCH, LIMITS, COMMISSIONING = (
     "comparison.json",
     "epoch.json",
     "limits.json",
     "commissioning.json",
 )
-PLANNED, WATCHED, SURVEY = "plan.json", "watch.json", "survey.json"
+PLANNED, WATCHED, SURVEY, AFFECTED = "plan.json", "watch.json", "survey.json", "affected.json"
 NIGHTS, REFERENCE, TRACKS = "nights.fits", "reference.fits", "tracks.fits"
 
 DOCUMENTS = {
@@ -26,5 +26,6 @@ DOCUMENTS = {
     "plan": PLANNED,
     "survey": SURVEY,
     "watch": WATCHED,
+    "affected": AFFECTED,
 }
 """Files of the documents of commands, by the name of the document."""

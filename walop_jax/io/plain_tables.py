@@ -41,7 +41,7 @@ def table_format(path: str | os.PathLike[str]) -> str:
     for extension, kind in FORMATS.items():
         if name.endswith(extension):
             return kind
-    raise fail("is no table that can be read", file=path, advice=f"use {', '.join(FORMATS)}")
+    raise fail("has no extension of a table", file=path, advice=f"use {', '.join(FORMATS)}")
 
 
 def astropy_table(

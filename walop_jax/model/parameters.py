@@ -80,7 +80,7 @@ class Parameter:
         return dataclasses.replace(self, start=value, prior=prior, scale=scale)
 
     def checked(self) -> Parameter:
-        """Itself. Raises ValueError for a name that files could not hold, and for numbers that mean nothing."""
+        """The parameter itself. Raises ValueError for a name that files cannot hold and for meaningless numbers."""
         if not NAME.fullmatch(self.name):
             raise ValueError(f"parameter {self.name!r}: a name has letters, digits and _ . + - * only")
         if not _finite(self.start):

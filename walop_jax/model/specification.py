@@ -130,7 +130,7 @@ class Model(Displayed):
 
     @property
     def masters(self) -> Int[np.ndarray, " n"]:
-        """Position of the parameter that gives each one its value: its master's where it is tied, its own elsewhere."""
+        """For each parameter the position of the one that sets its value: its master if it is tied, else itself."""
         place = {p.name: i for i, p in enumerate(self.parameters)}
         return np.array([place[p.tie or p.name] for p in self.parameters], int)
 

@@ -4,9 +4,9 @@ A unit (the exposures of one file in one night) says of the values θ of all par
 
     χ²_u(θ) = χ²_u + 2 g_uᵀ θ + θᵀ H_u θ,        θ = D_u x,
 
-with D_u what the laws make of the unknowns x: `globals`, each with a function of time, and locals, that belong to one
-cell, which is a night, or several that a file joins. With A the equations of the globals, T those of the locals (block
-tridiagonal, as a random walk couples neighbours and nothing else does) and B what lies between,
+with D_u the design of the laws for the unknowns x: `globals`, each with a function of time, and locals, that belong to
+one cell, which is a night, or several that a file joins. With A the equations of the globals, T those of the locals
+(block tridiagonal, as a random walk couples neighbours and nothing else does) and B the block between them,
 
     S_c  = T_c − C_c S_{c−1}⁻¹ C_cᵀ,      B'_c = B_c − C_c S_{c−1}⁻¹ B'_{c−1}          forwards
     K    = A − Σ B'_cᵀ S_c⁻¹ B'_c                                                      the globals
@@ -77,7 +77,7 @@ class Cell(NamedTuple):
 
 
 class Eliminated(NamedTuple):
-    """A cell in the elimination: its own block and border, coupling to the cell before, what is left of both."""
+    """A cell in the elimination: its own block and border, coupling to the cell before, and both reduced."""
 
     block: Matrix
     border: Float[np.ndarray, "_ _"]
@@ -119,8 +119,8 @@ class System:
         for i, law in enumerate(laws):
             if law is None:
                 continue
-            for form, known in law.forms(bool(means[i]), middle):
-                prior = (mean[i] / scale[i], _precision(width[i] / scale[i])) if known else (0.0, 0.0)
+            for form, has_prior in law.forms(bool(means[i]), middle):
+                prior = (mean[i] / scale[i], _precision(width[i] / scale[i])) if has_prior else (0.0, 0.0)
                 forms.append(Global(i, form, *prior))
             if law.rate is not None:
                 rates[i] = law.rate / scale[i]
@@ -143,11 +143,11 @@ class System:
 
     def functions(self, mjd: Any) -> Float[np.ndarray, "t g"]:
         """The functions of time of the global unknowns."""
-        made = {form: form.at(mjd) for form in dict.fromkeys(entry.form for entry in self.globals)}
-        found = np.ones((len(np.atleast_1d(mjd)), len(self.globals)))
+        courses = {form: form.at(mjd) for form in dict.fromkeys(entry.form for entry in self.globals)}
+        values = np.ones((len(np.atleast_1d(mjd)), len(self.globals)))
         for g, entry in enumerate(self.globals):
-            found[:, g] = made[entry.form]
-        return found
+            values[:, g] = courses[entry.form]
+        return values
 
 
 def _cells(
@@ -186,13 +186,13 @@ def _cells(
                 covers.append((groups == group).astype(float))
                 first = law.base == "walk" and not cells and group == groups.min()
                 if law.base == "walk":
-                    known = (mean[i], _precision(width[i])) if first else (0.0, 0.0)
+                    prior = (mean[i], _precision(width[i])) if first else (0.0, 0.0)
                 elif np.isfinite(spread[i]):
-                    known = (0.0, spread[i] ** -2)
+                    prior = (0.0, spread[i] ** -2)
                 else:
-                    known = (mean[i], _precision(width[i]))
-                means.append(known[0])
-                precisions.append(known[1])
+                    prior = (mean[i], _precision(width[i]))
+                means.append(prior[0])
+                precisions.append(prior[1])
                 times.append(equations.mjd[units][groups == group].mean() if law.base == "walk" else np.nan)
         cells.append(
             Cell(
@@ -229,8 +229,8 @@ def solve(system: System) -> Solution:
     e, at, basis = system.equations, system.at, system.basis
     size = len(at)
     top, right = np.zeros((size, size)), np.zeros(size)
-    every = bool(np.all(basis == 1.0))
-    if every:
+    constant_basis = bool(np.all(basis == 1.0))
+    if constant_basis:
         total, slope = e.matrix.sum(axis=0), e.gradient.sum(axis=0)
         top, right = total[np.ix_(at, at)].copy(), -slope[at]
     else:
@@ -239,59 +239,52 @@ def solve(system: System) -> Solution:
         rows = [np.flatnonzero(which == k) for k in range(kinds.shape[1])]
         for a, mine in enumerate(rows):
             right[mine] = -(kinds[:, a] @ e.gradient[:, at[mine]])
-            for b, others in enumerate(rows[: a + 1]):
+            for b, columns in enumerate(rows[: a + 1]):
                 weight = kinds[:, a] * kinds[:, b]
                 if weight.any():
-                    summed = np.tensordot(weight, e.matrix, 1)[np.ix_(at[mine], at[others])]
-                    top[np.ix_(mine, others)] = summed
-                    top[np.ix_(others, mine)] = summed.T
+                    summed = np.tensordot(weight, e.matrix, 1)[np.ix_(at[mine], at[columns])]
+                    top[np.ix_(mine, columns)] = summed
+                    top[np.ix_(columns, mine)] = summed.T
     precision = np.array([entry.precision for entry in system.globals])
     means = np.array([entry.mean for entry in system.globals])
     top[np.diag_indices(size)] += precision
     right += precision * means
-    constant = float(e.chi2.sum() + precision @ means**2)
-    logdet, rows_of = 0.0, []
+    rows_of: list[Any] = []
     before: Cell | None = None
     last: Eliminated | None = None
     for cell in system.cells:
-        block, border, own = _block(system, cell)
-        constant += float(cell.precision @ cell.mean**2)
-        logdet -= float(np.log(cell.precision[cell.precision > 0]).sum())
-        coupling, logs = _walks(system, cell, before, block, rows_of)
-        logdet += logs
-        rows_of.append((block, border, own, coupling))
+        block, border, rhs = _block(system, cell)
+        coupling = _walks(system, cell, before, block, rows_of)
+        rows_of.append((block, border, rhs, coupling))
         before = cell
-    # Forwards. A block knows what the walk to the next cell adds to it only when that cell was made.
+    # Forwards, after all blocks: the walk to the next cell adds to a block.
     done: list[Eliminated] = []
-    for cell, (block, border, own, coupling) in zip(system.cells, rows_of, strict=True):
-        left_block, left, rest = block, border, own
+    for cell, (block, border, rhs, coupling) in zip(system.cells, rows_of, strict=True):
+        left_block, reduced, remainder = block, border, rhs
         if last is not None and coupling.any():
             gain = linalg.cho_solve(last.factor, coupling.T, check_finite=False).T
-            left_block, left, rest = (
+            left_block, reduced, remainder = (
                 block - gain @ coupling.T,
                 border - gain @ last.left,
-                own - gain @ last.right,
+                rhs - gain @ last.right,
             )
-        factor = _factored(left_block, cell.parameter, int(cell.units[0])) if len(own) else (left_block, True)
-        last = Eliminated(block, border, coupling, factor, left, rest)
+        factor = _factored(left_block, cell.parameter, int(cell.units[0])) if len(rhs) else (left_block, True)
+        last = Eliminated(block, border, coupling, factor, reduced, remainder)
         done.append(last)
-        if len(own):
-            logdet += 2.0 * float(np.log(np.diag(factor[0])).sum())
-            gain = linalg.cho_solve(factor, np.column_stack([left, rest]), check_finite=False)
-            top -= left.T @ gain[:, :-1]
-            right -= left.T @ gain[:, -1]
+        if len(rhs):
+            gain = linalg.cho_solve(factor, np.column_stack([reduced, remainder]), check_finite=False)
+            top -= reduced.T @ gain[:, :-1]
+            right -= reduced.T @ gain[:, -1]
     factor = _factored(0.5 * (top + top.T), at, None) if size else (top, True)
-    logdet += 2.0 * float(np.log(np.diag(factor[0])).sum()) if size else 0.0
     shared = linalg.cho_solve(factor, right) if size else right
     values: list[Vector] = [np.zeros(0)] * len(done)
     for c in range(len(done) - 1, -1, -1):
         if len(done[c].right):
-            rest = done[c].right - done[c].left @ shared
+            remainder = done[c].right - done[c].left @ shared
             if c + 1 < len(done) and len(values[c + 1]):
-                rest = rest - done[c + 1].before.T @ values[c + 1]
-            values[c] = linalg.cho_solve(done[c].factor, rest, check_finite=False)
-    solution = Solution(system, shared, tuple(values), tuple(done), factor, 0.0)
-    return dataclasses.replace(solution, evidence=-0.5 * (solution.chi2 + solution.penalty + logdet))
+                remainder = remainder - done[c + 1].before.T @ values[c + 1]
+            values[c] = linalg.cho_solve(done[c].factor, remainder, check_finite=False)
+    return Solution(system, shared, tuple(values), tuple(done), factor)
 
 
 def _block(system: System, cell: Cell) -> tuple[Matrix, Float[np.ndarray, "_ _"], Vector]:
@@ -301,64 +294,59 @@ def _block(system: System, cell: Cell) -> tuple[Matrix, Float[np.ndarray, "_ _"]
     border, right = np.zeros((len(p), len(system.at))), cell.precision * cell.mean
     if len(p):
         for v, unit in enumerate(cell.units):
-            some = e.matrix[unit][p] * cell.covers[:, v : v + 1]
-            block += some[:, p] * cell.covers[:, v]
-            border += some[:, system.at] * system.basis[unit]
+            weighted = e.matrix[unit][p] * cell.covers[:, v : v + 1]
+            block += weighted[:, p] * cell.covers[:, v]
+            border += weighted[:, system.at] * system.basis[unit]
             right = right - cell.covers[:, v] * e.gradient[unit][p]
     return block, border, right
 
 
 def _walks(
     system: System, cell: Cell, before: Cell | None, block: Matrix, made: Sequence[Any]
-) -> tuple[Float[np.ndarray, "_ _"], float]:
-    """Add the steps of walks that end in a cell to its block and the one before; coupling, and log of variances."""
-    coupling, logs = np.zeros((len(cell.mjd), 0 if before is None else len(before.mjd))), 0.0
+) -> Float[np.ndarray, "_ _"]:
+    """Add the steps of walks that end in a cell to its block and the one before; the coupling of both."""
+    coupling = np.zeros((len(cell.mjd), 0 if before is None else len(before.mjd)))
     for k in np.flatnonzero(np.isfinite(cell.mjd)):
         i = cell.parameter[k]
-        here = np.flatnonzero((cell.parameter == i) & (cell.mjd < cell.mjd[k]))
-        there = np.zeros(0, int) if before is None else np.flatnonzero(before.parameter == i)
-        if not len(here) and not len(there):
+        within = np.flatnonzero((cell.parameter == i) & (cell.mjd < cell.mjd[k]))
+        previous = np.zeros(0, int) if before is None else np.flatnonzero(before.parameter == i)
+        if not len(within) and not len(previous):
             continue
-        times, own = (cell.mjd, True) if len(here) else (before.mjd, False)  # type: ignore[union-attr]
-        last = (here if own else there)[np.argmax(times[here if own else there])]
+        times, same_cell = (cell.mjd, True) if len(within) else (before.mjd, False)  # type: ignore[union-attr]
+        last = (within if same_cell else previous)[np.argmax(times[within if same_cell else previous])]
         variance = system.rates[i] ** 2 * (cell.mjd[k] - times[last])
-        logs += float(np.log(variance))
         block[k, k] += 1.0 / variance
-        if own:
+        if same_cell:
             block[last, last] += 1.0 / variance
             block[k, last] -= 1.0 / variance
             block[last, k] -= 1.0 / variance
         else:
             made[-1][0][last, last] += 1.0 / variance
             coupling[k, last] = -1.0 / variance
-    return coupling, logs
+    return coupling
 
 
 @dataclasses.dataclass(frozen=True)
 class Solution:
-    """Unknowns that fit best, in units of `Equations.scale`, with their covariances; `evidence` is a logarithm.
-
-    The evidence compares rates and spreads of the same laws: constants of what has no prior are left out.
-    """
+    """Unknowns that fit best, in units of `Equations.scale`, with their covariances."""
 
     system: System
     shared: Vector
     local: tuple[Vector, ...]
     cells: tuple[Eliminated, ...]
     factor: tuple[Matrix, bool]
-    evidence: float
 
     @functools.cached_property
     def values(self) -> Float[np.ndarray, "u n"]:
         """The parameters in every unit, from the origin, scaled."""
         system = self.system
-        found = np.zeros((len(system.equations), len(system.laws)))
+        values = np.zeros((len(system.equations), len(system.laws)))
         for g, i in enumerate(system.at):
-            found[:, i] += system.basis[:, g] * self.shared[g]
+            values[:, i] += system.basis[:, g] * self.shared[g]
         for cell, local in zip(system.cells, self.local, strict=True):
             for k, i in enumerate(cell.parameter):
-                found[cell.units, i] += cell.covers[k] * local[k]
-        return found
+                values[cell.units, i] += cell.covers[k] * local[k]
+        return values
 
     @functools.cached_property
     def slopes(self) -> Float[np.ndarray, "u n"]:
@@ -404,31 +392,31 @@ class Solution:
     @functools.cached_property
     def smoothed(self) -> list[tuple[Matrix, Matrix, Matrix]]:
         """Of every cell the covariance of its unknowns, that with the globals, and that with the next cell's."""
-        found: list[tuple[Matrix, Matrix, Matrix]] = []
+        smoothed: list[tuple[Matrix, Matrix, Matrix]] = []
         later: tuple[Matrix, Matrix] | None = None
         for c in range(len(self.cells) - 1, -1, -1):
             entry, size = self.cells[c], len(self.local[c])
             if not size:
                 later = (np.zeros((0, 0)), np.zeros((0, len(self.shared))))
-                found.append((*later, np.zeros((0, 0))))
+                smoothed.append((*later, np.zeros((0, 0))))
                 continue
             after = None if c + 1 == len(self.cells) else self.cells[c + 1].before
             joint, sides = self.covariance, entry.left
             if after is not None and after.any():
-                own, cross = later  # type: ignore[misc]
-                joint = np.block([[joint, cross.T], [cross, own]])
+                block, cross = later  # type: ignore[misc]
+                joint = np.block([[joint, cross.T], [cross, block]])
                 sides = np.hstack([sides, after.T])
             gain = linalg.cho_solve(entry.factor, sides, check_finite=False)
             with_others = -gain @ joint
-            own = linalg.cho_solve(entry.factor, np.eye(size)) - with_others @ gain.T
+            block = linalg.cho_solve(entry.factor, np.eye(size)) - with_others @ gain.T
             split = len(self.shared)
             next_one = with_others[:, split:]
             if after is not None and not next_one.size and len(after):
                 # Independent locals of neighbours share the globals alone.
                 next_one = -gain @ later[1].T  # type: ignore[index]
-            later = (own, with_others[:, :split])
-            found.append((own, with_others[:, :split], next_one))
-        return found[::-1]
+            later = (block, with_others[:, :split])
+            smoothed.append((block, with_others[:, :split], next_one))
+        return smoothed[::-1]
 
     def predict(self, mjd: float, night: int | None = None) -> tuple[Vector, Matrix]:
         """All parameters at a time (MJD), from the origin, scaled, and their covariance.
@@ -439,33 +427,35 @@ class Solution:
         """
         system, n = self.system, len(self.system.laws)
         function = system.functions(mjd)[0]
-        parts: list[tuple[int, int, int, float]] = []  # parameter, cell, place in it, weight
+        terms: list[tuple[int, int, int, float]] = []  # parameter, cell, place in it, weight
         extra = np.zeros(n)
         value = np.zeros(n)
         nights = [system.equations.night[cell.units] for cell in system.cells]
-        here = next((c for c, some in enumerate(nights) if night is not None and night in some), None)
+        current = next(
+            (c for c, members in enumerate(nights) if night is not None and night in members), None
+        )
         for i, law in enumerate(system.laws):
             if law is None or law.base not in ("night", "file", "walk"):
                 continue
             if law.base == "walk":
-                parts += self._bridge(i, mjd, extra)
+                terms += self._bridge(i, mjd, extra)
                 continue
-            own = [] if here is None else self._own(i, here, mjd, night)
-            if own:
-                parts.append((i, here, own[0], 1.0))  # type: ignore[arg-type]
+            places = [] if current is None else self._own(i, current, mjd, night)
+            if places:
+                terms.append((i, current, places[0], 1.0))  # type: ignore[arg-type]
                 continue
             if np.isfinite(system.spread[i]):
                 extra[i] += system.spread[i] ** 2
                 continue
             scatter = self.values[:, i]
             value[i], extra[i] = scatter.mean(), scatter.var(ddof=1) if len(scatter) > 1 else np.inf
-        design = np.zeros((n, len(self.shared) + len(parts)))
+        design = np.zeros((n, len(self.shared) + len(terms)))
         design[system.at, np.arange(len(self.shared))] = function
-        for k, (i, _, _, weight) in enumerate(parts):
+        for k, (i, _, _, weight) in enumerate(terms):
             design[i, len(self.shared) + k] = weight
-        local = np.array([self.local[c][k] for _, c, k, _ in parts])
+        local = np.array([self.local[c][k] for _, c, k, _ in terms])
         value += design @ np.concatenate([self.shared, local])
-        covariance = design @ self._joint(parts) @ design.T
+        covariance = design @ self._joint(terms) @ design.T
         covariance[np.diag_indices(n)] += extra
         return value, covariance
 
@@ -479,11 +469,11 @@ class Solution:
     @functools.cached_property
     def _states(self) -> dict[int, list[tuple[float, int, int]]]:
         """The states of every walk: time, cell, place."""
-        found: dict[int, list[tuple[float, int, int]]] = {}
+        states: dict[int, list[tuple[float, int, int]]] = {}
         for c, cell in enumerate(self.system.cells):
             for k in np.flatnonzero(np.isfinite(cell.mjd)):
-                found.setdefault(int(cell.parameter[k]), []).append((float(cell.mjd[k]), c, int(k)))
-        return {i: sorted(some) for i, some in found.items()}
+                states.setdefault(int(cell.parameter[k]), []).append((float(cell.mjd[k]), c, int(k)))
+        return {i: sorted(entries) for i, entries in states.items()}
 
     def _bridge(self, i: int, mjd: float, extra: Vector) -> list[tuple[int, int, int, float]]:
         states, rate = self._states[i], self.system.rates[i]
@@ -493,10 +483,10 @@ class Solution:
             time, c, k = states[min(after, len(times) - 1)]
             extra[i] += rate**2 * abs(mjd - time)
             return [(i, c, k, 1.0)]
-        (start, *one), (stop, *two) = states[after - 1], states[after]
+        (start, *earlier), (stop, *two) = states[after - 1], states[after]
         share = (mjd - start) / (stop - start)
         extra[i] += rate**2 * (mjd - start) * (1.0 - share)
-        return [(i, one[0], one[1], 1.0 - share), (i, two[0], two[1], share)]
+        return [(i, earlier[0], earlier[1], 1.0 - share), (i, two[0], two[1], share)]
 
     def _joint(self, parts: Sequence[tuple[int, int, int, float]]) -> Matrix:
         """Covariance of the globals and of unknowns of at most two neighbouring cells."""
@@ -504,11 +494,11 @@ class Solution:
         joint = np.zeros((size + len(parts), size + len(parts)))
         joint[:size, :size] = self.covariance
         for a, (_, c, k, _) in enumerate(parts):
-            own, cross, after = self.smoothed[c]
+            block, cross, after = self.smoothed[c]
             joint[size + a, :size] = joint[:size, size + a] = cross[k]
             for b, (_, d, m, _) in enumerate(parts[: a + 1]):
                 if c == d:
-                    value = own[k, m]
+                    value = block[k, m]
                 elif d == c + 1:
                     value = after[k, m]
                 else:
@@ -519,23 +509,25 @@ class Solution:
     def errors(self) -> Float[np.ndarray, "u n"]:
         """Standard errors of the parameters in every unit, scaled."""
         system = self.system
-        found = np.zeros_like(self.values)
+        variance = np.zeros_like(self.values)
         shared = np.array_equal(system.basis, np.ones_like(system.basis))
         fixed = np.zeros(len(system.laws))
         np.add.at(fixed, system.at, np.diag(self.covariance))
         local = {i for cell in system.cells[:1] for i in cell.parameter}
-        for u in range(len(found)):
+        for u in range(len(variance)):
             if shared:
-                found[u] = fixed
+                variance[u] = fixed
             else:
                 design = np.zeros((len(system.laws), len(self.shared)))
                 design[system.at, np.arange(len(self.shared))] = system.basis[u]
-                found[u] = np.einsum("ng,gh,nh->n", design, self.covariance, design, optimize=True)
+                variance[u] = np.einsum("ng,gh,nh->n", design, self.covariance, design, optimize=True)
         if local:
             for c, cell in enumerate(system.cells):
-                own, cross, _ = self.smoothed[c]
+                block, cross, _ = self.smoothed[c]
                 for k, i in enumerate(cell.parameter):
-                    some = cell.units[cell.covers[k] > 0]
+                    units = cell.units[cell.covers[k] > 0]
                     mine = np.flatnonzero(system.at == i)
-                    found[some, i] += own[k, k] + 2.0 * system.basis[np.ix_(some, mine)] @ cross[k, mine]
-        return np.sqrt(np.clip(found, 0.0, None))
+                    variance[units, i] += (
+                        block[k, k] + 2.0 * system.basis[np.ix_(units, mine)] @ cross[k, mine]
+                    )
+        return np.sqrt(np.clip(variance, 0.0, None))

@@ -1,7 +1,7 @@
-"""Breaks: what has changed, when, by how much, and what else it may be. Asked of a stack, not of its data.
+"""Breaks: changes with dates, sizes and rivals. Asked of a stack, not of its data.
 
 A change of any parameter or candidate is a step at the boundary of two nights, one bad night, or a drift. Its z and
-size come from `changes`, with everything else fitted anew: what a random walk may do by itself is no break. The largest
+size come from `changes`, with everything else fitted anew: the course of a random walk is no break. The largest
 |z| of all is one if chance makes one as large in less than `CHANCE` of series:
 
     P(max |z| ≥ u)  ≤  Σ P(|z_i| ≥ u)  −  Σ_(i,k) P(|z_i| ≥ u, |z_k| ≥ u)
@@ -27,9 +27,10 @@ from scipy import special
 
 from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.laws import YEAR, Law
+from walop_jax.model.parameters import Parameter
 from walop_jax.nights import changes
 from walop_jax.nights.algebra import Solution, System, UndeterminedError, solve
-from walop_jax.nights.equations import Together
+from walop_jax.nights.equations import EffectAmplitude, Together
 
 CHANCE = 0.005  # of any break in a series that has none: half of one in a hundred
 RIVAL = 2.0 * math.log(1000.0)  # z² behind the best at which another name is improbable
@@ -38,7 +39,7 @@ SURE = 5.0  # standard errors that keep one name from another
 MOST = 40  # breaks that are looked for
 ROUNDS = 3  # in which all are named again
 KINDS = ("step", "bad night", "drift")
-Carried = Callable[[str], bool]
+Carried = Callable[[Parameter], bool]
 """True for a candidate that stars can be corrected for."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 _FARTHEST = 40.0  # of the tail in units of 1/u, beyond which nothing is left of it
@@ -80,13 +81,13 @@ class Break:
     @classmethod
     def read(cls, entry: Mapping[str, Any]) -> Break:
         """A break as a document holds it."""
-        known = {field.name: entry[field.name] for field in dataclasses.fields(cls)}
-        for name, value in known.items():
+        values = {field.name: entry[field.name] for field in dataclasses.fields(cls)}
+        for name, value in values.items():
             if value is None:
-                known[name] = math.inf if name == "nights_needed" else math.nan
+                values[name] = math.inf if name == "nights_needed" else math.nan
             elif isinstance(value, list):
-                known[name] = tuple(value)
-        return cls(**known)
+                values[name] = tuple(value)
+        return cls(**values)
 
     def law(self, law: Law | None, *, gauge: bool = False) -> Law:
         """A law with the break; None is that of a candidate, which is 0 without it, or a gauge, which has a value."""
@@ -132,21 +133,23 @@ class Tried(NamedTuple):
 
     def without(self, barred: Sequence[int]) -> Tried:
         """The same but for some parameters."""
-        known = tuple(one.copy() for one in self.information)
-        for one in known:
-            one[:, barred] = 0.0
-        return self._replace(information=known)
+        information = tuple(array.copy() for array in self.information)
+        for array in information:
+            array[:, barred] = 0.0
+        return self._replace(information=information)
 
     def z(self, kind: int) -> Float[np.ndarray, "_ n"]:
         """Changes of a kind in their standard errors; 0 where the laws take them up."""
-        known = self.information[kind]
-        return np.where(known > 0, self.score[kind] / np.sqrt(np.where(known > 0, known, 1.0)), 0.0)
+        information = self.information[kind]
+        return np.where(
+            information > 0, self.score[kind] / np.sqrt(np.where(information > 0, information, 1.0)), 0.0
+        )
 
     def chance(self, u: float) -> float:
         """The bound on the probability of a |z| of u or more anywhere, if nothing has changed."""
         step, once, _ = self.information
         single = 2.0 * float(special.ndtr(-u))
-        total = single * sum(int((known > 0).sum()) for known in self.information)
+        total = single * sum(int((information > 0).sum()) for information in self.information)
         if u < 3.0:
             return 1.0
         after = np.vstack([step[1:], np.zeros_like(step[:1])])
@@ -171,9 +174,9 @@ class Tried(NamedTuple):
 
     def largest(self) -> tuple[int, int, int]:
         """Kind, cell and parameter of the largest |z|."""
-        every = [np.abs(self.z(kind)) for kind in range(len(KINDS))]
-        kind = int(np.argmax([z.max() for z in every]))
-        cell, parameter = np.unravel_index(every[kind].argmax(), every[kind].shape)
+        strengths = [np.abs(self.z(kind)) for kind in range(len(KINDS))]
+        kind = int(np.argmax([z.max() for z in strengths]))
+        cell, parameter = np.unravel_index(strengths[kind].argmax(), strengths[kind].shape)
         return kind, int(cell), int(parameter)
 
 
@@ -192,26 +195,26 @@ def find(
 
     Of names that explain a break as well as each other the first that is `carried` to stars is its law (None: all are).
     """
-    found: list[Break] = []
+    breaks: list[Break] = []
     while True:
-        solution = solved(data, with_breaks(data, laws, found))
-        one = _largest(data, solution, CHANCE, catalogue, carried)
-        if one is None or len(found) == MOST:
+        solution = solved(data, with_breaks(data, laws, breaks))
+        candidate = _largest(data, solution, CHANCE, catalogue, carried)
+        if candidate is None or len(breaks) == MOST:
             break
-        found.append(one)
+        breaks.append(candidate)
     # The first were named while the others were not known: each is named again beside all others.
-    for _ in range(ROUNDS if len(found) > 1 else 0):
-        before = [(one.kind, one.name, one.night) for one in found]
-        for k in range(len(found)):
-            rest = with_breaks(data, laws, found[:k] + found[k + 1 :])
-            found[k] = _largest(data, solved(data, rest), 1.1, catalogue, carried) or found[k]
-        if [(one.kind, one.name, one.night) for one in found] == before:
+    for _ in range(ROUNDS if len(breaks) > 1 else 0):
+        before = [(candidate.kind, candidate.name, candidate.night) for candidate in breaks]
+        for k in range(len(breaks)):
+            other_laws = with_breaks(data, laws, breaks[:k] + breaks[k + 1 :])
+            breaks[k] = _largest(data, solved(data, other_laws), 1.1, catalogue, carried) or breaks[k]
+        if [(candidate.kind, candidate.name, candidate.night) for candidate in breaks] == before:
             break
-    for k, one in enumerate(found):
-        known = with_breaks(data, laws, found[:k] + found[k + 1 :])
-        found[k] = dataclasses.replace(one, held_out=_held_out(data, known, one))
-    chosen = with_breaks(data, laws, found)
-    return tuple(sorted(found, key=lambda one: one.night)), chosen, solved(data, chosen)
+    for k, candidate in enumerate(breaks):
+        laws_of_others = with_breaks(data, laws, breaks[:k] + breaks[k + 1 :])
+        breaks[k] = dataclasses.replace(candidate, held_out=_held_out(data, laws_of_others, candidate))
+    chosen = with_breaks(data, laws, breaks)
+    return tuple(sorted(breaks, key=lambda candidate: candidate.night)), chosen, solved(data, chosen)
 
 
 def at_solution(data: Together, solution: Solution, one: Break) -> Break:
@@ -219,8 +222,8 @@ def at_solution(data: Together, solution: Solution, one: Break) -> Break:
     system, i = solution.system, data.names.index(one.name)
     start = one.date if one.kind == "step" else one.before
     for g, entry in enumerate(system.globals):
-        known = entry.form.kind == "linear" if one.kind == "drift" else entry.form.start == start
-        if entry.parameter == i and known:
+        matches = entry.form.kind == "linear" if one.kind == "drift" else entry.form.start == start
+        if entry.parameter == i and matches:
             scale = float(data.equations.scale[i])
             error = scale * math.sqrt(solution.covariance[g, g])
             return dataclasses.replace(one, size=scale * float(solution.shared[g]), error=error)
@@ -230,25 +233,25 @@ def at_solution(data: Together, solution: Solution, one: Break) -> Break:
 def with_breaks(data: Together, laws: Sequence[Law | None], found: Sequence[Break]) -> tuple[Law | None, ...]:
     """Laws with breaks."""
     changed = list(laws)
-    for one in found:
-        i = data.names.index(one.name)
-        changed[i] = one.law(changed[i], gauge=bool(data.gauge[i]))
+    for entry in found:
+        i = data.names.index(entry.name)
+        changed[i] = entry.law(changed[i], gauge=bool(data.gauge[i]))
     return tuple(changed)
 
 
 def _other_shapes(data: Together, laws: Sequence[Law | None]) -> list[int]:
     """Candidates that are another shape of an effect that the model or a law has: a model holds one shape alone."""
-    taken: dict[str, str | None] = {}
-    beyond = data.has_value | data.gauge
-    for name, law, has in zip(data.names, laws, beyond, strict=True):
-        if has:
-            taken[part_of(name)] = None
+    shapes: dict[str, tuple[int, int] | None] = {}
+    for p, law in zip(data.parameters, laws, strict=True):
+        if not isinstance(p, EffectAmplitude):
+            shapes[p.part] = None
         elif law is not None:
-            taken.setdefault(part_of(name), shape_of(name))
+            shapes.setdefault(p.part, p.shape)
     return [
-        i for i, (name, has) in enumerate(zip(data.names, beyond, strict=True))
-        if not has and taken.get(part_of(name), shape_of(name)) != shape_of(name)
-    ]  # fmt: skip
+        i
+        for i, p in enumerate(data.parameters)
+        if isinstance(p, EffectAmplitude) and shapes.get(p.part, p.shape) != p.shape
+    ]
 
 
 def _largest(
@@ -268,14 +271,14 @@ def _largest(
     low = 0 if kind == 2 else max(cell - 1, 0)
     near = z[low : None if kind == 2 else cell + 2] ** 2
     alike = [int(j) for j in np.argsort(-near.max(axis=0)) if near[:, j].max() > z[cell, i] ** 2 - RIVAL]
-    chosen = next((j for j in alike if carried is None or carried(data.names[j])), i)
+    chosen = next((j for j in alike if carried is None or carried(data.parameters[j])), i)
     if chosen != i:
         i, cell = chosen, low + int(near[:, chosen].argmax())
     at, rivals = (kind, cell, i), [j for j in alike if j != i]
     best, p, scale = float(z[cell, i] ** 2), data.parameters[i], float(data.equations.scale[i])
     first, span, before, after = _dates(data, solution, kind, cell, z[:, i] ** 2 > best - DATES)
-    members = {part_of(data.names[j]) for j in (i, *rivals)}
-    said = [effect.separated_by for effect in catalogue if effect.name in members and effect.separated_by]
+    members = {data.parameters[j].part for j in (i, *rivals)}
+    remedies = [effect.separated_by for effect in catalogue if effect.name in members and effect.separated_by]
     information = float(tried.information[kind][cell, i])
     return Break(
         kind=KINDS[kind],
@@ -290,21 +293,9 @@ def _largest(
         before=before,
         after=after,
         alike=tuple(data.names[j] for j in rivals),
-        separated_by=tuple(dict.fromkeys(said)) if rivals else (),
+        separated_by=tuple(dict.fromkeys(remedies)) if rivals else (),
         nights_needed=_nights_needed(solution, at, rivals, best) if rivals else 0.0,
     )
-
-
-def shape_of(name: str) -> str:
-    """The shape of its effect that a candidate stands for, GROUP#MEMBER of its probes; "" where it has one alone."""
-    head, _, leaf = name.partition(".")
-    group, member = head.partition("#")[2], leaf.partition("#")[2]
-    return f"{group or 0}#{member or 0}" if group or member else ""
-
-
-def part_of(name: str) -> str:
-    """The part or effect that a parameter or candidate belongs to."""
-    return name.split(".")[0].split("#")[0]
 
 
 def _dates(
@@ -321,8 +312,8 @@ def _dates(
     if kind == 1:
         later = begin[cell + 1] if cell + 1 < len(cells) else end[cell] + 1.0
         before, after = 0.5 * (before + after), 0.5 * (end[cell] + later)
-    some = np.flatnonzero(may)
-    return numbers[cell], (numbers[some[0]], numbers[some[-1]]), before, after
+    possible = np.flatnonzero(may)
+    return numbers[cell], (numbers[possible[0]], numbers[possible[-1]]), before, after
 
 
 def _nights_needed(solution: Solution, at: tuple[int, int, int], rivals: Sequence[int], best: float) -> float:
@@ -334,9 +325,9 @@ def _nights_needed(solution: Solution, at: tuple[int, int, int], rivals: Sequenc
     if kind == 2:
         course = (e.mjd - e.mjd.mean()) / YEAR
     parameter = np.array([i, *rivals])
-    _, known = changes.weighted(solution, np.repeat(course[:, None], len(parameter), axis=1), parameter)
-    own = np.maximum(np.diag(known)[1:], 1e-300)
-    least = float(np.min(best * (1.0 - known[0, 1:] ** 2 / (known[0, 0] * own))))
+    _, shared = changes.weighted(solution, np.repeat(course[:, None], len(parameter), axis=1), parameter)
+    rival_information = np.maximum(np.diag(shared)[1:], 1e-300)
+    least = float(np.min(best * (1.0 - shared[0, 1:] ** 2 / (shared[0, 0] * rival_information))))
     held = len(cells) - cell if kind == 0 else 1 if kind == 1 else len(cells)
     return math.inf if least < 1e-6 * best else float(max(0, math.ceil(held * (SURE**2 / least - 1.0))))
 
@@ -346,19 +337,19 @@ def _held_out(data: Together, laws: Sequence[Law | None], one: Break) -> float:
     i, halves = data.names.index(one.name), []
     for odd in (0, 1):
         keep = data.equations.night % 2 == odd
-        some, number = data.equations.only(keep), np.array([night.number for night in data.nights])[keep]
-        course = (some.mjd - data.equations.mjd.mean()) / YEAR
+        half, number = data.equations.only(keep), np.array([night.number for night in data.nights])[keep]
+        course = (half.mjd - data.equations.mjd.mean()) / YEAR
         if one.kind != "drift":
             course = (number >= one.night if one.kind == "step" else number == one.night).astype(float)
-        there = [None if law is None else law.seen_at(some.mjd) for law in laws]
+        half_laws = [None if law is None else law.seen_at(half.mjd) for law in laws]
         try:
-            solution = solve(System.of(some, there, data.mean, data.width, data.has_value))
+            solution = solve(System.of(half, half_laws, data.mean, data.width, data.has_value))
         except UndeterminedError:
             return math.nan
-        score, known = changes.weighted(solution, course[:, None], np.array([i]))
-        halves.append((float(score[0]), float(known[0, 0])))
-    (score, known), (other, information) = halves
-    if not known > 0 or not information > 0:
+        score, half_information = changes.weighted(solution, course[:, None], np.array([i]))
+        halves.append((float(score[0]), float(half_information[0, 0])))
+    (score, half_information), (other_score, information) = halves
+    if not half_information > 0 or not information > 0:
         return math.nan
-    size = score / known
-    return 2.0 * size * other - size**2 * information
+    size = score / half_information
+    return 2.0 * size * other_score - size**2 * information

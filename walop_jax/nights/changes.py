@@ -40,31 +40,31 @@ def _information(
     of: Solution, own: Vector, cross: Float[np.ndarray, "_ n"], taken: Vector
 ) -> Float[np.ndarray, " n"]:
     """Own information less what locals and globals take."""
-    left = own - taken
+    remaining = own - taken
     if len(cross):
         lower = linalg.solve_triangular(of.factor[0], cross, lower=True, check_finite=False)
-        left = left - np.einsum("gn,gn->n", lower, lower)
-    return np.where(left > NOTHING * np.maximum(own, 1e-300), left, 0.0)
+        remaining = remaining - np.einsum("gn,gn->n", lower, lower)
+    return np.where(remaining > NOTHING * np.maximum(own, 1e-300), remaining, 0.0)
 
 
 def scan(of: Solution) -> Scan:
     """The changes of every parameter and candidate at every cell."""
     system, e = of.system, of.system.equations
     n, count, globals_ = len(system.laws), len(system.cells), len(system.at)
-    found = Scan(*(np.zeros((count, n)) for _ in range(4)))
-    cross, own, score = np.zeros((globals_, n)), np.zeros(n), np.zeros(n)
-    taken, border_taken = np.zeros(n), np.zeros((globals_, n))
+    scores = Scan(*(np.zeros((count, n)) for _ in range(4)))
+    cross, information, score = np.zeros((globals_, n)), np.zeros(n), np.zeros(n)
+    absorbed, border_taken = np.zeros(n), np.zeros((globals_, n))
     after: tuple[tuple[Matrix, bool], Matrix, Matrix] | None = None  # of the cell behind: U, B̃, c̃
     for c in range(count - 1, -1, -1):
         cell, entry = system.cells[c], of.cells[c]
-        here = np.zeros((globals_, n))
+        cross_here = np.zeros((globals_, n))
         local, mine = np.zeros((len(cell.parameter), n)), np.zeros(n)
         for v, unit in enumerate(cell.units):
             matrix = e.matrix[unit]
-            here += system.basis[unit][:, None] * matrix[system.at]
+            cross_here += system.basis[unit][:, None] * matrix[system.at]
             local += cell.covers[:, v : v + 1] * matrix[cell.parameter]
             mine += np.diag(matrix)
-        cross, own = cross + here, own + mine
+        cross, information = cross + cross_here, information + mine
         alone = -of.slopes[cell.units].sum(axis=0)
         score = score + alone
         if len(cell.parameter):
@@ -76,27 +76,29 @@ def scan(of: Solution) -> Scan:
                 moved = local - gain @ after[2]
             # Precision of the cell given all others, from before and from behind; without the globals.
             lower = entry.factor[0]
-            both = linalg.cho_factor(lower @ lower.T + block - entry.block, lower=True, check_finite=False)
+            joint = linalg.cho_factor(lower @ lower.T + block - entry.block, lower=True, check_finite=False)
             sides = border + entry.left - entry.border
-            for columns, kept, base, into in (
-                (moved, taken, border_taken, 1),
+            for columns, base_absorbed, base, into in (
+                (moved, absorbed, border_taken, 1),
                 (local, np.zeros(n), np.zeros((globals_, n)), 3),
             ):
-                solved = linalg.cho_solve(both, columns, check_finite=False)
-                rest = (cross if into == 1 else here) - base - sides.T @ solved
-                more = kept + np.einsum("kn,kn->n", columns, solved)
-                found[into][c] = _information(of, own if into == 1 else mine, rest, more)
+                solved = linalg.cho_solve(joint, columns, check_finite=False)
+                border_rest = (cross if into == 1 else cross_here) - base - sides.T @ solved
+                total_absorbed = base_absorbed + np.einsum("kn,kn->n", columns, solved)
+                scores[into][c] = _information(
+                    of, information if into == 1 else mine, border_rest, total_absorbed
+                )
             factor = linalg.cho_factor(block, lower=True, check_finite=False)
             solved = linalg.cho_solve(factor, moved, check_finite=False)
-            taken = taken + np.einsum("kn,kn->n", moved, solved)
+            absorbed = absorbed + np.einsum("kn,kn->n", moved, solved)
             border_taken = border_taken + border.T @ solved
             after = (factor, border, moved)
         else:
-            found[1][c] = _information(of, own, cross - border_taken, taken)
-            found[3][c] = _information(of, mine, here, np.zeros(n))
-        found[0][c], found[2][c] = score, alone
-    found[1][0] = 0.0  # from the first night on is no change
-    return found
+            scores[1][c] = _information(of, information, cross - border_taken, absorbed)
+            scores[3][c] = _information(of, mine, cross_here, np.zeros(n))
+        scores[0][c], scores[2][c] = score, alone
+    scores[1][0] = 0.0  # from the first night on is no change
+    return scores
 
 
 def weighted(
@@ -108,31 +110,31 @@ def weighted(
     """
     system, e = of.system, of.system.equations
     count, globals_ = len(parameter), len(system.at)
-    own, cross = np.zeros((count, count)), np.zeros((globals_, count))
-    taken, border_taken = np.zeros((count, count)), np.zeros((globals_, count))
+    direct, cross = np.zeros((count, count)), np.zeros((globals_, count))
+    absorbed, border_taken = np.zeros((count, count)), np.zeros((globals_, count))
     moved = np.zeros((0, count))
     for c, cell in enumerate(system.cells):
         local = np.zeros((len(cell.parameter), count))
         for v, unit in enumerate(cell.units):
             if weights[unit].any():
-                some = e.matrix[unit][:, parameter] * weights[unit]
-                own += some[parameter] * weights[unit][:, None]
-                cross += system.basis[unit][:, None] * some[system.at]
-                local += cell.covers[:, v : v + 1] * some[cell.parameter]
+                columns = e.matrix[unit][:, parameter] * weights[unit]
+                direct += columns[parameter] * weights[unit][:, None]
+                cross += system.basis[unit][:, None] * columns[system.at]
+                local += cell.covers[:, v : v + 1] * columns[cell.parameter]
         entry = of.cells[c]
         if len(cell.parameter):
             if c and entry.before.any():
                 gain = linalg.cho_solve(of.cells[c - 1].factor, entry.before.T, check_finite=False).T
                 local = local - gain @ moved
             solved = linalg.cho_solve(entry.factor, local, check_finite=False)
-            taken += local.T @ solved
+            absorbed += local.T @ solved
             border_taken += entry.left.T @ solved
         moved = local
-    information = own - taken
+    information = direct - absorbed
     if globals_:
         lower = linalg.solve_triangular(of.factor[0], cross - border_taken, lower=True, check_finite=False)
         information = information - lower.T @ lower
-    gone = np.diag(information) <= NOTHING * np.maximum(np.diag(own), 1e-300)
+    gone = np.diag(information) <= NOTHING * np.maximum(np.diag(direct), 1e-300)
     information[gone] = 0.0
     information[:, gone] = 0.0
     return -np.sum(of.slopes[:, parameter] * weights, axis=0), information

@@ -4,7 +4,7 @@
 
 of the data alone: priors are laid on when nights are stacked, once. J holds the derivatives of the normalised residuals
 r, fluxes eliminated, with respect to the free parameters and to the amplitudes of effects that the model lacks (at 0):
-what is not in the model can be asked for afterwards without the data. So can the throughput that is held because the
+effects beyond the model can be tested afterwards without the data. So can the throughput that is held because the
 fluxes take it up: held in every night it is no gauge of what changes between them, as its camera may be the one that
 does.
 
@@ -61,7 +61,7 @@ class Night:
     """The normal equations of one file in one night.
 
     `number` is the MJD of the evening, `begin`, `end` and `mjd` (UTC) the first, last and mean exposure; `source` and
-    `sha256` the data, `model` a hash of what the model holds fixed. `dof` counts data less fluxes. The last parameters
+    `sha256` the data, `model` a hash of the fixed part of the model. `dof` counts data less fluxes. The last parameters
     are `candidates`, amplitudes beyond the model with reference 0; `gradient` and `matrix` are halves of the
     derivatives of `chi2`.
     """
@@ -130,16 +130,19 @@ def of_exposures(calset: CalibrationSet, keep: Bool[np.ndarray, " e"]) -> Calibr
     """The set with some of its exposures. Raises `DataError` for frames, and for a set that stands for frames."""
     if keep.all():
         return calset
-    whole = calset.intensities
-    if not isinstance(whole, TableIntensities) or calset.compression is not None:
+    intensities = calset.intensities
+    if not isinstance(intensities, TableIntensities) or calset.compression is not None:
         raise DataError("frames of several nights are in one set; give each night as a file of its own")
-    rows, place = keep[whole.exposure], np.cumsum(keep) - 1
-    some = {
-        name: getattr(whole, name)[rows] for name in ("point", "source", "counts", "sigma", "flag", "used")
+    rows, place = keep[intensities.exposure], np.cumsum(keep) - 1
+    columns = {
+        name: getattr(intensities, name)[rows]
+        for name in ("point", "source", "counts", "sigma", "flag", "used")
     }
-    if whole.sky is not None:
-        some["sky"] = whole.sky[rows]
-    table = TableIntensities(int(keep.sum()), whole.points, exposure=place[whole.exposure[rows]], **some)
+    if intensities.sky is not None:
+        columns["sky"] = intensities.sky[rows]
+    table = TableIntensities(
+        int(keep.sum()), intensities.points, exposure=place[intensities.exposure[rows]], **columns
+    )
     return dataclasses.replace(calset, exposures=calset.exposures[keep], intensities=table)
 
 
@@ -154,6 +157,39 @@ def split(calset: CalibrationSet) -> Iterator[tuple[int, CalibrationSet]]:
 # ------------------------------------------------------------------------------------------------------ candidates
 
 Change = tuple[tuple[float, Any], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class EffectAmplitude(Parameter):
+    """An amplitude of an effect (`part`) that a model lacks, of one `shape`: the group of its probes and the member.
+
+    `in_model` is its name in a model that has the effect. In files the name holds all of it: EFFECT#GROUP.LEAF#MEMBER,
+    without what is 0.
+    """
+
+    shape: tuple[int, int] = (0, 0)
+    in_model: str = ""
+
+    @classmethod
+    def of(cls, leaf: Parameter, effect: str, group: int | None, member: int) -> EffectAmplitude:
+        """That of a leaf of a probe; `group` is None where the effect has a single one."""
+        of_group, of_member = f"#{group}" * (group is not None), f"#{member}" * bool(member)
+        fields: dict[str, Any] = vars(leaf) | {
+            "name": f"{effect}{of_group}.{leaf.name}{of_member}",
+            "part": effect,
+            "start": 0.0,
+        }
+        return cls(**fields, shape=(group or 0, member), in_model=f"{effect}.{leaf.name}")
+
+    @classmethod
+    def read(cls, parameter: Parameter) -> EffectAmplitude:
+        """That of a parameter of a file."""
+        head, _, leaf = parameter.name.partition(".")
+        (part, _, group), (leaf, _, member) = head.partition("#"), leaf.partition("#")
+        fields: dict[str, Any] = vars(parameter) | {"part": part}
+        return cls(**fields, shape=(int(group or 0), int(member or 0)), in_model=f"{part}.{leaf}")
+
+
 Candidates = dict[str, tuple[Parameter, Change]]
 """Amplitudes beyond a model by name, each with the change that it is to first order; a gauge has none."""
 
@@ -162,7 +198,7 @@ def candidates_of(
     model: Model, exposures: Exposures, catalogue: Sequence[EffectKind] = EFFECTS
 ) -> Candidates:
     """Amplitudes of the effects that a model lacks, and its gauges, with the change that each is to first order."""
-    context, found = effect_context(model.template, exposures), {}
+    context, candidates = effect_context(model.template, exposures), {}
     for kind in catalogue:
         if kind.is_structural() or kind.name in (*OF_ONE_SET, *model.effect_names):
             continue
@@ -171,17 +207,15 @@ def candidates_of(
             continue
         for g, group in enumerate(groups):
             for m, member in enumerate(group):
-                each = member.first_order(model.template)
+                first_order = member.first_order(model.template)
                 of = [leaf for leaf in leaves(member) if leaf.name.split(".")[0] in kind.amplitudes()]
-                if not each or not all(each) or len(each) != len(of):
+                if not first_order or not all(first_order) or len(first_order) != len(of):
                     continue
-                for leaf, change in zip(of, each, strict=True):
-                    name = f"{kind.name}{f'#{g}' if len(groups) > 1 else ''}.{leaf.name}" + (
-                        f"#{m}" if m else ""
-                    )
-                    found[name] = dataclasses.replace(leaf, name=name, part=kind.name, start=0.0), change
+                for leaf, change in zip(of, first_order, strict=True):
+                    amplitude = EffectAmplitude.of(leaf, kind.name, g if len(groups) > 1 else None, m)
+                    candidates[amplitude.name] = amplitude, change
     held = [model[name] for name in gauges(model, flux_known=False) if not model[name].free]
-    return found | {p.name: (p, ()) for p in held}
+    return candidates | {p.name: (p, ()) for p in held}
 
 
 def with_candidates(
@@ -204,9 +238,9 @@ def with_candidates(
     if changes:
         cut = len(model.free)
         columns = Columns(likelihood, values)
-        there = [k for k, change in enumerate(changes) if change and columns.has(change)]
+        computable = [k for k, change in enumerate(changes) if change and columns.has(change)]
         added = np.zeros((len(r), len(changes)))
-        added[:, there] = columns.of([changes[k] for k in there])
+        added[:, computable] = columns.of([changes[k] for k in computable])
         added[:, held] = jacobian[:, cut:]
         jacobian = np.hstack([jacobian[:, :cut], added])
     return float(r @ r), jacobian.T @ r, jacobian.T @ jacobian
@@ -247,29 +281,29 @@ def night_equations(
     if isinstance(values, Mapping):
         values = np.array([values.get(p.name, p.start) for p in model.parameters])
     source = source_of(calset)
-    found = []
-    for evening, some in split(calset):
+    nights = []
+    for evening, subset in split(calset):
         if number not in (None, evening):
             continue
-        likelihood, there = Likelihood.of(some, model, sets=sets), values
+        likelihood, point = Likelihood.of(subset, model, sets=sets), values
         if own:
-            there = nearer(likelihood, values, np.sqrt(OWN * len(model.free)))
+            point = nearer(likelihood, values, np.sqrt(OWN * len(model.free)))
         if likelihood.layout.large:
-            terms, _ = likelihood.data_terms(there)
+            terms, _ = likelihood.data_terms(point)
             select = model.selection()
             chi2, gradient, matrix = terms.data, select.T @ terms.gradient, select.T @ terms.matrix @ select
-            known, census = {}, terms.census
+            beyond, census = {}, terms.census
         else:
-            known = candidates_of(model, some.exposures, model.catalogue) if changes is None else changes
-            chi2, gradient, matrix = with_candidates(likelihood, there, known)
+            beyond = candidates_of(model, subset.exposures, model.catalogue) if changes is None else changes
+            chi2, gradient, matrix = with_candidates(likelihood, point, beyond)
             census = likelihood.census
         if not (np.isfinite(chi2) and np.isfinite(gradient).all() and np.isfinite(matrix).all()):
             raise DataError(
                 f"{source}, night of MJD {evening}: the model has no finite counts or derivatives where the nights "
                 "meet; some night is far from it: fit each by itself (walop-jax refit), leave out what is not trusted"
             )
-        e = some.exposures
-        found.append(
+        e = subset.exposures
+        nights.append(
             Night(
                 instrument=model.name,
                 model=model_hash(model),
@@ -283,19 +317,19 @@ def night_equations(
                 n_data=census.n_data,
                 dof=round(float(census.rows @ likelihood.data_per_row)),
                 chi2=chi2,
-                parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in known.values())),
-                candidates=len(known),
+                parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in beyond.values())),
+                candidates=len(beyond),
                 reference=np.concatenate(
                     [
-                        there[model.free],
-                        [0.0 if change else there[model.index(name)] for name, (_, change) in known.items()],
+                        point[model.free],
+                        [0.0 if change else point[model.index(name)] for name, (_, change) in beyond.items()],
                     ]
                 ),
                 gradient=gradient,
                 matrix=matrix,
             )
         )
-    return found
+    return nights
 
 
 def with_candidates_of(night: Night, before: Night) -> Night:
@@ -307,9 +341,9 @@ def with_candidates_of(night: Night, before: Night) -> Night:
     cut = len(before.parameters) - before.candidates
     if not before.candidates or night.candidates or night.names != before.names[:cut]:
         return night
-    known, cross, own = before.matrix[:cut, :cut], before.matrix[cut:, :cut], before.matrix[cut:, cut:]
-    along = cross @ pseudo_inverse(known, 1e-13)
-    beyond, pull = own - along @ cross.T, before.gradient[cut:] - along @ before.gradient[:cut]
+    free, cross, block = (before.matrix[:cut, :cut], before.matrix[cut:, :cut], before.matrix[cut:, cut:])
+    along = cross @ pseudo_inverse(free, 1e-13)
+    beyond, pull = block - along @ cross.T, before.gradient[cut:] - along @ before.gradient[:cut]
     slope = along @ night.matrix
     return dataclasses.replace(
         night,
@@ -352,7 +386,7 @@ def _bytes(record: object) -> bytes:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Together:
-    """Nights in the order of time, with equations in the parameters of all: what a stack is solved from.
+    """Nights in the order of time, with equations in the parameters of all: the input of a stack.
 
     `origin` are the values that equations count from; `mean` and `width` (inf: none) the priors in the same way.
     """
@@ -371,7 +405,7 @@ class Together:
         return tuple(p.name for p in self.parameters)
 
     def aligned(self) -> list[Night]:
-        """The nights in the parameters of all, about the common origin: what a file of nights can hold together."""
+        """The nights in the parameters of all, about the common origin, as a file of nights holds them."""
         e, up = self.equations, 1.0 / self.equations.scale
         return [
             dataclasses.replace(
@@ -383,11 +417,11 @@ class Together:
 
     @property
     def reference(self) -> Float[np.ndarray, "u n"]:
-        """The values that every night was linearised at; the origin for what a night does not know."""
-        found, place = np.tile(self.origin, (len(self.nights), 1)), {n: k for k, n in enumerate(self.names)}
+        """The values that every night was linearised at; the origin for parameters that a night lacks."""
+        values, place = np.tile(self.origin, (len(self.nights), 1)), {n: k for k, n in enumerate(self.names)}
         for u, night in enumerate(self.nights):
-            found[u, [place[name] for name in night.names]] = night.reference
-        return found
+            values[u, [place[name] for name in night.names]] = night.reference
+        return values
 
     @property
     def has_value(self) -> Bool[np.ndarray, " n"]:
@@ -406,16 +440,16 @@ def together(nights: Sequence[Night]) -> Together:
         raise fail("no night was given", advice="give fits, sets or files of nights")
     ordered = tuple(sorted(nights, key=lambda night: (night.mjd, night.sha256)))
     check_together(ordered)
-    known: dict[str, Parameter] = {}
+    union: dict[str, Parameter] = {}
     for candidate in (False, True):
         for night in ordered:
             cut = len(night.parameters) - night.candidates
             for p in night.parameters[cut:] if candidate else night.parameters[:cut]:
-                known.setdefault(p.name, p)
+                union.setdefault(p.name, p)
     of_model = {
         p.name for night in ordered for p in night.parameters[: len(night.parameters) - night.candidates]
     }
-    names, n = list(known), len(known)
+    names, n = list(union), len(union)
     place, origin = {name: k for k, name in enumerate(names)}, np.full(n, np.nan)
     gradient, matrix = np.zeros((len(ordered), n)), np.zeros((len(ordered), n, n))
     chi2 = np.zeros(len(ordered))
@@ -430,7 +464,7 @@ def together(nights: Sequence[Night]) -> Together:
         gradient[u, at] = night.gradient + slope
         matrix[u][np.ix_(at, at)] = night.matrix
     mean, width = np.zeros(n), np.full(n, np.inf)
-    for k, p in enumerate(known.values()):
+    for k, p in enumerate(union.values()):
         if p.name in of_model and (p.prior is not None or p.loose is not None):
             centre, width[k] = p.prior if p.prior is not None else (p.start, p.loose)
             mean[k] = centre - origin[k]
@@ -449,7 +483,7 @@ def together(nights: Sequence[Night]) -> Together:
         matrix,
         scale,
     )
-    return Together(ordered, tuple(known.values()), n - len(of_model), origin, mean, width, equations)
+    return Together(ordered, tuple(union.values()), n - len(of_model), origin, mean, width, equations)
 
 
 def _numbers(nights: Sequence[Night]) -> Int[np.ndarray, " u"]:
@@ -470,23 +504,23 @@ def check_together(nights: Sequence[Night]) -> None:
     for name, remedy in advice.items():
         for night in nights:
             if getattr(night, name) != getattr(first, name):
-                one, other = (f"{getattr(entry, name)[:12]} ({entry.source})" for entry in (first, night))
-                raise fail(f"the nights are of two {name}s, {one} and {other}", advice=remedy)
+                mine, theirs = (f"{getattr(entry, name)[:12]} ({entry.source})" for entry in (first, night))
+                raise fail(f"the nights are of two {name}s, {mine} and {theirs}", advice=remedy)
     stars: dict[str, tuple[Parameter, Night]] = {}
     for night in nights:
         for p in night.parameters:
-            one, other = stars.setdefault(p.name, (p, night))
-            if p.name.startswith("standard.") and p.prior != one.prior:
+            mine, theirs = stars.setdefault(p.name, (p, night))
+            if p.name.startswith("standard.") and p.prior != mine.prior:
                 star = p.name.split(".")[1]
-                what = f"the catalogue has other values of {star} in {night.source} than in {other.source}"
+                what = f"the catalogue has other values of {star} in {night.source} than in {theirs.source}"
                 raise fail(what, extension="SOURCES", advice=_ONE_STAR)
-    seen: dict[Any, Night] = {}
+    earlier: dict[Any, Night] = {}
     for night in nights:
         for key in ((night.sha256, night.number), (night.begin, night.end)):
-            if key in seen:
+            if key in earlier:
                 what = (
                     "the same data" if key == (night.sha256, night.number) else "exposures of the same times"
                 )
-                where = f"{what} are in {seen[key].source} and {night.source}"
+                where = f"{what} are in {earlier[key].source} and {night.source}"
                 raise fail(f"the night of MJD {night.number} is there twice: {where}", advice="leave one out")
-            seen[key] = night
+            earlier[key] = night

@@ -132,13 +132,13 @@ class Maker:
         if not task.candidates:  # a gauge stays where its column was made
             cut = len(night.names) - night.candidates
             values |= dict(zip(night.names[cut:], night.reference[cut:].tolist(), strict=True))
-        (made,) = night_equations(calset, model, values, candidates, number=night.number, sets=self.count)
-        return Made([with_candidates_of(made, night)])
+        (anew,) = night_equations(calset, model, values, candidates, number=night.number, sets=self.count)
+        return Made([with_candidates_of(anew, night)])
 
     def _set_and_model(self, data: Data) -> tuple[CalibrationSet, Model]:
         assert self.like is not None
-        if (kept := self._sets.get(data.sha256)) is not None:
-            return kept
+        if (cached := self._sets.get(data.sha256)) is not None:
+            return cached
         calset = data.read()
         read = calset, data.model or model_like(calset, self.like.model)
         if isinstance(calset.intensities, TableIntensities):
@@ -166,12 +166,12 @@ class Makers:
 
         Raises `DataError` as `Maker.make` does, and for measurements that are in the data of an earlier task as well.
         """
-        for made in self._made(tasks):
-            if made.sketch:
-                self._refuse_copies(made.source, made.sketch)
-            if made.error is not None:
-                raise made.error
-            yield made.nights
+        for result in self._made(tasks):
+            if result.sketch:
+                self._refuse_copies(result.source, result.sketch)
+            if result.error is not None:
+                raise result.error
+            yield result.nights
 
     def _made(self, tasks: Sequence[Task]) -> Iterable[Made]:
         if self._executor is None:
@@ -180,9 +180,11 @@ class Makers:
         return mapped(make, [(recipe, task) for task in tasks], self._executor)
 
     def _refuse_copies(self, here: str, smallest: frozenset[int]) -> None:
-        seen = Counter(self._seen[number] for number in smallest if number in self._seen)
-        if seen and (most := seen.most_common(1)[0])[1] > COPIED * len(smallest):
-            share = f"{100 * most[1] / len(smallest):.0f} % of its measurements are in {most[0]} as well"
+        shared = Counter(self._seen[number] for number in smallest if number in self._seen)
+        if shared and (closest := shared.most_common(1)[0])[1] > COPIED * len(smallest):
+            share = (
+                f"{100 * closest[1] / len(smallest):.0f} % of its measurements are in {closest[0]} as well"
+            )
             raise fail(share, file=here, advice="leave one out: repeated data would shrink the errors")
         self._seen |= dict.fromkeys(smallest, here)
 
@@ -242,8 +244,8 @@ def executor_of(
     dask = importlib.import_module("distributed")
     with contextlib.ExitStack() as hold:
         if scheduler is None:
-            own = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None}
-            address = hold.enter_context(dask.LocalCluster(**own))
+            options = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None}
+            address = hold.enter_context(dask.LocalCluster(**options))
         else:
             address = scheduler
         try:

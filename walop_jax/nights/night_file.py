@@ -21,7 +21,7 @@ from walop_jax.io.fits_reading import OpenFile, open_fits
 from walop_jax.io.names import NIGHTS
 from walop_jax.io.text import in_ascii
 from walop_jax.model.parameters import Parameter
-from walop_jax.nights.equations import Night
+from walop_jax.nights.equations import EffectAmplitude, Night
 
 NIGHTVER = 1
 _NAN = float("nan")
@@ -144,15 +144,20 @@ def _nights(opened: OpenFile) -> list[Night]:
             prior=None if np.isnan(priors[k][1]) else (priors[k][0], priors[k][1]),
             scale=float(table["SCALE"][k]),
             loose=None if np.isnan(table["LOOSE"][k]) else float(table["LOOSE"][k]),
+            part=str(table["NAME"][k]).partition(".")[0],
         )
         for k in range(n)
     )
-    lower, found = np.tril_indices(n), []
+    parameters = tuple(
+        EffectAmplitude.read(p) if beyond and p.start == 0.0 else p  # others are gauges of the model
+        for p, beyond in zip(parameters, table["CANDIDATE"], strict=True)
+    )
+    lower, nights = np.tril_indices(n), []
     for k in range(len(rows["NIGHT"])):
         matrix = np.zeros((n, n))
         matrix[lower] = rows["MATRIX"][k]
         matrix = matrix + np.tril(matrix, -1).T
-        found.append(
+        nights.append(
             Night(
                 instrument=str(header.get("INSTRUME", "")),
                 model=str(header.get("MODEL", "")),
@@ -163,7 +168,7 @@ def _nights(opened: OpenFile) -> list[Night]:
                 **{field: kind(rows[name][k]) for name, (field, kind) in _PLAIN.items()},
             )
         )
-    return found
+    return nights
 
 
 def nights_in(place: str | os.PathLike[str]) -> list[Night]:
@@ -173,9 +178,5 @@ def nights_in(place: str | os.PathLike[str]) -> list[Night]:
         return read_nights(path)
     files = [path / NIGHTS] if (path / NIGHTS).exists() else sorted(path.glob("night*.fits"))
     if not files:
-        raise fail(
-            "holds no nights",
-            file=place,
-            advice="give sets, RUNs of walop-jax refit or a SURVEY",
-        )
+        raise fail("holds no nights", file=place, advice="give sets, RUNs of walop-jax refit or a SURVEY")
     return [night for file in files for night in read_nights(file)]

@@ -1,4 +1,4 @@
-"""From what users have to a survey: nights are made of fits, runs and sets, stacked, and kept in a folder.
+"""Surveys from fits, runs and sets: nights are made, stacked, and kept in a folder.
 
 The files of a survey: docs, files. Nights that are made lie in its folder `partial` until all are.
 """
@@ -33,17 +33,12 @@ from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import check_input, parse_toml, read_text
 from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.laws import Law, laws_of, resolved
+from walop_jax.model.parameters import Parameter
 from walop_jax.model.specification import effect_context
 from walop_jax.nights.algebra import Solution, UndeterminedError
-from walop_jax.nights.breaks import Break, at_solution, part_of, solved
+from walop_jax.nights.breaks import Break, at_solution, solved
 from walop_jax.nights.breaks import find as breaks_of
-from walop_jax.nights.equations import (
-    Night,
-    Together,
-    data_hash,
-    source_of,
-    together,
-)
+from walop_jax.nights.equations import Night, Together, data_hash, source_of, together
 from walop_jax.nights.making import Data, Maker, Makers, Task
 from walop_jax.nights.night_file import nights_in, read_nights, write_nights
 from walop_jax.nights.survey import Survey
@@ -63,7 +58,7 @@ PARTIAL = "partial"
 
 
 class _Opened(NamedTuple):
-    """Nights as given, or data that they can be made of, with what comes with them."""
+    """Nights as given, or data that they can be made of, with their fit, breaks and events."""
 
     nights: list[Night]
     data: Data | None = None
@@ -86,33 +81,33 @@ def stack(
 ) -> Survey:
     """Fit all nights together under laws of time, from their normal equations.
 
-    Nights are fits, calibration sets (linearised at the values of `like`, no fit is needed), or what was kept of them.
+    Nights are fits, calibration sets (linearised at the values of `like`, no fit is needed), or kept nights.
     `laws` are as the [law] tables of `model.laws`, or a file with them, by default those of the model of `like`; a
     parameter without one is shared by all nights. `like` is a calibration of their model, by default the first that is
     given. Sets and fits are linearised again at the common solution until none is far from it; kept nights cannot be.
-    With `find` breaks are looked for in three nights and more, and become laws. `events` is a table of what was done to
+    With `find` breaks are looked for in three nights and more, and become laws. `events` is a table of works on
     the instrument (MJD, WHAT); `partial` is a folder that nights are kept in while others are made,
     `executor` makes them in other processes, to the same result (`nights.making`).
 
     Raises `DataError` for nights that do not belong together, that do not determine a parameter under its law, and for
-    nights without a filter in common; ValueError for laws that are wrong, or of what does not exist.
+    nights without a filter in common; ValueError for laws that are wrong, or of parameters that do not exist.
     """
-    opened = [_opened(one, catalogue) for one in nights]
-    fits = [one for one in (like, *(some.fit for some in opened)) if one is not None]
-    held = [Calibration.from_fit(one) if isinstance(one, FitResult) else one for one in fits[:1]]
+    opened = [_opened(entry, catalogue) for entry in nights]
+    fits = [entry for entry in (like, *(source.fit for source in opened)) if entry is not None]
+    held = [Calibration.from_fit(entry) if isinstance(entry, FitResult) else entry for entry in fits[:1]]
     maker = Maker(held[0] if held else None, partial, len(opened))
     makers = Makers(maker, executor)
-    made: list[Night] = []
+    all_nights: list[Night] = []
     at_hand: dict[tuple[str, int], Data] = {}
-    new = makers.make([Task(one.data) for one in opened if one.data is not None])
-    for k, one in enumerate(opened):
-        some = one.nights
-        if one.data is not None:
+    new = makers.make([Task(entry.data) for entry in opened if entry.data is not None])
+    for k, entry in enumerate(opened):
+        source = entry.nights
+        if entry.data is not None:
             tell(f"{k + 1} of {len(opened)}")
-            some = next(new)
-            at_hand |= {night.key: one.data for night in some}
-        made += some
-    data = together(made)
+            source = next(new)
+            at_hand |= {night.key: entry.data for night in source}
+        all_nights += source
+    data = together(all_nights)
     doubts = [*_about_fits(fits), *_about_time(data.nights)]
     tables: Mapping[str, Any] = laws if isinstance(laws, Mapping) else {}
     if isinstance(laws, str | os.PathLike):
@@ -121,16 +116,16 @@ def stack(
         tables = maker.like.model.laws
     chosen = laws_of_all(data, tables)
     _check_filters(data, chosen)
-    breaks = [one for some in opened for one in some.breaks]
+    breaks = [entry for source in opened for entry in source.breaks]
     try:
         if find and len({night.number for night in data.nights}) > 2:
             # Ahead of linearising again: with breaks that are no law yet the common solution is one of no night.
             carried = functools.partial(_carried, maker.like, catalogue) if maker.like is not None else None
-            found, chosen, _ = breaks_of(data, chosen, catalogue, carried)
-            breaks += found
+            new_breaks, chosen, _ = breaks_of(data, chosen, catalogue, carried)
+            breaks += new_breaks
         data, solution, settled = _settled(data, chosen, at_hand, makers)
         if at_hand and any(law is not None for law in chosen[len(chosen) - data.candidates :]):
-            # What takes part in the solution is to be known there, not only what is left of it.
+            # Candidates with a law are linearised at the solution as well.
             data = _with_candidates_anew(data, solution, at_hand, makers)
             data, solution, settled = _settled(data, chosen, at_hand, makers)
     except UndeterminedError as error:
@@ -138,13 +133,15 @@ def stack(
     if not settled:
         what = "the solution has not settled: the nights differ by more than their laws and the breaks that were found"
         doubts.append(Doubt(Quality.NOT_CONVERGED, what))
-    if kept := sum(night.key not in at_hand for night in data.nights):
-        what = f"{kept} of {len(data.nights)} nights stay as they were linearised: their data are not at hand"
+    if fixed := sum(night.key not in at_hand for night in data.nights):
+        what = (
+            f"{fixed} of {len(data.nights)} nights stay as they were linearised: their data are not at hand"
+        )
         doubts.append(Doubt(Quality(0), what, blocking=False))
-    happened = {event for some in opened for event in some.events} | set(
+    happened = {event for source in opened for event in source.events} | set(
         () if events is None else events_of(events)
     )
-    breaks = sorted((at_solution(data, solution, one) for one in breaks), key=lambda one: one.night)
+    breaks = sorted((at_solution(data, solution, entry) for entry in breaks), key=lambda entry: entry.night)
     return Survey(data, chosen, solution, maker.like, tuple(doubts), tuple(breaks), tuple(sorted(happened)))
 
 
@@ -161,7 +158,7 @@ def events_of(table: Any) -> list[tuple[float, str]]:
 
 
 def laws_of_all(data: Together, laws: Mapping[str, Law | Mapping[str, Any]]) -> tuple[Law | None, ...]:
-    """A law for every parameter and candidate of nights (None: absent). ValueError for what is wrong in `laws`."""
+    """A law for every parameter and candidate of nights (None: absent). ValueError for wrong `laws`."""
     tables = {name: law.document() if isinstance(law, Law) else law for name, law in laws.items()}
     cut = len(data.names) - data.candidates
     alone = [name for name, gauge in zip(data.names, data.gauge, strict=True) if gauge]
@@ -170,11 +167,10 @@ def laws_of_all(data: Together, laws: Mapping[str, Law | Mapping[str, Any]]) -> 
 
 def writers(survey: Survey) -> dict[str, Callable[[Path], object]]:
     """Writers of the files of a survey, but for its document."""
-    last, reference = survey.at(survey.last), dataclasses.replace(survey.reference, path=None)
     return {
         NIGHTS: lambda path: write_nights(path, survey.data.aligned()),
-        REFERENCE: lambda path: write_calibration(path, reference),
-        PRODUCT: lambda path: write_calibration(path, last),
+        REFERENCE: lambda path: write_calibration(path, dataclasses.replace(survey.reference, path=None)),
+        PRODUCT: lambda path: write_calibration(path, survey.at(survey.last)),
         TRACKS: lambda path: survey.tracks.write(path, format="fits"),
     }
 
@@ -222,12 +218,12 @@ def _opened(one: Given, catalogue: Sequence[EffectKind]) -> _Opened:
     if path.is_dir() and (not (path / PRODUCT).exists() or (path / NIGHTS).exists()):
         fit = read_calibration(path / REFERENCE, catalogue) if (path / REFERENCE).exists() else None
         folder = RunFolder(path)
-        said = folder.document(SURVEY) if SURVEY in folder else {"breaks": [], "events": []}
+        document = folder.document(SURVEY) if SURVEY in folder else {"breaks": [], "events": []}
         return _Opened(
             nights_in(path),
             fit=fit,
-            breaks=tuple(Break.read(entry) for entry in said["breaks"]),
-            events=tuple((float(entry["mjd"]), str(entry["what"])) for entry in said["events"]),
+            breaks=tuple(Break.read(entry) for entry in document["breaks"]),
+            events=tuple((float(entry["mjd"]), str(entry["what"])) for entry in document["events"]),
         )
     keywords = () if path.is_dir() else primary_keywords(path)
     if "NIGHTVER" in keywords:
@@ -240,16 +236,13 @@ def _opened(one: Given, catalogue: Sequence[EffectKind]) -> _Opened:
 
 
 def _settled(
-    data: Together,
-    laws: Sequence[Law | None],
-    at_hand: Mapping[tuple[str, int], Data],
-    makers: Makers,
+    data: Together, laws: Sequence[Law | None], at_hand: Mapping[tuple[str, int], Data], makers: Makers
 ) -> tuple[Together, Solution, bool]:
     """Linearise nights at the common solution until that would not move it by `EXACT` errors; whether it would not.
 
     Those that lie farthest from the solution are linearised there first, the n-th of them to see: were each of the rest
     as far from linear, how far would all together move the solution? As far as may be, and the rest stays as it is.
-    What a model lacks may lead ever farther away: the search ends where all nights come no closer.
+    A missing effect may lead ever farther away: the search ends where all nights come no closer.
     """
     solution, anew, enough, farthest = solved(data, laws), list[int](), False, np.inf
     for _ in range(ROUNDS):
@@ -267,26 +260,26 @@ def _settled(
         farthest = float(away.max())
         nights, anew, enough = list(data.nights), [], False
         for begin in (0, *(2**k for k in range(len(again).bit_length()))):
-            if not (some := again[begin : max(1, 2 * begin)]):
+            if not (batch := again[begin : max(1, 2 * begin)]):
                 break
-            there = [dict(zip(data.names, values[u].tolist(), strict=True)) for u in some]
-            tasks = [Task(at_hand[nights[u].key], nights[u], at) for u, at in zip(some, there, strict=True)]
-            *made, (last,) = makers.make(tasks)
-            for u, (night,) in zip(some, made, strict=False):
+            points = [dict(zip(data.names, values[u].tolist(), strict=True)) for u in batch]
+            tasks = [Task(at_hand[nights[u].key], nights[u], at) for u, at in zip(batch, points, strict=True)]
+            *earlier, (last,) = makers.make(tasks)
+            for u, (night,) in zip(batch, earlier, strict=False):
                 nights[u] = night
-            seeing = len(some) == max(1, begin)  # the first, second, fourth …: solving costs time as well
+            seeing = len(batch) == max(1, begin)  # the first, second, fourth …: solving costs time as well
             before = values
             if seeing and begin > 0:
-                before, _ = _in_units(one := together(nights), solved(one, laws))
-            nights[u := some[-1]] = last
-            anew += some
+                before, _ = _in_units(trial := together(nights), solved(trial, laws))
+            nights[u := batch[-1]] = last
+            anew += batch
             data = together(nights)
             solution = solved(data, laws)
             if seeing:
                 after, _ = _in_units(data, solution)
-                rest = np.full((len(nights), 1), len(again) - begin - len(some))
-                rest[u] = min(rest[u], 1)  # what is its own moves with no other night
-                if enough := bool(np.all(rest * np.abs(after - before) <= EXACT * sigma)):
+                remaining = np.full((len(nights), 1), len(again) - begin - len(batch))
+                remaining[u] = min(remaining[u], 1)  # its own values move with no other night
+                if enough := bool(np.all(remaining * np.abs(after - before) <= EXACT * sigma)):
                     break
     return data, solution, False
 
@@ -297,10 +290,10 @@ def _with_candidates_anew(
     """The nights linearised at the solution, with their candidates."""
     values, _ = _in_units(data, solution)
     nights = list(data.nights)
-    some = [u for u, night in enumerate(nights) if night.key in at_hand]
-    there = [dict(zip(data.names, values[u].tolist(), strict=True)) for u in some]
-    tasks = [Task(at_hand[nights[u].key], nights[u], at, True) for u, at in zip(some, there, strict=True)]
-    for u, (night,) in zip(some, makers.make(tasks), strict=True):
+    units = [u for u, night in enumerate(nights) if night.key in at_hand]
+    points = [dict(zip(data.names, values[u].tolist(), strict=True)) for u in units]
+    tasks = [Task(at_hand[nights[u].key], nights[u], at, True) for u, at in zip(units, points, strict=True)]
+    for u, (night,) in zip(units, makers.make(tasks), strict=True):
         nights[u] = night
     return together(nights)
 
@@ -313,25 +306,25 @@ def _in_units(
     return data.origin + solution.values * scale, np.maximum(solution.errors() * scale, 1e-12 * scale)
 
 
-def _carried(like: Calibration, catalogue: Sequence[EffectKind], name: str) -> bool:
+def _carried(like: Calibration, catalogue: Sequence[EffectKind], candidate: Parameter) -> bool:
     """True unless a candidate is an effect of which a star at another time and flux says nothing.
 
     Such are the median counts of a field, the exposure before, the time since the first exposure of a night.
     """
-    kind = next((one for one in catalogue if one.name == part_of(name)), None)
+    kind = next((entry for entry in catalogue if entry.name == candidate.part), None)
     if kind is None:
         return True
     template = like.model.template
     changes = kind.neutral(effect_context(template, like.exposures)).first_order(template)
-    return all(change.of_stars for each in changes for _, change in each)
+    return all(change.of_stars for orders in changes for _, change in orders)
 
 
 def _about_fits(fits: Sequence[Calibration | FitResult]) -> list[Doubt]:
     doubts = []
-    for one in fits:
-        verdict = one.verdict if isinstance(one, Calibration) else one.checked_verdict()
-        where = str(one.path or source_of(one)) if isinstance(one, Calibration) else source_of(one.calset)
-        if (one.errors_from if isinstance(one, FitResult) else verdict.errors_from) != STATED:
+    for fit in fits:
+        verdict = fit.verdict if isinstance(fit, Calibration) else fit.checked_verdict()
+        where = str(fit.path or source_of(fit)) if isinstance(fit, Calibration) else source_of(fit.calset)
+        if (fit.errors_from if isinstance(fit, FitResult) else verdict.errors_from) != STATED:
             raise fail(
                 f"the errors of {where} do not explain its scatter, and nights are weighed by them",
                 advice="correct N_ERR, or leave the night out",
@@ -355,13 +348,13 @@ def _undetermined(data: Together, error: UndeterminedError) -> DataError:
 
 
 def _about_time(nights: Sequence[Night]) -> list[Doubt]:
-    found, reached = [], math.inf
+    doubts, reached = [], math.inf
     for begin, end in sorted((night.begin, night.end) for night in nights):
         if begin - reached > LONG:
             what = f"no night from MJD {reached:.1f} to {begin:.1f}: what holds there rests on the laws alone"
-            found.append(Doubt(Quality(0), what, blocking=False))
+            doubts.append(Doubt(Quality(0), what, blocking=False))
         reached = end if math.isinf(reached) else max(reached, end)
-    return found
+    return doubts
 
 
 def _check_filters(data: Together, laws: Sequence[Law | None]) -> None:

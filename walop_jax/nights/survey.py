@@ -15,7 +15,6 @@ import dataclasses
 import functools
 import itertools
 import math
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -34,9 +33,9 @@ from walop_jax.model.effects import EffectKind
 from walop_jax.model.laws import Law
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights.algebra import Solution
-from walop_jax.nights.breaks import Break, part_of, shape_of
+from walop_jax.nights.breaks import Break
 from walop_jax.nights.changes import scan
-from walop_jax.nights.equations import Together, night_numbers
+from walop_jax.nights.equations import EffectAmplitude, Together, night_numbers
 from walop_jax.science.field_accuracy import NODES, SIZE, TOLERANCE, judged, reached
 
 Vector = Float[np.ndarray, " _"]
@@ -50,10 +49,10 @@ SUSPECT = 5.0  # excess of χ² of a night over its expectation, in its own stan
 class Survey(Displayed):
     """Nights under laws: `at(mjd)` is the calibration of a moment, `tracks` every parameter against time.
 
-    `laws` are those of every parameter and candidate (None: absent), `breaks` what was found and made a law. `like` is
+    `laws` are those of every parameter and candidate (None: absent), `breaks` the detected ones, now laws. `like` is
     a calibration of the same model, from which field, filters, site and parameters that are held are taken (None:
-    there is no calibration of a moment); `doubts` are what speaks against it beside χ²; `events` what users have
-    written down (MJD, words).
+    there is no calibration of a moment); `doubts` are those beside χ²; `events` the notes of
+    users (MJD, words).
     """
 
     data: Together
@@ -68,13 +67,13 @@ class Survey(Displayed):
 
     @functools.cached_property
     def excess(self) -> Vector:
-        """(χ² − dof)/√(2 dof) of every night: how far its data are from what the laws say."""
+        """(χ² − dof)/√(2 dof) of every night: the distance of its data from the laws."""
         dof = np.array([night.dof for night in self.data.nights], float)
         return (self.solution.unit_chi2 - dof) / np.sqrt(2.0 * np.maximum(dof, 1.0))
 
     @functools.cached_property
     def _counts(self) -> tuple[float, int]:
-        """χ² of data and of what is known beforehand, and its degrees of freedom.
+        """χ² of data and priors, and its degrees of freedom.
 
         These are data less fluxes, plus priors, less the unknowns that these determine. Loose widths only keep the
         search inside: they are no knowledge, what they add to χ² is left out, and an unknown that nothing else
@@ -82,11 +81,11 @@ class Survey(Displayed):
         """
         system, chi2 = self.solution.system, self.solution.chi2 + self.solution.penalty
         prior = np.array([p.prior is not None for p in self.data.parameters])
-        known, walks, weak = 0, set(), 0.0
+        constraints, walks, weak = 0, set(), 0.0
         variances = np.diag(self.solution.covariance)
         for entry, value, variance in zip(system.globals, self.solution.shared, variances, strict=True):
             if prior[entry.parameter]:
-                known += entry.precision > 0
+                constraints += entry.precision > 0
             else:
                 chi2 -= entry.precision * (value - entry.mean) ** 2
                 weak += entry.precision * variance
@@ -96,13 +95,15 @@ class Survey(Displayed):
             states = cell.parameter[np.isfinite(cell.mjd)].tolist()
             stated = prior[cell.parameter] | np.isfinite(system.spread[cell.parameter])
             # A step of a walk is known beforehand to be about 0: one for every state but the first.
-            known += int(((cell.precision > 0) & stated).sum()) + len(states) - len(set(states) - walks)
+            constraints += int(((cell.precision > 0) & stated).sum()) + len(states) - len(set(states) - walks)
             loose = np.where(stated, 0.0, cell.precision)
             chi2 -= float(loose @ (local - cell.mean) ** 2)
             weak += float(loose @ np.diag(spread))
             walks |= set(states)
         unknown = len(system.globals) + sum(len(cell.parameter) for cell in system.cells)
-        return float(chi2), int(sum(night.dof for night in self.data.nights) + known - unknown + round(weak))
+        return float(chi2), int(
+            sum(night.dof for night in self.data.nights) + constraints - unknown + round(weak)
+        )
 
     @functools.cached_property
     def verdict(self) -> Verdict:
@@ -111,11 +112,13 @@ class Survey(Displayed):
         against = list(self.doubts)
         excess = (chi2 - dof) / math.sqrt(2.0 * max(dof, 1))
         if excess > SUSPECT:
-            said = f"χ²/dof = {chi2 / max(dof, 1):.4g} lies {excess:.3g} standard deviations above 1"
-            against.append(Doubt(Quality.UNEXPLAINED, f"{said}: the laws do not explain the nights"))
-        if some := [str(nights[u].number) for u in np.flatnonzero(self.excess > SUSPECT)]:
-            listed = ", ".join(some[:5]) + (" …" if len(some) > 5 else "")
-            what = f"{len(some)} of {len(nights)} nights scatter more than their errors say: MJD {listed}"
+            statement = f"χ²/dof = {chi2 / max(dof, 1):.4g} lies {excess:.3g} standard deviations above 1"
+            against.append(Doubt(Quality.UNEXPLAINED, f"{statement}: the laws do not explain the nights"))
+        if scattered := [str(nights[u].number) for u in np.flatnonzero(self.excess > SUSPECT)]:
+            listed = ", ".join(scattered[:5]) + (" …" if len(scattered) > 5 else "")
+            what = (
+                f"{len(scattered)} of {len(nights)} nights scatter more than their errors say: MJD {listed}"
+            )
             against.append(Doubt(Quality.DOUBTED, what))
         structure = NO_STRUCTURE if self.like is None else self.like.verdict.structure
         n_data = sum(night.n_data for night in nights)
@@ -137,10 +140,10 @@ class Survey(Displayed):
     def until(self) -> float:
         """The end of the validity (MJD): see the head of this file."""
         begin, end = min(night.begin for night in self.data.nights), self.last
-        most = end + max(end - begin, HALF_A_DAY)
-        if self._matrix is None or self.error_of_p(most) <= GOAL / 2:
-            return most
-        low, high = end, most
+        latest = end + max(end - begin, HALF_A_DAY)
+        if self._matrix is None or self.error_of_p(latest) <= GOAL / 2:
+            return latest
+        low, high = end, latest
         while high - low > 0.01:
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self.error_of_p(middle) <= GOAL / 2 else (low, middle)
@@ -173,8 +176,8 @@ class Survey(Displayed):
         x, y = product.raster(SIZE)
         matrix, covariance, slopes = product.over_field(x, y, settings, NODES, TOLERANCE)
         structure = covariance - slopes @ product.covariance @ slopes.swapaxes(1, 2)
-        seen = measures_u(matrix.reshape(-1, 2, 3))
-        return (matrix[seen], slopes[seen], structure[seen], float(np.mean(~seen))) if seen.any() else None
+        good = measures_u(matrix.reshape(-1, 2, 3))
+        return (matrix[good], slopes[good], structure[good], float(np.mean(~good))) if good.any() else None
 
     @property
     def last(self) -> float:
@@ -184,8 +187,8 @@ class Survey(Displayed):
     @property
     def changing(self) -> dict[str, Law]:
         """The laws other than that of a parameter that all nights share."""
-        known = zip(self.data.names, self.laws, strict=True)
-        return {name: law for name, law in known if law is not None and law.per != ("shared",)}
+        by_name = zip(self.data.names, self.laws, strict=True)
+        return {name: law for name, law in by_name if law is not None and law.per != ("shared",)}
 
     @property
     def edges(self) -> tuple[float, ...]:
@@ -217,14 +220,17 @@ class Survey(Displayed):
             number = int(night_numbers(np.array([mjd], float), self.like.site)[0])
         else:
             number = next((n.number for n in nights if n.begin <= mjd <= n.end), -1)
-        known = sorted({n.number for n in nights})
-        value, covariance = self.solution.predict(mjd, known.index(number) if number in known else None)
+        evenings = sorted({n.number for n in nights})
+        value, covariance = self.solution.predict(mjd, evenings.index(number) if number in evenings else None)
         value, covariance = self.data.origin + value * scale, covariance * np.outer(scale, scale)
-        for one in self.breaks:
-            if one.kind == "step" and one.before < mjd < one.after:
-                i, share = self.data.names.index(one.name), (mjd - one.before) / (one.after - one.before)
-                value[i] += one.size * (share - (mjd >= one.date))
-                covariance[i, i] += (one.size**2 + one.error**2) * share * (1.0 - share)
+        for case in self.breaks:
+            if case.kind == "step" and case.before < mjd < case.after:
+                i, share = (
+                    self.data.names.index(case.name),
+                    (mjd - case.before) / (case.after - case.before),
+                )
+                value[i] += case.size * (share - (mjd >= case.date))
+                covariance[i, i] += (case.size**2 + case.error**2) * share * (1.0 - share)
         return value, covariance
 
     def at(self, mjd: float, *, force: bool = False) -> Calibration:
@@ -247,16 +253,17 @@ class Survey(Displayed):
     def _product(self, mjd: float) -> Calibration:
         """The calibration of a moment, whether it is valid or not."""
         full, (value, covariance) = self._full, self.values_at(mjd)
-        model, names = full.model, [_in_model(name) for name in self.data.names]
-        there = [k for k, name in enumerate(names) if name in model.names and self.laws[k] is not None]
-        select = np.zeros((len(model.names), len(there)))
-        select[[model.index(names[k]) for k in there], np.arange(len(there))] = 1.0
+        model, parameters = full.model, self.data.parameters
+        names = [p.in_model if isinstance(p, EffectAmplitude) else p.name for p in parameters]
+        present = [k for k, name in enumerate(names) if name in model.names and self.laws[k] is not None]
+        select = np.zeros((len(model.names), len(present)))
+        select[[model.index(names[k]) for k in present], np.arange(len(present))] = 1.0
         select = select[model.masters]
         inside = select.any(axis=1)
         return dataclasses.replace(
             full,
-            values=np.where(inside, select @ value[there], full.values),
-            covariance=select @ covariance[np.ix_(there, there)] @ select.T,
+            values=np.where(inside, select @ value[present], full.values),
+            covariance=select @ covariance[np.ix_(present, present)] @ select.T,
             origin=f"{len(self.data.nights)} nights, stacked, at MJD {mjd:.5f}",
             inputs=(),
         )
@@ -269,24 +276,19 @@ class Survey(Displayed):
         context = effect_context(model.template, like.exposures)
         candidates = [
             p for p, law, has in zip(self.data.parameters, self.laws, self.data.has_value, strict=True)
-            if law is not None and not has and p.name not in model.names
+            if law is not None and not has and p.name not in model.names and isinstance(p, EffectAmplitude)
         ]  # fmt: skip
-        taken: dict[str, str] = {}
+        shapes: dict[str, tuple[int, int]] = {}
         for p in candidates:
-            # Names of parts, not `Parameter.part`, which files of nights do not hold.
-            part, shape = part_of(p.name), shape_of(p.name)
-            if taken.setdefault(part, shape) != shape or part in self.reference.model.effect_names:
+            part, (group, member) = p.part, (shape := p.shape)
+            if shapes.setdefault(part, shape) != shape or part in self.reference.model.effect_names:
                 raise fail(
                     f"{p.name} is one shape of its effect, and the model has another",
                     advice="put the effect into the model file and fit the nights again",
                 )
-            kind: EffectKind = next(one for one in model.catalogue if one.name == part)
+            kind: EffectKind = next(entry for entry in model.catalogue if entry.name == part)
             if part not in model.effect_names:
-                group, _, member = shape.partition("#")
-                chosen = (
-                    kind.probes(context)[int(group)][int(member or 0)] if shape else kind.neutral(context)
-                )
-                model = with_effects(model, [chosen], context)
+                model = with_effects(model, [kind.probes(context)[group][member]], context)
         values, old = model.start, [model.index(name) for name in like.model.names]
         values[old] = like.values
         return dataclasses.replace(like, model=model, values=values, covariance=np.zeros((len(values),) * 2))
@@ -295,20 +297,20 @@ class Survey(Displayed):
 
     @functools.cached_property
     def tracks(self) -> Any:
-        """Every parameter in every night as an astropy table: value and error under its law, and what a night adds.
+        """Every parameter in every night as an astropy table: value and error under its law, and deviation.
 
         DEVIATION is by how much the parameter would differ in that night, or in nights that a file joins, if it alone
         were free to differ there, with everything else fitted anew; NaN where its law takes that up.
         """
         data, solution = self.data, self.solution
-        shape, scale, found = (len(data.nights), len(data.names)), data.equations.scale, scan(self.solution)
+        shape, scale, scores = (len(data.nights), len(data.names)), data.equations.scale, scan(self.solution)
         alone = np.full(shape, np.nan)
         deviation = alone.copy()
         for c, cell in enumerate(solution.system.cells):
-            seen = found.once_information[c] > 0
-            known = found.once_information[c, seen]
-            deviation[np.ix_(cell.units, seen)] = found.once_score[c, seen] / known
-            alone[np.ix_(cell.units, seen)] = known**-0.5
+            informed = scores.once_information[c] > 0
+            information = scores.once_information[c, informed]
+            deviation[np.ix_(cell.units, informed)] = scores.once_score[c, informed] / information
+            alone[np.ix_(cell.units, informed)] = information**-0.5
         laws = ["absent" if law is None else " ".join(law.per) for law in self.laws]
 
         def by_night(of: Sequence[Any]) -> np.ndarray:
@@ -331,7 +333,7 @@ class Survey(Displayed):
         })  # fmt: skip
 
     def to_table(self) -> Any:
-        """The nights as an astropy table: time, χ², what it should be, and how far off that is."""
+        """The nights as an astropy table: time, χ², its expectation, and the distance."""
         nights = self.data.nights
         return astropy_table({
             "NIGHT": (np.array([n.number for n in nights]), "", "MJD of the evening"),
@@ -354,11 +356,11 @@ class Survey(Displayed):
             "valid_from": start, "valid_until": stop, "validity": self.validity,
             "error_of_p": None if self._matrix is None else self.error_of_p(self.last),
             "without_u": None if self._matrix is None else self._matrix[3],
-            "breaks": [dataclasses.asdict(one) | {"date": one.date} for one in self.breaks],
+            "breaks": [dataclasses.asdict(case) | {"date": case.date} for case in self.breaks],
             "events": [{"mjd": mjd, "what": what} for mjd, what in self.events],
             "by_night": [
-                {"night": one.number, "mjd": one.mjd, "chi2": float(chi2), "dof": one.dof, "excess": float(excess)}
-                for one, chi2, excess in zip(self.data.nights, self.solution.unit_chi2, self.excess, strict=True)
+                {"night": n.number, "mjd": n.mjd, "chi2": float(chi2), "dof": n.dof, "excess": float(excess)}
+                for n, chi2, excess in zip(self.data.nights, self.solution.unit_chi2, self.excess, strict=True)
             ],
             "advice": self.advice,
             "laws": {name: law.document() for name, law in self.changing.items()},
@@ -372,24 +374,24 @@ class Survey(Displayed):
     @property
     def advice(self) -> tuple[str, ...]:
         """Advice, in sentences, the most urgent first."""
-        found = (
+        sentences = (
             [] if self.trusted else ["Look at the nights that scatter too much: walop-jax diagnose NIGHT."]
         )
-        for one in self.breaks:
-            if one.alike:
-                more = (
-                    "no more nights like these would tell" if math.isinf(one.nights_needed)
-                    else f"{'or ' if one.separated_by else ''}{one.nights_needed:.0f} more nights like these"
+        for case in self.breaks:
+            if case.alike:
+                needed = (
+                    "no more nights like these would tell" if math.isinf(case.nights_needed)
+                    else f"{'or ' if case.separated_by else ''}{case.nights_needed:.0f} more nights like these"
                 )  # fmt: skip
-                names = ", ".join(one.alike[:3]) + (" …" if len(one.alike) > 3 else "")
-                how = "; ".join((*one.separated_by, more))
-                found.append(
-                    f"MJD {one.night}: {one.name} cannot be told from {names}. To separate them: {how}."
+                names = ", ".join(case.alike[:3]) + (" …" if len(case.alike) > 3 else "")
+                how = "; ".join((*case.separated_by, needed))
+                sentences.append(
+                    f"MJD {case.night}: {case.name} cannot be told from {names}. To separate them: {how}."
                 )
-        return (*found, f"Calibrate again before MJD {self.until:.1f}.")
+        return (*sentences, f"Calibrate again before MJD {self.until:.1f}.")
 
     def display(self) -> Display:
-        """Quality tonight, what has changed since when, and what to do."""
+        """Quality tonight, changes with dates, and advice."""
         verdict, (start, stop), nights = self.verdict, self.span, self.data.nights
         facts = {
             "χ²/dof": f"{verdict.chi2:.1f} / {verdict.dof} = {verdict.chi2 / max(verdict.dof, 1):.4g}",
@@ -403,10 +405,11 @@ class Survey(Displayed):
             facts["changes"] = "none found beyond the laws"
         rows = tuple(
             (
-                one.kind, one.name, " ± ".join(value_and_error(one.size, one.error)), one.unit, str(one.night),
-                f"{one.z:+.1f}", ", ".join(one.alike[:3]),
+                case.kind, case.name, " ± ".join(value_and_error(case.size, case.error)), case.unit,
+                str(case.night),
+                f"{case.z:+.1f}", ", ".join(case.alike[:3]),
             )
-            for one in self.breaks
+            for case in self.breaks
         )  # fmt: skip
         return Display(
             f"Survey of {nights[0].instrument}: {verdict.words}",
@@ -415,8 +418,3 @@ class Survey(Displayed):
             rows,
             tuple(dict.fromkeys((*verdict.warnings, *self.advice))),
         )
-
-
-def _in_model(name: str) -> str:
-    """The name that a parameter or candidate has in a model."""
-    return re.sub("#[0-9]+", "", name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,20 +29,6 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.specification import Model, Vector
 from walop_jax.posterior.draws import A_MEAN, read_groups
-
-VERDICTS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
-    "diagnosis": lambda d: str(d["verdict"]),
-    "commissioning": lambda d: "go" if d["go"] else "no-go",
-    "epoch": lambda d: (
-        f"the old calibration {'still holds' if d.get('fits') and d.get('new_trusted') else 'does not hold'}"
-    ),
-    "survey": lambda d: "trusted" if d["trusted"] else "not trusted",
-    "watch": lambda d: (
-        "the calibration is still valid" if d["holds"] else "the calibration may be no longer valid"
-    ),
-    "plan": lambda d: f"{d['what']}: {d['value']:.3g} {d['unit']}".rstrip(),
-}
-"""Documents in a few words."""
 
 SAME_FIT = 0.05  # standard errors
 
@@ -191,7 +177,11 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
             facts.append(
                 ("p of a star", f"{two_digits(100 * accuracy['median'])} % (median of the field), {share}")
             )
-        facts += [(name, VERDICTS[name](documents[name])) for name in VERDICTS if name in documents]
+        facts += [
+            (name, document["shown"]["title"])
+            for name, document in documents.items()
+            if "shown" in document and name != "summary"
+        ]
         inner = Display("") if self.calibration is None else self.calibration.display()
         return dataclasses.replace(
             inner, title=f"Run {self.folder}. {inner.title}".removesuffix(". "), facts=(*facts, *inner.facts)

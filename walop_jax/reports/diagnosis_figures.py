@@ -66,10 +66,10 @@ def residual_maps(
 
 @styled
 def effect_figure(data: DiagnosisFigureData, number: int = 1, on: Canvas = PAGE) -> AnyFigure:
-    """Residuals without the effect of a comparison, what it explains, and with it; of 0: starting and final model."""
-    one = data.comparisons[number]
-    without, with_it = (f"without\n{one.effect}", f"with\n{one.effect}") if number else _MODELS
-    rows = {without: one.before, one.effect or "explained": one.explained, with_it: one.after}
+    """Residuals without and with the effect of a comparison, and its part; of 0: starting and final model."""
+    c = data.comparisons[number]
+    without, with_it = (f"without\n{c.effect}", f"with\n{c.effect}") if number else _MODELS
+    rows = {without: c.before, c.effect or "explained": c.explained, with_it: c.after}
     return residual_maps(data.points, rows, data.cameras, on)
 
 
@@ -81,9 +81,9 @@ def rms_figure(data: DiagnosisFigureData, on: Canvas = PAGE) -> AnyFigure:
     other points and are measured in other exposures: left out, if need be. Noise alone gives √(1 − 1/K) with K cameras
     and a free flux: 0.87 of four.
     """
-    whole = data.comparisons[0]
-    there = np.isfinite(whole.before)
-    rms = (np.where(there, values, np.nan) for values in (whole.rms_before, whole.rms_after))
+    overall = data.comparisons[0]
+    measured = np.isfinite(overall.before)
+    rms = (np.where(measured, values, np.nan) for values in (overall.rms_before, overall.rms_after))
     maps: dict[str, PointMap] = dict(zip(_MODELS, rms, strict=True))
     norm = Normalize(0.5, max(largest_size(*maps.values()), 1.5))
     return _maps(data.points, maps, data.cameras, norm, "magma_r", "rms residual (σ)", False, on)
@@ -134,21 +134,22 @@ def _signs(axis: Axes, points: Points, values: Float[np.ndarray, " p"], norm: No
 def signature_figure(
     comparison: ResidualComparison, exposures: Table, cameras: Sequence[str], on: Canvas = PAGE
 ) -> AnyFigure:
-    """Residuals averaged over the field, camera by camera: data as dots, what the effect explains as a line.
+    """Residuals averaged over the field, camera by camera: data as dots, the part of the effect as a line.
 
     Against the polariser angle where the comparison shows a harmonic of it, or most of its signal is behind the
-    polariser; against time otherwise. Exposures at one angle are averaged. The lower panels hold what is left.
+    polariser; against time otherwise. Exposures at one angle are averaged. The lower panels hold the remaining
+    residuals.
     """
     angular = _against_angle(comparison, exposures)
     grid = {"sharex": True, "sharey": "row", "height_ratios": (2.2, 1), "squeeze": False}
     figure, (upper, lower) = on.panels(0.6 + 2.0 * len(cameras), 3.5, 2, len(cameras), **grid)
     position, label = _abscissa(exposures, angular)
     for k, camera in enumerate(cameras):
-        known = np.isfinite(position) & np.isfinite(comparison.curve_before[:, k])
+        finite = np.isfinite(position) & np.isfinite(comparison.curve_before[:, k])
         c = comparison
         columns = (c.curve_before, c.curve_error, c.curve_explained, c.curve_after)
         x, before, error, explained, after = _binned(
-            position[known], *(column[known, k] for column in columns)
+            position[finite], *(column[finite, k] for column in columns)
         )
         for axis, dots in ((upper[k], before), (lower[k], after)):
             axis.axhline(0.0, color=QUIET, lw=0.8, zorder=0)
@@ -314,18 +315,18 @@ def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     Effects that nothing comes near are left out, and counted.
     """
     alike = found.separation + np.where(np.eye(len(found.effects), dtype=bool), np.inf, 0.0) < _STEPS[-1]
-    kept = np.flatnonzero((alike | alike.T).any(axis=0))
-    kept = kept if kept.size else np.arange(len(found.effects))
-    count, names = len(kept), [found.effects[i] for i in kept]
+    confusable = np.flatnonzero((alike | alike.T).any(axis=0))
+    confusable = confusable if confusable.size else np.arange(len(found.effects))
+    count, names = len(confusable), [found.effects[i] for i in confusable]
     size = max(1.5, 0.17 * count)
     figure, axis = on.single(size + 3.2, size + 2.0)
-    separation = found.separation[np.ix_(kept, kept)]
+    separation = found.separation[np.ix_(confusable, confusable)]
     shown = axis.imshow(separation, norm=BoundaryNorm(_STEPS, 256, extend="max"), cmap="RdYlBu")
     axis.set_xticks(range(count), names, rotation=90, fontsize=SMALL)
     axis.set_yticks(range(count), names, fontsize=SMALL)
     axis.set_ylabel("effect present\n(at its detection limit)", fontsize=FONT)
     axis.set_xlabel("could be mistaken for", fontsize=FONT)
-    if others := len(found.effects) - count:
-        axis.set_title(f"{others} other effects: more than {_STEPS[-1]:g} σ from all", fontsize=FONT)
+    if omitted := len(found.effects) - count:
+        axis.set_title(f"{omitted} other effects: more than {_STEPS[-1]:g} σ from all", fontsize=FONT)
     colour_bar(figure, shown, axis, f"separation (σ); below {thresholds.SEPARATION:g}: can be mistaken")
     return figure

@@ -131,18 +131,18 @@ def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n
     square = (likelihood.points.gathered("counts") * likelihood.points.gathered("weight")) ** 2
     together = likelihood.model.template.cameras.together
     power = square @ (np.ones((likelihood.cameras,) * 2) if together is None else np.asarray(together))
-    taken = np.where(likelihood.flux_known[:, None], 0.0, square / np.where(power > 0, power, 1.0))
-    width = np.sqrt(np.clip(1.0 - taken, 1e-3, None))[likelihood.used].ravel()
+    flux_share = np.where(likelihood.flux_known[:, None], 0.0, square / np.where(power > 0, power, 1.0))
+    width = np.sqrt(np.clip(1.0 - flux_share, 1e-3, None))[likelihood.used].ravel()
     used = residual[likelihood.used].ravel()
     edges = np.linspace(-4.0, 4.0, 41)
-    each = np.full(
+    density = np.full(
         used.size, 1.0 / (used.size * (edges[1] - edges[0]))
     )  # those beyond the axis count as well
-    axis.hist(used / width, bins=edges.tolist(), weights=each, color="0.75", label="residuals")
+    axis.hist(used / width, bins=edges.tolist(), weights=density, color="0.75", label="residuals")
     beyond = float(np.mean(np.abs(used / width) > edges[-1]))
     if beyond > 0:
-        said = f"{two_digits(100.0 * beyond)} % beyond ±{edges[-1]:g}"
-        axis.text(0.03, 0.97, said, transform=axis.transAxes, va="top", fontsize=SMALL)
+        tail = f"{two_digits(100.0 * beyond)} % beyond ±{edges[-1]:g}"
+        axis.text(0.03, 0.97, tail, transform=axis.transAxes, va="top", fontsize=SMALL)
     t = np.linspace(-4.0, 4.0, 201)
     axis.plot(t, np.exp(-0.5 * t**2) / np.sqrt(2 * np.pi), color="C3", lw=1.2, label="noise alone")
     axis.set_xlabel("residual / its expected width", fontsize=FONT)
@@ -170,8 +170,8 @@ def modulation_figure(
     turn = 180 if np.max(e.clp_angle[shown], initial=0.0) <= 180.0 else 360
     angle = np.linspace(0.0, turn, 181)
     for arm, axis in enumerate(panels[0]):
-        pair, (one, other) = 2 * arm, names[2 * arm : 2 * arm + 2]
-        name = f"({one} − {other}) / ({one} + {other})"
+        pair, (first_camera, second_camera) = 2 * arm, names[2 * arm : 2 * arm + 2]
+        name = f"({first_camera} − {second_camera}) / ({first_camera} + {second_camera})"
         if arms == 2:
             name, ideal = (("$q_m$", np.cos), ("$u_m$", np.sin))[arm]
             axis.plot(angle, ideal(2 * np.deg2rad(angle)), color="0.8", lw=1.0, zorder=0, label="ideal")
@@ -220,8 +220,8 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
     low = max(10.0 ** np.floor(np.log10(low)), high / 1e4)
     image = None
     for axis, errors, name in zip(axes.ravel(), maps.errors, element_symbols(maps.arms), strict=True):
-        least, most = (plain(100.0 * float(value)) for value in (errors.min(), errors.max()))
-        field_axes(axis, f"error of {name}\n{least} to {most} %")
+        least, highest = (plain(100.0 * float(value)) for value in (errors.min(), errors.max()))
+        field_axes(axis, f"error of {name}\n{least} to {highest} %")
         image = pixel_map(axis, 100.0 * errors, field_of(maps), LogNorm(low, max(high, 10 * low)), SEQUENTIAL)
     colour_bar(figure, image, axes, "standard error (%)", pad=0.02, extend="min", aspect=30)
     outer_labels(axes)
@@ -333,12 +333,12 @@ def planned_figure(field: Mapping[str, Sequence[float | None]]) -> Figure:
         np.maximum.at(worst, at.ravel(), np.where(np.isnan(error), np.inf, 100.0 * error))
         maps.append(np.where(np.isfinite(worst), worst, np.nan))
     figure, axes = PAGE.panels(8.2, 3.6, 1, 2)
-    lowest, most = float(0.5 * np.nanmin(maps[1])), float(2.0 * np.nanmax(maps[1]))
-    most = min(max(float(np.nanmax(maps[0])), most), max(_RANGE[1], most))
+    lowest, highest = float(0.5 * np.nanmin(maps[1])), float(2.0 * np.nanmax(maps[1]))
+    highest = min(max(float(np.nanmax(maps[0])), highest), max(_RANGE[1], highest))
     for axis, values, title in zip(axes, maps, ("before", "after"), strict=True):
         field_axes(axis, f"error of p {title}")
-        shown = np.minimum(values, most)
-        image = point_map(axis, places[0], places[1], shown, LogNorm(lowest, most), SEQUENTIAL)
+        shown = np.minimum(values, highest)
+        image = point_map(axis, places[0], places[1], shown, LogNorm(lowest, highest), SEQUENTIAL)
         blind = np.isnan(values)
         axis.plot(places[0, blind], places[1, blind], "x", color="0.5", ms=4)
         colour_bar(figure, image, axis, "error of p (%)", extend="max")

@@ -1,4 +1,4 @@
-"""The figures of a run by name: what each shows, and what it is drawn from."""
+"""The figures of a run by name: a line about each, and the data that it is drawn from."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ NARROW = 5.0  # inches of a corner plot: three coefficients at most
 
 
 def _accuracy(source: FigureSource) -> AnyFigure:
-    found = source.accuracy
-    if found is None:
+    accuracy = source.accuracy
+    if accuracy is None:
         advice = "plot matrix-errors"
         raise fail("has a single arm: one exposure holds no p", file=source.folder, advice=advice)
-    return figures.accuracy_figure(found, source.canvas)
+    return figures.accuracy_figure(accuracy, source.canvas)
 
 
 def _residuals(source: FigureSource, whole: bool = False) -> AnyFigure:
@@ -68,8 +68,8 @@ def _corner(source: FigureSource) -> AnyFigure:
     if not source.parameters:
         draws = np.stack([held[name].ravel() for name in shown], axis=1)
         narrow = source.canvas.width is not None and source.canvas.width < NARROW
-        most = 3 if narrow else posterior_figures.MOST_IN_CORNER
-        shown = posterior_figures.correlated(draws, shown, source.prior_width, most)
+        limit = 3 if narrow else posterior_figures.MOST_IN_CORNER
+        shown = posterior_figures.correlated(draws, shown, source.prior_width, limit)
     if source.canvas.ax is not None:
         raise ValueError("ax: a corner plot needs a figure of its own")
     draws = np.stack([held[name].ravel() for name in shown], axis=1)
@@ -104,17 +104,17 @@ def _cameras(source: FigureSource) -> tuple[str, ...] | None:
 def _modulation(source: FigureSource) -> AnyFigure:
     exposures, points = source.calset.exposures, source.calset.points
     behind = np.flatnonzero(exposures.clp_in & ~exposures.position(CALIBRATION_PLATE).inside)
-    seen = source.calset.intensities.block(0, len(points)).used[:, behind].any(axis=1)
-    if not seen.any():
+    measured = source.calset.intensities.block(0, len(points)).used[:, behind].any(axis=1)
+    if not measured.any():
         raise fail("no field point was seen behind the polariser", file=source.folder, advice="plot matrix")
     away = np.hypot(points.x - source.place[0], points.y - source.place[1])
-    nearest = int(np.argmin(np.where(seen, away, np.inf)))
+    nearest = int(np.argmin(np.where(measured, away, np.inf)))
     return figures.modulation_figure(source.calset, [nearest], source.canvas, _cameras(source))
 
 
 @dataclasses.dataclass(frozen=True)
 class NamedFigure:
-    """A figure with what it shows in a few words, the file of a run that it needs, and whether a run can give it."""
+    """A figure with a line about it, the file of a run that it needs, and whether a run can give it."""
 
     about: str
     draw: Callable[[FigureSource], AnyFigure]
@@ -156,8 +156,7 @@ FIGURES: Mapping[str, NamedFigure] = {
         possible=_small,
     ),
     "matrix": NamedFigure(
-        "the elements of the instrument matrix",
-        lambda s: figures.matrix_maps_figure(s.maps, on=s.canvas),
+        "the elements of the instrument matrix", lambda s: figures.matrix_maps_figure(s.maps, on=s.canvas)
     ),
     "matrix-errors": NamedFigure(
         "their standard errors", lambda s: figures.matrix_errors_figure(s.maps, s.canvas)
@@ -198,9 +197,7 @@ FIGURES: Mapping[str, NamedFigure] = {
         LIMITS,
     ),
     "separation": NamedFigure(
-        "which effects look alike",
-        lambda s: diagnosis_figures.separation_figure(s.limits, s.canvas),
-        LIMITS,
+        "which effects look alike", lambda s: diagnosis_figures.separation_figure(s.limits, s.canvas), LIMITS
     ),
     "ladder": NamedFigure(
         "χ² of the starting model and of every model after it",
@@ -245,15 +242,17 @@ FIGURES: Mapping[str, NamedFigure] = {
 
 def possible(source: FigureSource) -> dict[str, NamedFigure]:
     """The figures that a run, or a result in memory, can give; its plates go by their names."""
-    found = {name: one for name, one in FIGURES.items() if one.needs in source and one.possible(source)}
-    if "retardance" in found:
+    figures = {
+        name: entry for name, entry in FIGURES.items() if entry.needs in source and entry.possible(source)
+    }
+    if "retardance" in figures:
         about = f"maps of the retardance of {listed(_plates(source))}"
-        found["retardance"] = dataclasses.replace(found["retardance"], about=about)
-    return found
+        figures["retardance"] = dataclasses.replace(figures["retardance"], about=about)
+    return figures
 
 
 def draw(name: str, source: FigureSource) -> AnyFigure:
-    """The figure of a name; `DataError` with the nearest names if there is none, or if the run lacks what it needs."""
+    """The figure of a name; `DataError` with the nearest names if there is none, or if the run lacks its data."""
     if name not in FIGURES:
         raise fail(
             f"there is no figure {name!r}", advice=f"{nearest(name, FIGURES)} (walop-jax plot RUN lists all)"

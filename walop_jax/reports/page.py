@@ -1,6 +1,6 @@
 """Pages about runs: single HTML files, figures inside, nothing fetched from anywhere.
 
-A page is a header (what the command displayed first of its result), then sections: what else it displayed, and figures.
+A page is a header (the first lines that the command displayed of its result), then sections: the rest, and figures.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from walop_jax.fit.verdict import Quality
 from walop_jax.io.display import Display, signed
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.names import (
+    AFFECTED,
     COMMISSIONING,
     COMPARISON,
     EPOCH,
@@ -99,18 +100,18 @@ def display_of(document: Mapping[str, Any], path: Path) -> Display:
 
 def filled(head: Display, sections: Iterable[Section], *, good: bool, **content: Any) -> str:
     """The text of a page; no line ends between a number and its sign or unit."""
-    made = jinja2.Environment(
+    environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {"unit": unit_in_words, "signed": signed}
-    kept = [section for section in sections if not section.empty]
+    environment.filters |= {"unit": unit_in_words, "signed": signed}
+    filled_sections = [section for section in sections if not section.empty]
     defaults = {"doubts": (), "next": (), "versions": {}, "many": MANY, "instrument": "", "missing": ()}
-    content = defaults | content | {"head": head, "sections": kept, "good": good}
-    text = made.get_template("page.html").render(content)
+    content = defaults | content | {"head": head, "sections": filled_sections, "good": good}
+    text = environment.get_template("page.html").render(content)
     return re.sub(r"(?<=\d) (?=[%σ±])|(?<=[=±≤]) (?=\d)", "\N{NO-BREAK SPACE}", text)
 
 
@@ -137,7 +138,7 @@ def picture(
 
 
 def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str, ...]]:
-    """The HTML text of the page about a fit or a diagnosis, and in words what the run lacks for it.
+    """The HTML text of the page about a fit or a diagnosis, and in words the files that the run lacks for it.
 
     `goal` is the error of p that is wanted (None: as the fit was asked).
     """
@@ -148,18 +149,18 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
     head = fit if diagnosis is None else display_of(diagnosis, folder / "diagnosis.json")
     trusted = bool(summary.get("trusted", summary["converged"]))
     good = trusted and (diagnosis is None or diagnosis["verdict"] != "unexplained")
-    asked, go = _asked(run)
+    requirements_shown, go = _asked(run)
     answered = any(name.startswith("good for") for name, _ in head.facts)
-    if trusted and asked is not None and (goal is not None or not answered):
-        known = _accuracy(run)
-        head = head if known is None else _with_goal(head, known)
+    if trusted and requirements_shown is not None and (goal is not None or not answered):
+        accuracy = _accuracy(run)
+        head = head if accuracy is None else _with_goal(head, accuracy)
     missing, drawn = [*run.missing], _Drawn(run)
     origin = "" if run.product is None or not run.product.origin else f"; data from {run.product.origin}"
     sampled = run.product is not None and run.product.verdict.covariance_from == "posterior"
     when = "" if run.product is None else run.product.date.replace("T", " at ")
     date = f", {'sampled' if sampled else 'fitted'} on {when} UTC" if when else ""
     sections = (
-        Section("commissioning", "Go or no-go", asked),
+        Section("commissioning", "Go or no-go", requirements_shown),
         Section(
             "accuracy", "Accuracy of p over the field", pictures=drawn.accuracy(missing) if trusted else ()
         ),
@@ -187,7 +188,7 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
         title="Calibration" if diagnosis is None else "Diagnosis",
         instrument=summary.get("instrument", "WALOP"),
         about=f"{date}{origin}",
-        first="" if asked is None else asked.title,
+        first="" if requirements_shown is None else requirements_shown.title,
         doubts=() if trusted else _doubts(summary),
         name=folder.resolve().name,
         versions=summary["versions"],
@@ -205,13 +206,11 @@ def _asked(run: RunContents) -> tuple[Display | None, bool]:
     accuracy = _accuracy(run)
     if run.product is None or accuracy is None:
         return None, True
-    found = requirements(run.product.verdict, "", accuracy, None)
-    whole = all(each.met for each in found)
-    title = "No go" if not is_go(found) else "Go: fit for use" if whole else "Go, with reservations"
-    advice = requirement_advice(found)
-    return Display(
-        title, head=("", "requirement", "result"), rows=requirement_rows(found), notes=advice
-    ), is_go(found)
+    checks = requirements(run.product.verdict, "", accuracy, None)
+    all_met = all(check.met for check in checks)
+    title = "No go" if not is_go(checks) else "Go: fit for use" if all_met else "Go, with reservations"
+    rows, advice = requirement_rows(checks), requirement_advice(checks)
+    return Display(title, head=("", "requirement", "result"), rows=rows, notes=advice), is_go(checks)
 
 
 def _accuracy(run: RunContents) -> FieldAccuracy | None:
@@ -225,13 +224,13 @@ def _accuracy(run: RunContents) -> FieldAccuracy | None:
 def _with_goal(head: Display, known: FieldAccuracy) -> Display:
     """The head of a page with the answer for another goal in place of that of the fit."""
     answer = known.facts()
-    said = {name for name, _ in answer}
-    rest = [
+    replaced = {name for name, _ in answer}
+    remaining = [
         fact
         for fact in head.facts
-        if fact[0] not in said and not fact[0].startswith(("good for", "what to do"))
+        if fact[0] not in replaced and not fact[0].startswith(("good for", "what to do"))
     ]
-    return dataclasses.replace(head, facts=(*answer, *rest))
+    return dataclasses.replace(head, facts=(*answer, *remaining))
 
 
 class _Drawn:
@@ -252,17 +251,17 @@ class _Drawn:
             return []
 
     def accuracy(self, missing: list[str]) -> list[Picture]:
-        """The error of p over the field, and what a mistake could do unnoticed."""
-        found = (
+        """The error of p over the field, and the effect of a mistake that goes unnoticed."""
+        pictures = (
             []
             if self.product is None
             else self.named("accuracy", missing, {"filter": self.product.maps.filter})
         )
-        if found and self.run.limits is not None and self.run.limits.worst is not None:
-            found.append(
+        if pictures and self.run.limits is not None and self.run.limits.worst is not None:
+            pictures.append(
                 picture("protection", diagnosis_figures.protection_figure(self.run.limits), small=True)
             )
-        return found
+        return pictures
 
     def residuals(self, missing: list[str]) -> list[Picture]:
         """Residuals with the starting and the final model."""
@@ -271,15 +270,15 @@ class _Drawn:
             return [] if self.product is None else self.named("residuals", missing)
         if data is None:
             return []
-        found, whole = [], data.comparisons[0]
+        pictures, overall = [], data.comparisons[0]
         if len(data.comparisons) == 1:
-            drawn = diagnosis_figures.residual_maps(data.points, {"residuals": whole.before}, data.cameras)
-            found.append(picture("whole", drawn, {"combination": in_greek(whole.combination)}))
+            drawn = diagnosis_figures.residual_maps(data.points, {"residuals": overall.before}, data.cameras)
+            pictures.append(picture("whole", drawn, {"combination": in_greek(overall.combination)}))
         else:
-            found.append(picture("ladder", diagnosis_figures.ladder_figure(data.ladder), small=True))
+            pictures.append(picture("ladder", diagnosis_figures.ladder_figure(data.ladder), small=True))
         if len(data.comparisons) > 2:
-            found.append(picture("rms", diagnosis_figures.rms_figure(data)))
-        return [*found, picture("shares", diagnosis_figures.shares_figure(data.shares))]
+            pictures.append(picture("rms", diagnosis_figures.rms_figure(data)))
+        return [*pictures, picture("shares", diagnosis_figures.shares_figure(data.shares))]
 
     def matrix(self) -> list[Picture]:
         """Maps of the instrument matrix, of its errors, and of what whole frames leave."""
@@ -287,30 +286,32 @@ class _Drawn:
             return []
         maps, residuals = self.product.maps, self.product.residuals
         errors = {"covariance": self.product.verdict.covariance_from}
-        found = [
+        pictures = [
             picture("matrix", figures.matrix_maps_figure(maps), {"filter": maps.filter}),
             picture("matrix-errors", figures.matrix_errors_figure(maps), errors),
         ]
         if residuals is not None:
             words = {"filter": residuals.filter, "significance": f"{residuals.significance():.1f}"}
-            found += self.named("residual-map", [], words)
-        return found
+            pictures += self.named("residual-map", [], words)
+        return pictures
 
 
 def _diagnosed(run: RunContents, head: Display) -> list[Section]:
     """Sections on findings, with the figures of every addition."""
     assert run.diagnosis is not None
-    left, data, pictures = run.diagnosis["unexplained"], run.figure_data, []
-    for number, one in enumerate(() if data is None else data.comparisons[1:], start=1):
-        words = {"effect": one.effect, "combination": in_greek(one.combination)}
+    leftover, data, pictures = run.diagnosis["unexplained"], run.figure_data, []
+    for number, comparison in enumerate(() if data is None else data.comparisons[1:], start=1):
+        words = {"effect": comparison.effect, "combination": in_greek(comparison.combination)}
         assert data is not None
         pictures += [
             picture("effect", diagnosis_figures.effect_figure(data, number), words),
             picture(
-                "signature", diagnosis_figures.signature_figure(one, data.exposures, data.cameras), words
+                "signature",
+                diagnosis_figures.signature_figure(comparison, data.exposures, data.cameras),
+                words,
             ),
         ]
-    patterns = [] if not left else left.get("patterns", [])
+    patterns = [] if not leftover else leftover.get("patterns", [])
     rows = tuple((row["pattern"], probability(row["p_value"]).removeprefix("= ")) for row in patterns)
     shown = dataclasses.replace(head, facts=())
     return [
@@ -320,7 +321,7 @@ def _diagnosed(run: RunContents, head: Display) -> list[Section]:
 
 
 def _candidates(run: RunContents) -> Section:
-    """Every effect of the catalogue at the first look, limits on what was not found, other descriptions."""
+    """Every effect of the catalogue at the first look, limits on effects that were not found."""
     assert run.diagnosis is not None
     catalogue = EFFECTS if run.source.run is None else run.source.run.catalogue
     rows = tuple(
@@ -333,7 +334,7 @@ def _candidates(run: RunContents) -> Section:
         for row in run.diagnosis["candidates"]
     )
     table = Display("", head=("effect", "what it is", ">score", ">p"), rows=rows[:SHOWN_CANDIDATES])
-    rest = rows[SHOWN_CANDIDATES:]
+    hidden_rows = rows[SHOWN_CANDIDATES:]
     limits = tuple(
         (
             row["effect"],
@@ -345,7 +346,7 @@ def _candidates(run: RunContents) -> Section:
         for row in run.diagnosis.get("limits", ())
     )
     folded = (
-        Display(f"{len(rest)} more", head=table.head, rows=rest),
+        Display(f"{len(hidden_rows)} more", head=table.head, rows=hidden_rows),
         Display(
             f"{len(limits)} amplitudes that were not found, with the size they stay below with 95 % probability",
             head=("effect", "parameter", ">value", ">σ", ">below (95 %)", "unit"),
@@ -353,7 +354,9 @@ def _candidates(run: RunContents) -> Section:
         ),
     )
     text = "Every effect of the catalogue at the first look at the starting model; p is corrected for their number."
-    return Section("candidates", "Candidates", table, folded=[one for one in folded if one.rows], text=text)
+    return Section(
+        "candidates", "Candidates", table, folded=[display for display in folded if display.rows], text=text
+    )
 
 
 def _limits(run: RunContents) -> list[Display]:
@@ -408,16 +411,16 @@ def _posterior(run: RunContents) -> Section:
 
 def _parameters(run: RunContents, shown: Display) -> Section:
     """The parameters as displayed; behind a line those that a display leaves out."""
-    there = {row[0] for row in shown.rows}
-    rest = []
+    displayed = {row[0] for row in shown.rows}
+    hidden_rows = []
     for name, entry in run.summary["parameters"].items():
-        if name not in there:
+        if name not in displayed:
             value, sigma = value_and_error(entry["value"], entry["sigma"])
-            rest.append((name, value, sigma or "fixed", entry["unit"]))
-    title = f"{len(rest)} more: throughputs of the cameras and fixed values"
-    more = Display(title, head=("parameter", ">value", ">error", "unit"), rows=tuple(rest))
+            hidden_rows.append((name, value, sigma or "fixed", entry["unit"]))
+    title = f"{len(hidden_rows)} more: throughputs of the cameras and fixed values"
+    hidden_table = Display(title, head=("parameter", ">value", ">error", "unit"), rows=tuple(hidden_rows))
     text = names_in_words(run.summary["parameters"])
-    return Section("parameters", "Parameters", shown, folded=[more] if rest else [], text=text)
+    return Section("parameters", "Parameters", shown, folded=[hidden_table] if hidden_rows else [], text=text)
 
 
 def _inputs(summary: Mapping[str, Any]) -> Section:
@@ -464,6 +467,7 @@ OTHERS = {
     "limits": OtherPage(LIMITS, "What these data can show"),
     "survey": OtherPage(SURVEY, "Many nights of one instrument", "trusted"),
     "watch": OtherPage(WATCHED, "Does the calibration still hold?", "holds"),
+    "affected": OtherPage(AFFECTED, "Catalogues that a new calibration changes"),
     "commissioning": OtherPage(COMMISSIONING, "Go or no-go", "go"),
 }
 
@@ -472,22 +476,22 @@ def kind_of_run(folder: Path) -> str:
     """One of `OTHERS` for a folder that holds such a document and no fit to report; else `fit`."""
     if (folder / SUMMARY).exists():
         return "fit"
-    return next((kind for kind, other in OTHERS.items() if (folder / other.file).exists()), "fit")
+    return next((kind for kind, page in OTHERS.items() if (folder / page.file).exists()), "fit")
 
 
 def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
-    """The HTML text of the page about such a folder, and in words what the folder lacks for it.
+    """The HTML text of the page about such a folder, and in words the files that the folder lacks for it.
 
-    Raises `DataError` for a document that cannot be read or lacks what the page shows.
+    Raises `DataError` for a document that cannot be read or lacks contents of the page.
     """
-    other, missing = OTHERS[kind], []
-    document = RunFolder(folder).document(other.file, ("shown",))
-    head = display_of(document, folder / other.file)
+    page, missing = OTHERS[kind], []
+    document = RunFolder(folder).document(page.file, ("shown",))
+    head = display_of(document, folder / page.file)
     pictures = _pictures(folder, kind, document, missing)
     limits = None
     if kind == "plan" and (folder / LIMITS).exists():
         limits = read_limits(folder / LIMITS).display()
-    good = bool(document.get(other.trust, True)) and bool(document.get("new_trusted", True))
+    good = bool(document.get(page.trust, True)) and bool(document.get("new_trusted", True))
     text = filled(
         head,
         (
@@ -497,10 +501,10 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
         ),
         good=good,
         untrusted=not document.get("trusted", document.get("new_trusted", True)),
-        title=other.title,
+        title=page.title,
         about="",
         first="",
-        doubts=[one for one in document.get("warnings", ()) if one not in head.notes],
+        doubts=[warning for warning in document.get("warnings", ()) if warning not in head.notes],
         name=folder.resolve().name,
         next=_AFTER.get(kind, ()),
         missing=missing,
@@ -525,29 +529,29 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
             return []
         return [picture("planned", figures.planned_figure(document["field"]))]
     if kind == "limits":
-        found = read_limits(folder / LIMITS)
-        drawn = {"separation": diagnosis_figures.separation_figure(found)}
-        if found.worst is not None:
-            drawn = {"protection": diagnosis_figures.protection_figure(found)} | drawn
+        results = read_limits(folder / LIMITS)
+        drawn = {"separation": diagnosis_figures.separation_figure(results)}
+        if results.worst is not None:
+            drawn = {"protection": diagnosis_figures.protection_figure(results)} | drawn
         return [picture(name, figure, small=name == "protection") for name, figure in drawn.items()]
     if kind == "epoch":
         return _change_of_the_matrix(folder, document, missing)
     if kind == "survey":
-        found = []
+        results = []
         try:
             tracks = survey_figures.tracks_figure(read_input_table(folder / TRACKS).table, document)
-            found = [] if tracks is None else [picture("tracks", tracks)]
+            results = [] if tracks is None else [picture("tracks", tracks)]
         except DataError as error:
             missing.append(f"Parameters against time are not drawn: {error}.")
-        return [*found, picture("nights", survey_figures.nights_figure(document))]
+        return [*results, picture("nights", survey_figures.nights_figure(document))]
     names = [name for name in CAPTIONS if name.endswith(".png") and name.startswith(kind)]
-    there = [name for name in names if (folder / name).exists()]
-    missing += [f"{name} is not there." for name in names if name not in there]
-    return [Picture(png((folder / name).read_bytes()), CAPTIONS[name]) for name in there]
+    existing = [name for name in names if (folder / name).exists()]
+    missing += [f"{name} is not there." for name in names if name not in existing]
+    return [Picture(png((folder / name).read_bytes()), CAPTIONS[name]) for name in existing]
 
 
 def _change_of_the_matrix(folder: Path, document: Mapping[str, Any], missing: list[str]) -> list[Picture]:
-    """Maps of what has changed of the instrument matrix, if both calibrations are there and worth comparing."""
+    """Maps of the change of the instrument matrix, if both calibrations are there and worth comparing."""
     if document["fits"] is None or document.get("same"):
         return []
     try:

@@ -54,20 +54,25 @@ def retardance_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
     """Maps of the retardance of every half-wave plate over the field at one wavelength, in degrees modulo 360."""
     instrument = calibration.model.instrument(calibration.values)
     names = plate_names(instrument)
-    found = plate_retardances(instrument, np.array([_WAVELENGTH]), *calibration.raster(_PIXELS))[..., 0]
+    retardances = plate_retardances(instrument, np.array([_WAVELENGTH]), *calibration.raster(_PIXELS))[..., 0]
     figure, axes = on.panels(3.9 * len(names), 3.3, 1, len(names), squeeze=False)
-    for name, axis, values in zip(names, axes[0], found, strict=True):
+    for name, axis, values in zip(names, axes[0], retardances, strict=True):
         # Unwrapped: a map that jumps by 360° would show the jump and nothing else.
-        whole = np.unwrap(
+        smooth = np.unwrap(
             np.unwrap(values.reshape(_PIXELS, _PIXELS), axis=1, period=360.0), axis=0, period=360.0
         )
-        whole -= 360.0 * np.floor(whole[_PIXELS // 2, _PIXELS // 2] / 360.0)
+        smooth -= 360.0 * np.floor(smooth[_PIXELS // 2, _PIXELS // 2] / 360.0)
         field_axes(axis, f"{PLATES.get(name, name)} at {1e3 * _WAVELENGTH:.0f} nm")
-        norm = Normalize(float(whole.min()), float(whole.max()))
+        norm = Normalize(float(smooth.min()), float(smooth.max()))
         label = "retardance (deg)" if axis is axes[0, -1] else ""
-        colour_bar(figure, pixel_map(axis, whole, calibration.field, norm, SEQUENTIAL), axis, label)
+        colour_bar(figure, pixel_map(axis, smooth, calibration.field, norm, SEQUENTIAL), axis, label)
         lines = axis.contour(
-            whole, extent=calibration.field, levels=6, colors="w", linewidths=0.5, negative_linestyles="solid"
+            smooth,
+            extent=calibration.field,
+            levels=6,
+            colors="w",
+            linewidths=0.5,
+            negative_linestyles="solid",
         )
         axis.clabel(lines, fontsize=SMALL - 1, fmt=lambda value: with_minus_sign(f"{value:.0f}"))
     outer_labels(axes)
@@ -85,9 +90,9 @@ def retardance_wavelength_figure(calibration: Calibration, on: Canvas = PAGE) ->
     places |= {with_minus_sign(f"X = {x:+.2f}°"): (x, 0.0) for x in (low_x, high_x)}
     places |= {with_minus_sign(f"Y = {y:+.2f}°"): (0.0, y) for y in (low_y, high_y)}
     x, y = (np.array(values) for values in zip(*places.values(), strict=True))
-    found = _unwrapped_retardances(instrument, line, x, y)
+    retardances = _unwrapped_retardances(instrument, line, x, y)
     figure, axes = on.panels(3.9 * len(names), 3.5, 1, len(names), squeeze=False)
-    for name, axis, curves in zip(names, axes[0], found, strict=True):
+    for name, axis, curves in zip(names, axes[0], retardances, strict=True):
         for n, (place, curve) in enumerate(zip(places, curves, strict=True)):
             style = ("-", "--", "-.", ":", (0, (4, 4)))[n]
             axis.plot(1e3 * line, curve, linestyle=style, color=f"C{n}", lw=1.3, label=place)
@@ -112,30 +117,30 @@ def _unwrapped_retardances(
     steps = np.linspace(0.0, 1.0, _STEPS)[:, None]
     along = [(v[0] + steps * (v - v[0])).ravel() for v in (x, y)]
     lines = np.append(_WAVELENGTH, line)
-    found = plate_retardances(instrument, lines, *along).reshape(-1, _STEPS, len(x), len(lines))
-    there = np.unwrap(found[..., 0], axis=1, period=360.0)[:, -1] - 360.0 * np.floor(
-        found[:, :1, 0, 0] / 360.0
+    retardances = plate_retardances(instrument, lines, *along).reshape(-1, _STEPS, len(x), len(lines))
+    at_reference = np.unwrap(retardances[..., 0], axis=1, period=360.0)[:, -1] - 360.0 * np.floor(
+        retardances[:, :1, 0, 0] / 360.0
     )
-    curves = np.unwrap(found[:, -1, :, 1:], axis=-1, period=360.0)
+    curves = np.unwrap(retardances[:, -1, :, 1:], axis=-1, period=360.0)
     near = int(np.argmin(np.abs(line - _WAVELENGTH)))
-    jump = curves[..., near] - there
+    jump = curves[..., near] - at_reference
     return curves - 360.0 * np.round(jump / 360.0)[..., None]
 
 
 @styled
 def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = PAGE) -> AnyFigure:
     """Maps of the ten coefficients of the method of Paper II, a row for q and one for u."""
-    found = fit_paper(calset, filter_name)
+    fits = fit_paper(calset, filter_name)
     figure, axes = on.panels(10.6, 4.3, 2, 5, turned=True, sharex=True, sharey=True)
-    for row, quantity, coefficients in zip(axes, "qu", np.moveaxis(found.coefficients, 1, 0), strict=True):
+    for row, quantity, coefficients in zip(axes, "qu", np.moveaxis(fits.coefficients, 1, 0), strict=True):
         for axis, name, values in zip(row, COEFFICIENTS, coefficients.T, strict=True):
             field_axes(axis, f"{quantity}, {name}{'' if name == COEFFICIENTS[0] else ' term'}")
             low, high = _most(values)  # where an exposure holds no u a few are larger by orders of magnitude
-            whole = low < 0 < high
-            if whole:
+            both_signs = low < 0 < high
+            if both_signs:
                 low, high = -max(-low, high), max(-low, high)
-            colours = DIVERGING if whole else SEQUENTIAL
-            shown = point_map(axis, found.x, found.y, values, Normalize(low, high), colours)
+            colours = DIVERGING if both_signs else SEQUENTIAL
+            shown = point_map(axis, fits.x, fits.y, values, Normalize(low, high), colours)
             colour_bar(figure, shown, axis, extend="both")
     outer_labels(axes)
     return figure
@@ -158,7 +163,7 @@ def transmission_figure(
 ) -> AnyFigure:
     """Share of the light in each camera against the polariser angle at the field point nearest to `place` (deg).
 
-    With the model of Paper II, a constant plus terms in q and u of the polariser, and what it leaves below.
+    With the model of Paper II, a constant plus terms in q and u of the polariser; its residuals below.
     """
     e = calset.exposures
     rows = np.flatnonzero(e.clp_in & ~e.position(CALIBRATION_PLATE).inside & (e.filter == filter_name))
@@ -167,8 +172,8 @@ def transmission_figure(
             f"EXPOSURES: fewer than 3 polariser angles in {filter_name}: nothing to draw a curve through"
         )
     block = calset.intensities.block(0, len(calset.points))
-    whole = np.flatnonzero(block.used[:, rows].all(axis=1))
-    point = whole[np.argmin(np.hypot(block.x[whole] - place[0], block.y[whole] - place[1]))]
+    complete = np.flatnonzero(block.used[:, rows].all(axis=1))
+    point = complete[np.argmin(np.hypot(block.x[complete] - place[0], block.y[complete] - place[1]))]
     angle, counts, sigma = e.clp_angle[rows], block.counts[point, rows], block.sigma[point, rows]
     total = counts.sum(axis=1, keepdims=True)
     model = fit_transmissions(counts[None], polariser_states(angle))
@@ -244,23 +249,23 @@ def map_figure(comparison: Comparison) -> Figure:
 
 @styled
 def offset_figure(comparison: Comparison) -> Figure:
-    """Δq and Δu: against what the weakest direction of the design matrix predicts, and with one exposure more."""
-    found = comparison.offsets
+    """Δq and Δu: against those of the weakest direction of the design matrix, and with one exposure more."""
+    offsets = comparison.offsets
     figure, (left, middle, right) = PAGE.panels(9.6, 3.2, 1, 3)
     for axis, c, name in ((left, 0, "q"), (middle, 1, "u")):
         for along, label, color in (
-            (found.along, "one", "tab:orange"),
-            (found.along_three, "three", "tab:blue"),
+            (offsets.along, "one", "tab:orange"),
+            (offsets.along_three, "three", "tab:blue"),
         ):
-            axis.plot(100 * along[:, c], 100 * found.found[:, c], ".", ms=4, color=color, label=label)
+            axis.plot(100 * along[:, c], 100 * offsets.found[:, c], ".", ms=4, color=color, label=label)
         axis.legend(fontsize=SMALL, title="directions", title_fontsize=SMALL)
-        edge = 105 * np.abs(found.found[:, c]).max()
+        edge = 105 * np.abs(offsets.found[:, c]).max()
         axis.plot([-edge, edge], [-edge, edge], color="0.6", lw=0.8)
         axis.set_xlabel(f"Δ{name} from the weakest directions (%)", fontsize=FONT)
         axis.set_ylabel(f"Δ{name} fitted as in Paper II (%)", fontsize=FONT)
     labels = ("as published", "noise-free states", "one unpolarised\nexposure added")
     for c, name, shift in ((0, "q", -0.15), (1, "u", 0.15)):
-        sizes = [np.sqrt(np.mean(v[:, c] ** 2)) for v in (found.found, found.noiseless, found.anchored)]
+        sizes = [np.sqrt(np.mean(v[:, c] ** 2)) for v in (offsets.found, offsets.noiseless, offsets.anchored)]
         right.bar(np.arange(3) + shift, 100 * np.array(sizes), 0.28, label=f"Δ{name}")
     right.set_yscale("log")
     right.set_xticks(range(3), labels, fontsize=SMALL)

@@ -15,14 +15,7 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.text import RAISED, with_error
-from walop_jax.reports.style import (
-    PAGE,
-    SMALL,
-    AnyFigure,
-    Canvas,
-    PaperFigure,
-    styled,
-)
+from walop_jax.reports.style import PAGE, SMALL, AnyFigure, Canvas, PaperFigure, styled
 
 SHARES = (0.393, 0.865)  # of the draws: inside 1 and 2 σ of a normal distribution of two coefficients
 BINS = 30  # of a histogram, along each axis
@@ -98,8 +91,8 @@ def correlated(
         nearest = size[chosen].max(axis=0)
         nearest[chosen] = -1.0
         chosen.append(int(np.argmax(nearest)))
-    kept = {pool[i] for i in chosen}
-    return tuple(name for name in names if name in kept)
+    shown_names = {pool[i] for i in chosen}
+    return tuple(name for name in names if name in shown_names)
 
 
 @styled
@@ -179,8 +172,8 @@ def trace_figure(
         if np.isfinite(tau[i]):
             bottom = axes.get_ylim()[0]
             axes.plot([0, tau[i]], [bottom, bottom], color="k", linewidth=3, solid_capstyle="butt")
-            said = f"autocorrelation time (bar) {tau[i]:.1f} steps"
-            axes.text(1.0, 1.0, said, transform=axes.transAxes, fontsize=SMALL, ha="right", va="bottom")
+            caption = f"autocorrelation time (bar) {tau[i]:.1f} steps"
+            axes.text(1.0, 1.0, caption, transform=axes.transAxes, fontsize=SMALL, ha="right", va="bottom")
         axes.set_ylabel(label(names[i], units[i]), fontsize=SMALL, rotation=0, ha="right", va="center")
         axes.tick_params(labelsize=SMALL - 1)
         axes.yaxis.set_major_locator(MaxNLocator(3))
@@ -192,7 +185,7 @@ def trace_figure(
 def save_figure(
     path: str | os.PathLike[str], figure: Figure, *, overwrite: bool = False, exact: bool = False
 ) -> None:
-    """Write a figure (format by the name), cut to what is drawn, or of its `exact` size; whole or not at all."""
+    """Write a figure (format by the name), without empty margins, or of its `exact` size; whole or not at all."""
     with atomic_path(path, overwrite=overwrite) as temporary:
         if exact:
             figure.savefig(temporary, dpi=300)

@@ -1,4 +1,4 @@
-"""A run as figures and pages read it: what a figure needs, and the contents of a page, checked against each other."""
+"""A run as figures and pages read it: data of a figure, and contents of a page, checked against each other."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from walop_jax.calibration.calibration import Calibration, Product
 from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.records import CalibrationSet
-from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, figure_data, read_figure_data
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.limits_found import DetectionLimits
@@ -25,7 +24,6 @@ from walop_jax.io.names import (
     CORNER,
     DIAGNOSIS,
     FIGURE_DATA,
-    INTERVALS,
     LIMITS,
     POSTERIOR,
     PRODUCT,
@@ -42,7 +40,7 @@ from walop_jax.science.field_accuracy import FieldAccuracy, field_accuracy
 
 SUMMARY_KEYS = ("chi2", "dof", "n_data", "parameters", "converged", "message", "versions", "inputs")
 DIAGNOSIS_KEYS = ("verdict", "steps", "candidates", "unexplained")
-DEFAULTS: dict[str, Any] = {"warnings": [], "remarks": [], "misfit": None}  # what a summary may lack
+DEFAULTS: dict[str, Any] = {"warnings": [], "remarks": [], "misfit": None}  # keys that a summary may lack
 SAME_CHI2 = 1e-6  # relative difference of χ²/dof of one and the same fit, read from two files
 
 T = TypeVar("T")
@@ -52,7 +50,7 @@ Drawable = FitResult | Calibration | Diagnosis | PosteriorSample | Run
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class FigureSource:
-    """The run, or the result in memory, that a figure is drawn from; a lack of what it needs is a `DataError`.
+    """The run, or the result in memory, that a figure is drawn from; missing data are a `DataError`.
 
     `held` are the contents of a result in memory under the names of the files of a run that would hold them, its data
     as `DATA`; it has no `run`. `sample` is a posterior in memory, which has the walkers as well. `parameters` are
@@ -175,20 +173,20 @@ class FigureSource:
         """Number of the comparison of a diagnosis that is asked for."""
         count = len(self.figure_data.comparisons) - 1
         if self.step > count:
-            found = f"the diagnosis added {count or 'no'} effect{'s' if count != 1 else ''}"
+            result = f"the diagnosis added {count or 'no'} effect{'s' if count != 1 else ''}"
             raise fail(
-                f"step {self.step}: {found}", advice="step 0 compares the starting with the final model"
+                f"step {self.step}: {result}", advice="step 0 compares the starting with the final model"
             )
         return self.step
 
 
 @dataclasses.dataclass(frozen=True)
 class RunContents:
-    """The contents of a run; None for what is not there. `missing` says what that means for a page.
+    """The contents of a run; None for files that are not there. `missing` names their sections of a page.
 
     `source` is what figures are drawn from. `summary`, `diagnosis` and `sample` are the contents of the JSON files;
-    `intervals` are rows of the table of posterior intervals; `corner` are the bytes of a PNG; `limits` is what
-    `limits` has found for the same data, `commissioning` is a go or no-go with its reasons.
+    `corner` are the bytes of a PNG; `limits` are detection limits of the same data, `commissioning` is a go or no-go
+    and its reasons.
     """
 
     source: FigureSource
@@ -197,7 +195,6 @@ class RunContents:
     diagnosis: dict[str, Any] | None
     figure_data: DiagnosisFigureData | None
     sample: dict[str, Any] | None
-    intervals: tuple[dict[str, Any], ...]
     corner: bytes | None
     limits: DetectionLimits | None
     commissioning: dict[str, Any] | None
@@ -234,7 +231,7 @@ def read_run(run: Run | Path) -> RunContents:
         lost = "no maps of the residuals, no curves, no ladder of χ²"
         pictures = optional(FIGURE_DATA, lambda: source.figure_data, lost)
         names = [step["effect"] for step in diagnosis["steps"]]
-        drawn = [] if pictures is None else [one.effect for one in pictures.comparisons[1:]]
+        drawn = [] if pictures is None else [comparison.effect for comparison in pictures.comparisons[1:]]
         if pictures is not None and drawn not in (names, [*names, FreeForm.name]):
             missing.append(
                 f"{FIGURE_DATA} is of another diagnosis than {DIAGNOSIS}: its pictures are left out."
@@ -245,9 +242,8 @@ def read_run(run: Run | Path) -> RunContents:
                 f"{DIAGNOSIS} is of another fit than {SUMMARY}: this folder was written to again since."
             )
     sampled = POSTERIOR in run
-    rest = {
+    extras = {
         "sample": optional(SAMPLE, lambda: run.document(SAMPLE), "no verdict on the sampling", sampled),
-        "intervals": optional(INTERVALS, lambda: _intervals(run), "no table of the posterior", sampled) or (),
         "corner": optional(CORNER, (run.folder / CORNER).read_bytes, "no corner plot", sampled),
         "limits": optional(LIMITS, lambda: _limits(run, summary), "no protection level", False),
         "commissioning": optional(
@@ -262,14 +258,14 @@ def read_run(run: Run | Path) -> RunContents:
             run.calset  # noqa: B018
         except (ValueError, OSError) as error:
             missing.append(f"Residuals are not drawn: {error}.")
-    return RunContents(source, summary, product, diagnosis, pictures, missing=tuple(missing), **rest)
+    return RunContents(source, summary, product, diagnosis, pictures, missing=tuple(missing), **extras)
 
 
 def read_limits(path: Path) -> DetectionLimits:
     """The content of a `limits.json`. Raises `DataError` if it is none."""
     try:
-        found = RunFolder(path.parent).document(path.name, ("limits", "effects", "protection"))
-        return DetectionLimits.from_document(found)
+        content = RunFolder(path.parent).document(path.name, ("limits", "effects", "protection"))
+        return DetectionLimits.from_document(content)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise fail(
             f"is not what walop-jax limits writes: {error}", file=path, advice="run it again"
@@ -279,30 +275,14 @@ def read_limits(path: Path) -> DetectionLimits:
 def _limits(run: Run, summary: dict[str, Any]) -> DetectionLimits:
     """The limits of the data behind a summary; those of other data are refused."""
     documents = run.document(LIMITS, ("inputs",)), summary
-    of, wanted = ({entry["sha256"] for entry in document["inputs"]} for document in documents)
+    of, expected = ({entry["sha256"] for entry in document["inputs"]} for document in documents)
     path = run.folder / LIMITS
-    if of != wanted:
+    if of != expected:
         raise fail("is of other data", file=path, advice="run walop-jax limits on the sets of this run")
     return read_limits(path)
 
 
 def _another_fit(summary: dict[str, Any], diagnosis: dict[str, Any]) -> bool:
-    said = diagnosis.get("chi2_per_dof_after")
+    stated = diagnosis.get("chi2_per_dof_after")
     ratio = summary["chi2"] / max(summary["dof"], 1)
-    return said is not None and abs(said - ratio) > SAME_CHI2 * ratio
-
-
-def _intervals(run: Run) -> tuple[dict[str, Any], ...]:
-    """Rows of the sampled coefficients: those that have an effective sample size."""
-    path = run.folder / INTERVALS
-    table = read_input_table(path).table
-    names = ("NAME", "UNIT", "MEDIAN", "LOW68", "HIGH68", "LOW95", "HIGH95", "ESS")
-    lacking = [name for name in names if name not in table.colnames]
-    if lacking:
-        raise fail("the column is missing", file=path, column=lacking[0])
-    # An empty text comes back masked.
-    columns = {
-        name: np.ma.filled(np.ma.asarray(table[name]), "" if name in names[:2] else np.nan) for name in names
-    }
-    rows = [{name: column[i] for name, column in columns.items()} for i in range(len(table))]
-    return tuple(row for row in rows if np.isfinite(float(row["ESS"])))
+    return stated is not None and abs(stated - ratio) > SAME_CHI2 * ratio

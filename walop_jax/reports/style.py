@@ -54,7 +54,7 @@ Map = Float[np.ndarray, "y x"]
 Maps = Float[np.ndarray, "m y x"]
 Field = tuple[float, float, float, float]
 AnyFigure = Any
-"""A figure, or the subfigure that took the room of axes: what is drawn on a `Canvas`."""
+"""A figure on a `Canvas`, or the subfigure that took the room of axes."""
 
 
 def own_style() -> contextlib.AbstractContextManager[None]:
@@ -122,7 +122,7 @@ class Canvas:
     ) -> tuple[Any, Any]:
         """A figure, and panels in it with small numbers, as `subplots` makes them.
 
-        `least` is the width (inches) of the narrowest panel that can be read, `labels` the height of what is written
+        `least` is the width (inches) of the narrowest panel that can be read, `labels` the height of the labels
         around each at any size; where columns are narrower, rows become
         columns (`turned`), or groups of columns go below each other.
         """
@@ -130,12 +130,12 @@ class Canvas:
         group = columns
         if turned:
             rows, columns, group = columns, rows, rows
-            other = {"row": "col", "col": "row"}
-            options |= {key: other.get(str(value), value) for key, value in options.items() if key in SHARED}
+            swap = {"row": "col", "col": "row"}
+            options |= {key: swap.get(str(value), value) for key, value in options.items() if key in SHARED}
         elif self._narrow(columns, least) and "width_ratios" not in options:
             fitting = [n for n in range(1, columns) if not self._narrow(n, least)]
-            whole = [n for n in fitting if columns % n == 0] if rows > 1 else fitting
-            group = whole[-1]
+            divisors = [n for n in fitting if columns % n == 0] if rows > 1 else fitting
+            group = divisors[-1]
             if "height_ratios" in options:
                 options["height_ratios"] = [*options["height_ratios"]] * (columns // group)
         groups = -(-columns // group)
@@ -181,12 +181,12 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def draw(*args: P.args, **options: P.kwargs) -> T:
-        given = (one.ax for one in (*args, *options.values()) if isinstance(one, Canvas))
-        if any(ax is not None for ax in given):
+        axes = (arg.ax for arg in (*args, *options.values()) if isinstance(arg, Canvas))
+        if any(ax is not None for ax in axes):
             return function(*args, **options)
         with own_style():
             figure = function(*args, **options)
-            if any(isinstance(one, Canvas) and one.width is not None for one in (*args, *options.values())):
+            if any(isinstance(arg, Canvas) and arg.width is not None for arg in (*args, *options.values())):
                 _in_print(figure)
             return figure
 
@@ -260,17 +260,17 @@ def point_map(
     """
     shown = np.ones(len(x), bool) if shown is None else shown
     size = _spacing(x[shown], y[shown])
-    known = shown & np.isfinite(values)
-    corners = zip(x[known] - 0.5 * size, y[known] - 0.5 * size, strict=True)
+    visible = shown & np.isfinite(values)
+    corners = zip(x[visible] - 0.5 * size, y[visible] - 0.5 * size, strict=True)
     # Edges in the colour of the tile close the seams that viewers leave between neighbours.
     tiles = PatchCollection(
         [Rectangle(corner, size, size) for corner in corners],
         cmap=colours, norm=norm, edgecolor="face", linewidth=0.3,
     )  # fmt: skip
-    tiles.set_array(values[known])
-    tiles.set_rasterized(bool(known.sum() > MOST_VECTOR))
+    tiles.set_array(values[visible])
+    tiles.set_rasterized(bool(visible.sum() > MOST_VECTOR))
     axis.add_collection(tiles)
-    _set_limits(axis, *((float(one[shown].min()), float(one[shown].max())) for one in (x, y)))
+    _set_limits(axis, *((float(v[shown].min()), float(v[shown].max())) for v in (x, y)))
     return tiles
 
 
@@ -329,7 +329,7 @@ def calendar(axis: Axes, mjd: Any) -> bool:
 
 
 def day_of(mjd: Any) -> Any:
-    """Days of matplotlib (since 1970) of MJD; what is no MJD, the number of an exposure group, stays."""
+    """Days of matplotlib (since 1970) of MJD; numbers of exposure groups stay as they are."""
     mjd = np.asarray(mjd, float)
     return mjd - 40587.0 if mjd.size and np.nanmin(mjd) > EARLIEST else mjd
 
@@ -357,7 +357,7 @@ def plain(value: float, digits: int = 2) -> str:
 def largest_size(*maps: Any) -> float:
     """The largest size of any finite value: the end of a symmetric scale that all of the maps share."""
     sizes = [np.abs(values[np.isfinite(values)]) for values in map(np.asarray, maps)]
-    return max((float(one.max()) for one in sizes if one.size), default=0.0) or 1.0
+    return max((float(size.max()) for size in sizes if size.size), default=0.0) or 1.0
 
 
 def rounded_up(value: float) -> float:

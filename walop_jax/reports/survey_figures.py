@@ -8,17 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from walop_jax.reports.style import (
-    AFTER,
-    BEFORE,
-    FONT,
-    PAGE,
-    QUIET,
-    SMALL,
-    calendar,
-    day_of,
-    styled,
-)
+from walop_jax.reports.style import AFTER, BEFORE, FONT, PAGE, QUIET, SMALL, calendar, day_of, styled
 from walop_jax.science.quality import ERRORS, GAIN, OUTSIDE, Limits
 from walop_jax.science.watch_found import Watch
 
@@ -29,13 +19,13 @@ MOST = 8  # parameters in a figure
 def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
     """Parameters whose law lets them change, against time; None where there is none.
 
-    The band is the value under the law with its error, dots what each night would have by itself. A step is a step:
+    The band is the value under the law with its error, dots the value of each night alone. A step is a step:
     grey across is the time in which it can have been; dashed lines are other breaks of that parameter, dotted ones the
     events that the user wrote down.
     """
-    found = document["breaks"]
-    laws = [name for name in document["laws"] if name not in {one["name"] for one in found}]
-    names = [*dict.fromkeys(one["name"] for one in found), *laws][:MOST]
+    broken = document["breaks"]
+    laws = [name for name in document["laws"] if name not in {entry["name"] for entry in broken}]
+    names = [*dict.fromkeys(entry["name"] for entry in broken), *laws][:MOST]
     if not names:
         return None
     count = len(names)
@@ -45,11 +35,11 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
         mjd, value, error, alone, alone_error = (
             np.asarray(rows[key], float) for key in ("MJD", "VALUE", "ERROR", "DEVIATION", "DEVIATION_ERR")
         )
-        breaks = [one for one in found if one["name"] == name and one["kind"] != "drift"]
-        steps = sorted(one["date"] for one in breaks if one["kind"] == "step")
-        time, parts = day_of(mjd), np.searchsorted(steps, mjd)
-        for part in range(len(steps) + 1):
-            at = parts == part
+        breaks = [entry for entry in broken if entry["name"] == name and entry["kind"] != "drift"]
+        steps = sorted(entry["date"] for entry in breaks if entry["kind"] == "step")
+        time, segments = day_of(mjd), np.searchsorted(steps, mjd)
+        for segment in range(len(steps) + 1):
+            at = segments == segment
             axis.fill_between(
                 time[at], (value - error)[at], (value + error)[at], color=AFTER, alpha=0.3, lw=0
             )
@@ -57,11 +47,11 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
         axis.errorbar(
             time, value + alone, alone_error, fmt="o", ms=2.5, mfc="white", lw=0.7, color="0.45", zorder=1.5
         )
-        for one in breaks:
-            if one["kind"] == "step":
-                axis.axvspan(*day_of([one["before"], one["after"]]), color=QUIET, lw=0, zorder=0)
+        for entry in breaks:
+            if entry["kind"] == "step":
+                axis.axvspan(*day_of([entry["before"], entry["after"]]), color=QUIET, lw=0, zorder=0)
             else:
-                axis.axvline(float(day_of(one["before"])), color=BEFORE, lw=0.9, ls="--")
+                axis.axvline(float(day_of(entry["before"])), color=BEFORE, lw=0.9, ls="--")
         _events(axis, document["events"])
         unit = str(rows["UNIT"][0]) if len(rows) else ""
         axis.set_ylabel(f"{name}\n{f'({unit})' if unit else ''}".strip(), fontsize=SMALL)
@@ -94,9 +84,11 @@ def watch_figure(found: Watch) -> Figure:
     figure, axes = PAGE.panels(6.0, 1.1 + 1.3 * count, count, 1, sharex=True, sharey=True, squeeze=False)
     named = {change.camera for change in found.changes}
     for k, axis in enumerate(axes[:, 0]):
-        gain, error, seen = (100.0 * values[:, k] for values in (found.gain, found.error, found.smallest))
+        gain, error, detectable = (
+            100.0 * values[:, k] for values in (found.gain, found.error, found.smallest)
+        )
         time = day_of(found.time)
-        axis.fill_between(time, -seen, seen, color=QUIET, lw=0, step=None)
+        axis.fill_between(time, -detectable, detectable, color=QUIET, lw=0, step=None)
         colour = BEFORE if found.cameras[k] in named else AFTER
         axis.errorbar(time, gain, error, fmt="o", ms=3, lw=1, color=colour)
         for change in found.changes:

@@ -26,10 +26,10 @@ def effect_in_words(name: str, catalogue: Iterable[EffectKind] = EFFECTS) -> str
     """A few words on an effect that may stand inside a sentence; empty for a name that is not in the catalogue."""
     if name == FreeForm.name:
         return "unidentified patterns"
-    known = next((entry for entry in catalogue if entry.name == name), None)
-    if known is None:
+    kind = next((entry for entry in catalogue if entry.name == name), None)
+    if kind is None:
         return ""
-    text = (known.__doc__ or "").strip().splitlines()[0].rstrip(".")
+    text = (kind.__doc__ or "").strip().splitlines()[0].rstrip(".")
     return text if text.startswith(_PROPER) else text[:1].lower() + text[1:]
 
 
@@ -45,8 +45,8 @@ def hidden_in_words(summary: Mapping[str, Any]) -> str:
         f"{entry['name']} ({rounded(entry['size'], '.2g')} {entry['unit']})".replace(" )", ")")
         for entry in entries
     ]
-    told = "Mistakes larger than the errors that these data would not show, up to the size in brackets"
-    return f"{told}: {listed(sizes)}." if sizes else ""
+    lead = "Mistakes larger than the errors that these data would not show, up to the size in brackets"
+    return f"{lead}: {listed(sizes)}." if sizes else ""
 
 
 _MJD_0 = datetime.datetime(1858, 11, 17)
@@ -88,8 +88,8 @@ def data_in_words(product: Calibration | Product) -> tuple[tuple[str, str], ...]
 
 
 def _nights(mjd: Float[np.ndarray, " e"], longitude: float) -> str:
-    known = np.unique(night_of(mjd[np.isfinite(mjd)], longitude))
-    days = [(_MJD_0 + datetime.timedelta(days=float(day))).date().isoformat() for day in known]
+    evenings = np.unique(night_of(mjd[np.isfinite(mjd)], longitude))
+    days = [(_MJD_0 + datetime.timedelta(days=float(day))).date().isoformat() for day in evenings]
     if not days:
         return "not recorded"
     return days[0] if len(days) == 1 else f"{len(days)}, {days[0]} to {days[-1]}"
@@ -105,15 +105,15 @@ def _angles(angles: Float[np.ndarray, " a"]) -> str:
 
 
 def _settings(angles: Float[np.ndarray, " a"], out: bool) -> str:
-    found = (["out"] if out else []) + [f"{angle:g}°" for angle in np.unique(np.round(angles, 3))]
-    return some(found, _MANY)
+    texts = (["out"] if out else []) + [f"{angle:g}°" for angle in np.unique(np.round(angles, 3))]
+    return some(texts, _MANY)
 
 
 def _range(values: Float[np.ndarray, " e"], unit: str) -> str:
-    known = values[np.isfinite(values)]
-    if known.size == 0:
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
         return "not recorded"
-    low, high = f"{known.min():.1f}", f"{known.max():.1f}"
+    low, high = f"{finite.min():.1f}", f"{finite.max():.1f}"
     return with_minus_sign(f"{low} {unit}" if low == high else f"{low} to {high} {unit}")
 
 
@@ -128,20 +128,20 @@ PLACES = {
 def names_in_words(names: Iterable[str]) -> str:
     """Meanings of the first parts of names of parameters, where that is no word of its own."""
     used = {name.partition(".")[0] for name in names}
-    found = [words for part, words in PLACES.items() if part in used]
-    return f"Parts of parameter names: {'; '.join(found)}." if found else ""
+    meanings = [words for prefix, words in PLACES.items() if prefix in used]
+    return f"Parts of parameter names: {'; '.join(meanings)}." if meanings else ""
 
 
 def symbols_in_words(names: Sequence[str]) -> str:
     """The symbols that figures of a posterior use, with the names they stand for."""
     greek = {"\\delta": "δ", "\\kappa": "κ", "\\eta": "η", "\\ln": "ln"}
-    found = []
+    symbols = []
     for name in names:
         symbol = re.sub(r"[${}]", "", LABELS.get(name, ""))
         for code, letter in greek.items():
             symbol = symbol.replace(code, letter)
-        found += [f"{symbol} {name}"] if symbol else []
-    return f" Symbols: {', '.join(found)}." if found else ""
+        symbols += [f"{symbol} {name}"] if symbol else []
+    return f" Symbols: {', '.join(symbols)}." if symbols else ""
 
 
 _RESIDUALS = "Residuals (data − model) over the field in the cameras"

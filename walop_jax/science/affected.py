@@ -32,6 +32,7 @@ MOST = 0.95  # share of the stars of a night that may shift by no more than the 
 class NightShift(NamedTuple):
     """Stars of a night in one catalogue: their shift (standard errors), and the mean shift of q and u themselves.
 
+    The mean is weighted by the old errors: where q or u is hardly measured, shifts are large and mean nothing.
     `night` is the MJD of the evening, NaN where the catalogue has no times. `lost` stars have a result by the old
     calibration alone, `gained` ones by the new one alone, `beyond` ones have settings that the new one does not cover.
     """
@@ -95,7 +96,7 @@ class Affected(Displayed):
                 f"{night.night:.0f}" if np.isfinite(night.night) else "",
                 f"{night.stars}",
                 *map(two_digits, (night.median, night.most, night.largest)),
-                *(f"{100 * one:+.4f} %" for one in (night.q, night.u)),
+                *(f"{100 * mean:+.4f} %" for mean in (night.q, night.u)),
                 self._reason(night),
             )
             for night in self.nights
@@ -117,8 +118,8 @@ def affected(
     np.fmin.at(time, catalogue.star, catalogue.time)
     evening = night_of(time, old.site.longitude)
     for night in np.unique(evening):
-        here = evening == night if np.isfinite(night) else np.isnan(evening)
-        yield _night(before, after, here, beyond, (name, float(night)), limit)
+        of_night = evening == night if np.isfinite(night) else np.isnan(evening)
+        yield _night(before, after, of_night, beyond, (name, float(night)), limit)
 
 
 def _night(
@@ -129,17 +130,22 @@ def _night(
     which: tuple[str, float],
     limit: float,
 ) -> NightShift:
-    there, then = (~np.isnan(one.qu).any(axis=1) & here for one in (before, after))
-    both = there & then
-    z = shift(before, after)[both]
-    mean = (after.qu - before.qu)[both].mean(axis=0) if both.any() else np.zeros(2)
-    median, most, largest = np.quantile(z, [0.5, MOST, 1.0]) if z.size else np.zeros(3)
-    lost, gained = int((there & ~then).sum()), int((then & ~there).sum())
+    measured_before, then = (~np.isnan(stars.qu).any(axis=1) & here for stars in (before, after))
+    measured_twice = measured_before & then
+    z = shift(before, after)[measured_twice]
+    weight = 1.0 / np.diagonal(before.covariance[measured_twice], axis1=1, axis2=2)
+    mean = (
+        np.average((after.qu - before.qu)[measured_twice], axis=0, weights=weight)
+        if measured_twice.any()
+        else np.zeros(2)
+    )
+    median, quantile, largest = np.quantile(z, [0.5, MOST, 1.0]) if z.size else np.zeros(3)
+    lost, gained = int((measured_before & ~then).sum()), int((then & ~measured_before).sum())
     return NightShift(
         *which,
         stars=int(here.sum()),
         median=float(median),
-        most=float(most),
+        most=float(quantile),
         largest=float(largest),
         q=float(mean[0]),
         u=float(mean[1]),
@@ -147,22 +153,22 @@ def _night(
         lost=lost,
         gained=gained,
         beyond=int((beyond & here).sum()),
-        again=bool(most > limit) or lost + gained > 0 or verdicts_differ(before, after),
+        again=bool(quantile > limit) or lost + gained > 0 or verdicts_differ(before, after),
     )
 
 
 def shift(before: Stars, after: Stars) -> Float[np.ndarray, " s"]:
     """Shift of every star in standard errors of `before`, in the worst direction of (q, u); NaN without a result."""
     change = after.qu - before.qu
-    known = np.isfinite(change).all(axis=1)
+    measured = np.isfinite(change).all(axis=1)
     square = np.full(len(change), np.nan)
-    inverse = np.linalg.inv(before.covariance[known])
-    square[known] = np.einsum("si,sij,sj->s", change[known], inverse, change[known])
+    inverse = np.linalg.inv(before.covariance[measured])
+    square[measured] = np.einsum("si,sij,sj->s", change[measured], inverse, change[measured])
     return np.sqrt(square)
 
 
 def verdicts_differ(before: Stars, after: Stars) -> bool:
     """True where one of the calibrations says of all stars that it is not to be trusted, and the other does not."""
     bad = Quality.NOT_CONVERGED | Quality.UNEXPLAINED
-    first, second = (int(np.bitwise_and.reduce(one.flag)) & bad for one in (before, after))
+    first, second = (int(np.bitwise_and.reduce(stars.flag)) & bad for stars in (before, after))
     return first != second

@@ -1,7 +1,7 @@
 """A calibration applied to a science catalogue: q, u of every star with errors of photons and calibration.
 
-Rows are taken star by star in blocks that fit into memory. What is computed for a star does not depend on what else is
-in the catalogue, until all of it is looked at together (`catalogue_check`): then errors grow for all stars by what
+Rows are taken star by star in blocks that fit into memory. The result of a star does not depend on the rest of
+the catalogue, until all of it is looked at together (`catalogue_check`): then errors grow for all stars by what
 that has found.
 """
 
@@ -30,6 +30,7 @@ from walop_jax.science.detectors import detector_slopes, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
 from walop_jax.science.left_over_sky import with_sky
 from walop_jax.science.star_residuals import StarResiduals
+from walop_jax.sky.moon import sky_to_instrument
 
 STAR_SAMPLE = 16384
 """Rows of a catalogue, spread over it, by which the whole of it is judged: they see a camera that has changed by a
@@ -57,12 +58,12 @@ class Stars:
 
     On the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere. `covariance`
     is the sum of `photon`, `calibration` (parameters of the optics and of the detectors), `spectrum`: a TEFF has its
-    error, a star without one the colour of a population (`COOL`, `HOT`), and `changed`: what the whole catalogue says
-    has changed since the calibration. `colour` is the error of (q, u) if TEFF were ignored; without TEFF, half the
-    difference between stars of 3500 K and 10 000 K. `hidden` is the largest shift of q and u by a single mistake
-    that the data of the calibration would not have shown (NaN: nobody asked). `flag` holds bits of `Quality`;
-    `rows` counts the rows of a star. `check` is what all stars say together, `sky_bound` the largest shift by light of
-    the sky left over that they do not exclude (None: the level of the sky is not stated).
+    error, a star without one the colour of a population (`COOL`, `HOT`), and `changed`: changes since the calibration
+    that the whole catalogue shows. `colour` is the error of (q, u) if TEFF were ignored; without TEFF, half the
+    difference between stars of 3500 K and 10 000 K. `hidden` is the largest shift of q and u by a single mistake that
+    the data of the calibration would not have shown (NaN: nobody asked). `flag` holds bits of `Quality`; `rows` counts
+    the rows of a star. `check` is that of all stars together, `sky_bound` the largest shift by light of the sky left
+    over that they do not exclude (None: the level of the sky is not stated).
     """
 
     qu: Float[np.ndarray, "s 2"]
@@ -95,19 +96,19 @@ def apply(
     """Stokes parameters of all stars of a catalogue.
 
     `progress` is told how many rows of how many are done. Raises `DataError` for a filter that nobody knows, for a
-    catalogue with more optical settings than can be tabulated, and, unless `force` is given, for what the calibration
-    does not cover (`check_validity`).
+    catalogue with more optical settings than can be tabulated, and, unless `force` is given, for settings that the
+    calibration does not cover (`check_validity`).
     """
     work = _Application(AnalysisVectors(calibration), catalogue, force=force)
     chosen = work.sample(STAR_SAMPLE)
-    parts, watched = [], []
+    blocks, watched = [], []
     for done, rows in work.blocks():
         block = work.block(rows)
-        parts.append(block.stars)
+        blocks.append(block.stars)
         watched += work.residuals(block, chosen)
         if progress is not None:
             progress(done, len(catalogue))
-    return with_sky(work.together(_joined(parts), work.checked(watched, chosen)), catalogue)
+    return with_sky(work.together(_joined(blocks), work.checked(watched, chosen)), catalogue)
 
 
 def results_of(calibration: Calibration, catalogue: Catalogue) -> Stars:
@@ -118,7 +119,7 @@ def results_of(calibration: Calibration, catalogue: Catalogue) -> Stars:
 
 def _joined(parts: list[Stars]) -> Stars:
     columns = [f.name for f in dataclasses.fields(Stars) if f.name not in ("check", "sky_bound")]
-    return Stars(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))  # pyright: ignore[reportArgumentType]
+    return Stars(*(np.concatenate([getattr(stars, name) for stars in parts]) for name in columns))  # pyright: ignore[reportArgumentType]
 
 
 def residuals_of(
@@ -130,7 +131,11 @@ def residuals_of(
     """
     work = _Application(vectors, catalogue, force=force)
     chosen = work.sample(rows)
-    return [part for _, here in work.blocks() for part in work.residuals(work.block(here), chosen)]
+    return [
+        residuals
+        for _, rows_there in work.blocks()
+        for residuals in work.residuals(work.block(rows_there), chosen)
+    ]
 
 
 class _Block(NamedTuple):
@@ -176,54 +181,58 @@ class _Application:
         outside = self.outside(rows)
         x, y = (np.where(outside, 0.0, values[rows]) for values in (points.x, points.y))
         teff, sky = points.settings.teff[rows], np.isfinite(catalogue.rotator[rows])
-        turn = 2.0 * np.where(sky, np.deg2rad(catalogue.rotator[rows]) + self.offset, 0.0)
+        rotator = np.where(sky, catalogue.rotator[rows] + np.rad2deg(self.offset), 0.0)
 
         spectra = np.empty((len(rows), COLOURS + 1, vectors.cameras, 3))
-        for k, here in _rows_by_setting(setting_of):
-            spectra[here] = vectors.at(self.settings[k], x[here], y[here])
-        there = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
+        for k, same in _rows_by_setting(setting_of):
+            spectra[same] = vectors.at(self.settings[k], x[same], y[same])
+        mixed = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
         used = np.where(outside[:, None], np.nan, counts)
-        on_sky = _vectors_on_sky(there, turn)
-        found = estimate(on_sky, used, sigma, star, vectors.instrument.cameras)
+        # Of light with (q + iu) exp(−2iR) in the instrument frame: the vectors turn the other way.
+        axes = sky_to_instrument(mixed[..., 1], mixed[..., 2], -rotator[:, None])
+        on_sky = np.stack([mixed[..., 0], *axes], axis=-1)
+        fitted = estimate(on_sky, used, sigma, star, vectors.instrument.cameras)
 
-        s = _instrument_stokes(found.qu[star], turn)
+        s = np.stack(
+            [np.ones(len(rows)), *sky_to_instrument(fitted.qu[star, 0], fitted.qu[star, 1], rotator)], axis=1
+        )
         # Of the model per unit flux, to the plain parameters and to the throughputs.
         plain = np.empty((len(rows), vectors.cameras, vectors.plain))
         throughput = np.empty((len(rows), vectors.cameras, vectors.cameras))
         derivative = np.empty((len(rows), 2, len(vectors.parameters)))
-        for k, here in _rows_by_setting(setting_of):
-            local = vectors.derivatives(self.settings[k], x[here], y[here], teff[here])
-            plain[here], throughput[here] = (np.einsum("rs,rksf->rkf", s[here], part) for part in local)
-            gain = found.gain[here]
-            derivative[here] = vectors.to_parameters(
-                gain @ plain[here], gain @ throughput[here], x[here], y[here]
+        for k, same in _rows_by_setting(setting_of):
+            local = vectors.derivatives(self.settings[k], x[same], y[same], teff[same])
+            plain[same], throughput[same] = (np.einsum("rs,rksf->rkf", s[same], slopes) for slopes in local)
+            gain = fitted.gain[same]
+            derivative[same] = vectors.to_parameters(
+                gain @ plain[same], gain @ throughput[same], x[same], y[same]
             )
-        lit = np.where(found.flux > 0, found.flux, np.inf)
+        lit = np.where(fitted.flux > 0, fitted.flux, np.inf)
         for p, change in detector_slopes(vectors, counts):
             change = np.nan_to_num(change) / lit[:, None]
             plain[..., p] -= change
-            derivative[..., p] -= np.einsum("rik,rk->ri", found.gain, change)
+            derivative[..., p] -= np.einsum("rik,rk->ri", fitted.gain, change)
         if self.slope.any():
-            derivative += (found.gain @ _turned(s, there, sky)[..., None]) * self.slope
+            derivative += (fitted.gain @ _turned(s, mixed, sky)[..., None]) * self.slope
         derivative = np.add.reduceat(-derivative, first)
         hidden = _hidden(
-            vectors, derivative, self.shift_by_effects(rows, s, there, sky, found.gain, first, x, y)
+            vectors, derivative, self.shift_by_effects(rows, s, mixed, sky, fitted.gain, first, x, y)
         )
         root = derivative @ vectors.root
         calibration = root @ root.swapaxes(1, 2)
         structure = vectors.calibration.verdict.structure
         if structure:
             # A gain of every camera at the place of the star, the same in all of its rows.
-            lit = np.einsum("rks,rs->rk", there, s)
-            each = calibration_shift(found.gain, lit[:, :, None] * np.eye(vectors.cameras), star)
-            square = structure.gain**2 + structure.response**2 * np.sum(found.qu**2, axis=1)
-            calibration = calibration + square[:, None, None] * (each @ each.swapaxes(1, 2))
+            lit = np.einsum("rks,rs->rk", mixed, s)
+            gain_shift = calibration_shift(fitted.gain, lit[:, :, None] * np.eye(vectors.cameras), star)
+            square = structure.gain**2 + structure.response**2 * np.sum(fitted.qu**2, axis=1)
+            calibration = calibration + square[:, None, None] * (gain_shift @ gain_shift.swapaxes(1, 2))
 
         def change_of(weights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r k"]:
             return np.einsum("rc,rcks,rs->rk", weights, spectra, s, optimize=True)
 
         def shift(change: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "s 2"]:
-            return calibration_shift(found.gain, change[..., None], star)[..., 0]
+            return calibration_shift(fitted.gain, change[..., None], star)[..., 0]
 
         nothing = np.zeros_like(calibration)
         spectrum, colour = nothing, np.zeros((len(rows), vectors.cameras, 2))
@@ -232,23 +241,23 @@ class _Application:
             colour = np.stack([change_of(weights) for weights in _unsure_colour(teff, teff_err)], axis=-1)
             mean, width = (shift(colour[..., n]) for n in range(2))
             spectrum = mean[:, :, None] * mean[:, None] + width[:, :, None] * width[:, None]
-        flag = self.flags(rows, used, first, found)
-        others = np.trace(found.photon + calibration, axis1=1, axis2=2)
-        flag[np.trace(spectrum, axis1=1, axis2=2) > others] |= Quality.UNKNOWN_COLOUR
+        flag = self.flags(rows, used, first, fitted)
+        other_causes = np.trace(fitted.photon + calibration, axis1=1, axis2=2)
+        flag[np.trace(spectrum, axis1=1, axis2=2) > other_causes] |= Quality.UNKNOWN_COLOUR
         stars = Stars(
-            qu=found.qu,
-            photon=found.photon,
+            qu=fitted.qu,
+            photon=fitted.photon,
             calibration=calibration,
             spectrum=spectrum,
             changed=nothing,
             colour=shift(change_of(_ignored_colour(teff))),
             hidden=hidden,
-            chi2=found.chi2,
-            dof=found.dof,
+            chi2=fitted.chi2,
+            dof=fitted.dof,
             rows=np.add.reduceat((~catalogue.copy[rows]).astype(int), first),
             flag=flag,
         )
-        return _Block(rows, star, stars, found, on_sky, sigma, plain, throughput, colour, derivative)
+        return _Block(rows, star, stars, fitted, on_sky, sigma, plain, throughput, colour, derivative)
 
     def shift_by_effects(
         self,
@@ -266,14 +275,15 @@ class _Application:
         `s` are the Stokes parameters of the rows in the instrument frame, `there` the vectors.
         """
         vectors, lit = self.vectors, {}
-        for k, here in _rows_by_setting(self.setting_of[rows]):
-            for number, added in vectors.added(self.settings[k], x[here], y[here]).items():
-                whole = lit.setdefault(number, np.zeros((len(rows), vectors.cameras)))
-                whole[here] = np.einsum("rs,rks->rk", s[here], added)
+        for k, same in _rows_by_setting(self.setting_of[rows]):
+            for number, added in vectors.added(self.settings[k], x[same], y[same]).items():
+                total = lit.setdefault(number, np.zeros((len(rows), vectors.cameras)))
+                total[same] = np.einsum("rs,rks->rk", s[same], added)
         for number, turn in vectors.turns.items():
             lit[number] = lit.get(number, 0.0) + turn * _turned(s, there, sky)
         return {
-            number: np.add.reduceat(-(gain @ one[..., None])[..., 0], first) for number, one in lit.items()
+            number: np.add.reduceat(-(gain @ change[..., None])[..., 0], first)
+            for number, change in lit.items()
         }
 
     def outside(self, rows: Int[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:
@@ -339,7 +349,7 @@ class _Application:
         model, scale = flux * unit, (flux * root)[..., None]
         tangent = project_flux(np.moveaxis(scale * a[..., 1:], -1, 0), model, False, shared)
         x, y = catalogue.points.x[rows], catalogue.points.y[rows]
-        left = StarResiduals(
+        residuals = StarResiduals(
             star=np.unique(block.star[r], return_inverse=True)[1],
             residual=residual,
             model=model,
@@ -356,7 +366,7 @@ class _Application:
             together=vectors.instrument.cameras.together,
             structure=vectors.calibration.verdict.structure.gain,
         )
-        return [left]
+        return [residuals]
 
     def checked(self, watched: list[StarResiduals], chosen: Bool[np.ndarray, " s"]) -> CatalogueCheck:
         """Check of all stars together; `chosen` are those whose residuals are `watched`.
@@ -377,25 +387,25 @@ class _Application:
             values = vectors.calibration.values.copy()
             values[vectors.parameters] += vectors.root @ errors
             moved = dataclasses.replace(vectors.calibration, values=values)
-            seen = self.catalogue.of_rows(chosen[self.catalogue.star])
-            left = residuals_of(AnalysisVectors(moved), seen, len(seen), force=True)
-            there = StarResiduals.joined(left) if left else None
-            same = there is not None and there.residual.shape == search.stars.residual.shape
-            if there is None or (same and search.bend(errors, there.residual) < _STRAIGHT):
+            sample = self.catalogue.of_rows(chosen[self.catalogue.star])
+            residuals = residuals_of(AnalysisVectors(moved), sample, len(sample), force=True)
+            joined = StarResiduals.joined(residuals) if residuals else None
+            same = joined is not None and joined.residual.shape == search.stars.residual.shape
+            if joined is None or (same and search.bend(errors, joined.residual) < _STRAIGHT):
                 break
-            search = CatalogueSearch(there, names, vectors.named, vectors.root, errors)
+            search = CatalogueSearch(joined, names, vectors.named, vectors.root, errors)
             check = search.answer()
         return check
 
     def together(self, stars: Stars, check: CatalogueCheck) -> Stars:
-        """The stars with errors, and a bit of FLAG, that hold what all of them say together."""
+        """The stars with the errors, and a bit of FLAG, of the check of all of them."""
         if check.holds:
             return dataclasses.replace(stars, check=check)
         changed, flag = stars.changed, stars.flag
         if check.changes or check.places:
-            found = [self._changed(self.block(rows), check) for _, rows in self.blocks()]
-            changed = np.concatenate([part for part, _ in found])
-            flag = np.where(np.concatenate([near for _, near in found]), flag | Quality.PLACE, flag)
+            of_blocks = [self._changed(self.block(rows), check) for _, rows in self.blocks()]
+            changed = np.concatenate([added for added, _ in of_blocks])
+            flag = np.where(np.concatenate([near for _, near in of_blocks]), flag | Quality.PLACE, flag)
         if check.holds_elsewhere:
             return dataclasses.replace(stars, changed=changed, flag=flag, check=check)
         factor = np.where(stars.rows > 1, check.scale[1], check.scale[0])[:, None, None]
@@ -410,21 +420,22 @@ class _Application:
 
         The largest, in q and in u, of the changes that cannot be told apart.
         """
-        points, found = self.catalogue.points, block.found
+        points, fitted = self.catalogue.points, block.found
+        cameras = self.vectors.instrument.cameras.names
+        parameters = [name for name, _ in self.vectors.named]
         counts = np.nan_to_num(self.counts[block.rows])
-        lit = np.where(found.flux > 0, found.flux, np.inf)
+        lit = np.where(fitted.flux > 0, fitted.flux, np.inf)
         place = (points.x[block.rows], points.y[block.rows], self.catalogue.time[block.rows])
         total = np.zeros_like(block.stars.changed)
         for change in check.changes:
             largest = np.zeros_like(block.stars.qu)
             for entry in change.alike:
-                question = entry.question
-                if question.of_camera:
-                    grown, k = np.zeros_like(counts), question.camera
-                    grown[:, k] = check.growth.electrons(question.kind, *place, counts[:, k]) / lit
-                    shift = calibration_shift(found.gain, grown[..., None], block.star)[..., 0]
+                if entry.camera:
+                    grown, k = np.zeros_like(counts), cameras.index(entry.name)
+                    grown[:, k] = check.growth.electrons(entry.kind, *place, counts[:, k]) / lit
+                    shift = calibration_shift(fitted.gain, grown[..., None], block.star)[..., 0]
                 else:
-                    shift = block.derivative[:, :, question.parameter]
+                    shift = block.derivative[:, :, parameters.index(entry.name)]
                 largest = np.maximum(largest, np.abs(entry.size * np.nan_to_num(shift)))
             total += largest[:, :, None] ** 2 * np.eye(2)
         near = np.zeros(len(total), bool)
@@ -436,7 +447,7 @@ class _Application:
             for camera in spot.alike:
                 grown = np.zeros_like(counts)
                 grown[:, camera.camera] = g * counts[:, camera.camera] / lit
-                shift = calibration_shift(found.gain, grown[..., None], block.star)[..., 0]
+                shift = calibration_shift(fitted.gain, grown[..., None], block.star)[..., 0]
                 largest = np.maximum(largest, np.abs(camera.size * np.nan_to_num(shift)))
             total += largest[:, :, None] ** 2 * np.eye(2)
         return total, near
@@ -460,27 +471,6 @@ def _rows_by_setting(setting_of: Int[np.ndarray, " r"]) -> Iterator[tuple[int, I
         yield int(k), np.flatnonzero(setting_of == k)
 
 
-def _vectors_on_sky(
-    vectors: Float[np.ndarray, "r k 3"], turn: Float[np.ndarray, " r"]
-) -> Float[np.ndarray, "r k 3"]:
-    """Analysis vectors for Stokes parameters on the sky; `turn` is twice the position angle of +X (rad).
-
-    (q + iu) of the instrument = (q + iu) of the sky × exp(−i turn).
-    """
-    cos, sin = np.cos(turn)[:, None], np.sin(turn)[:, None]
-    one, q, u = (vectors[..., k] for k in range(3))
-    return np.stack([one, cos * q - sin * u, sin * q + cos * u], axis=-1)
-
-
-def _instrument_stokes(
-    qu: Float[np.ndarray, "r 2"], turn: Float[np.ndarray, " r"]
-) -> Float[np.ndarray, "r 3"]:
-    """(1, q, u) in the instrument frame from (q, u) on the sky."""
-    cos, sin = np.cos(turn), np.sin(turn)
-    q, u = qu.T
-    return np.stack([np.ones_like(q), cos * q + sin * u, cos * u - sin * q], axis=-1)
-
-
 def _ignored_colour(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:
     """Mixture of spectra that is the error of ignoring the colour (see `Stars.colour`)."""
     flat = colour_weights(np.full(len(teff), np.nan), COLOURS)
@@ -491,7 +481,7 @@ def _ignored_colour(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:
 def _unsure_colour(
     teff: Float[np.ndarray, " r"], error: Float[np.ndarray, " r"]
 ) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
-    """Mixtures of spectra: mean of what the colour of a star may be less what it was taken to be, and the deviation.
+    """Mixtures of spectra: mean of the possible colours of a star less the assumed one, and their deviation.
 
     The effect of the colour is close to linear in 1/T, in which `COOL` and `HOT` lie two deviations from the mean of
     the stars without TEFF, and in which a TEFF (K) has its `error`, (1/T) · error/T.
@@ -516,12 +506,12 @@ def check_validity(calibration: Calibration, settings: Settings) -> None:
     beyond = calibration.beyond_settings(settings)
     if not beyond.any():
         return
-    seen = np.unique(calibration.exposures.filter)
-    other = ~np.isin(settings.filter, seen)
-    if other.any():
-        column, rows = "FILTER", other
-        names = ", ".join(np.unique(settings.filter[other]))
-        what = f"{names}; the calibration was made in {', '.join(seen)}"
+    filters = np.unique(calibration.exposures.filter)
+    uncovered = ~np.isin(settings.filter, filters)
+    if uncovered.any():
+        column, rows = "FILTER", uncovered
+        names = ", ".join(np.unique(settings.filter[uncovered]))
+        what = f"{names}; the calibration was made in {', '.join(filters)}"
     else:
         column, rows = "TEMP", beyond
         low, high = np.nanmin(calibration.exposures.temp), np.nanmax(calibration.exposures.temp)
@@ -535,28 +525,28 @@ def check_validity(calibration: Calibration, settings: Settings) -> None:
 def _settings(vectors: AnalysisVectors, catalogue: Catalogue) -> tuple[list[Settings], Int[np.ndarray, " n"]]:
     """The optical settings of a catalogue and which of them every row has."""
     settings = vectors.reduced(catalogue.points.settings)
-    found = settings.optics()
-    if len(found) > MOST_SETTINGS:
+    layouts = settings.optics()
+    if len(layouts) > MOST_SETTINGS:
         columns = ", ".join(["TEMP", "HA", *(f"{prefix}_ANGLE" for prefix in settings.positions)])
         raise DataError(
-            f"{columns}: {len(found)} different optical settings, at most {MOST_SETTINGS} can be tabulated; round "
+            f"{columns}: {len(layouts)} different optical settings, at most {MOST_SETTINGS} can be tabulated; round "
             "TEMP to 0.1 Celsius and HA to 0.1 h, or take the catalogue in parts"
         )
     of = np.empty(len(catalogue), int)
-    for number, (_, rows) in enumerate(found):
+    for number, (_, rows) in enumerate(layouts):
         of[rows] = number
-    return [setting for setting, _ in found], of
+    return [setting for setting, _ in layouts], of
 
 
 def _disagree(
     chi2: Float[np.ndarray, " s"], dof: Int[np.ndarray, " s"], brightness: Float[np.ndarray, " s"]
 ) -> Bool[np.ndarray, " s"]:
     """Stars with significant residual χ² after adding `ROUGH` × flux to the errors."""
-    found = np.zeros(len(chi2), bool)
+    disagreeing = np.zeros(len(chi2), bool)
     chi2 = chi2 / (1.0 + (ROUGH * brightness) ** 2)
     for k in np.unique(dof[dof > 0]).tolist():
-        found |= (dof == k) & (chi2 > special.chdtri(k, IMPROBABLE))
-    return found
+        disagreeing |= (dof == k) & (chi2 > special.chdtri(k, IMPROBABLE))
+    return disagreeing
 
 
 # ---------------------------------------------------------------------------------- effects beyond the optics
@@ -580,8 +570,8 @@ def _hidden(
     if hidden is None or not len(hidden):
         return np.full(derivative.shape[:2], np.nan if hidden is None else 0.0)
     shift = derivative @ hidden.changes[:, vectors.parameters].T
-    for number, own in acting.items():
-        shift[..., number] -= own
+    for number, acting_shift in acting.items():
+        shift[..., number] -= acting_shift
     return np.abs(shift).max(axis=2)
 
 

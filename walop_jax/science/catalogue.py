@@ -12,12 +12,7 @@ from jaxtyping import Bool, Float, Int
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, plain_column
 from walop_jax.data.table_intensities import equal_rows
 from walop_jax.data.units import Place
-from walop_jax.data.user_tables import (
-    OF_STARS,
-    InputTable,
-    numeric_column,
-    vector_columns,
-)
+from walop_jax.data.user_tables import OF_STARS, InputTable, numeric_column, vector_columns
 from walop_jax.io.errors import rows_text
 from walop_jax.model.instrument import Instrument
 from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
@@ -36,9 +31,9 @@ class Catalogue:
     `points` are positions and settings, `teff_err` the errors of the colour temperatures [K] (0: none); `counts` and
     `sigma` [electron] are NaN where a camera is not used; `spoilt` marks rows in which a camera was flagged, `copy`
     those that repeat another row of their star to the last bit, which are not used, and `repeated` those that have the
-    counts of another star or setting. `star` numbers the stars from 0; `sky` [electron] is what was subtracted
+    counts of another star or setting. `star` numbers the stars from 0; `sky` [electron] is the level subtracted
     (None: not stated), `rotator` [deg] NaN for results in the instrument frame, `time` [MJD, d] where it is not known.
-    `remarks` say what is odd in the table, and what of it is not used.
+    `remarks` name oddities of the table, and unused columns.
     """
 
     points: FieldPoints
@@ -61,15 +56,15 @@ class Catalogue:
         """Some of the rows; stars are numbered anew."""
         if keep.all():
             return self
-        whole = {
+        columns = {
             f.name: getattr(self, f.name)
             for f in dataclasses.fields(self)
             if f.name not in ("points", "remarks") and getattr(self, f.name) is not None
         }
         p = self.points
         points = FieldPoints(p.x[keep], p.y[keep], p.settings[np.flatnonzero(keep)], p.outside[keep])
-        some = Catalogue(points=points, **{name: values[keep] for name, values in whole.items()})
-        return dataclasses.replace(some, star=np.unique(some.star, return_inverse=True)[1].reshape(-1))
+        subset = Catalogue(points=points, **{name: values[keep] for name, values in columns.items()})
+        return dataclasses.replace(subset, star=np.unique(subset.star, return_inverse=True)[1].reshape(-1))
 
 
 def read_catalogue(
@@ -101,9 +96,9 @@ def read_catalogue(
     doubt_radians(source, "ROTATOR", rotator, place)
     star = _stars(source, points, place)
     on_sky = np.isfinite(rotator)
-    most = np.zeros(star.max() + 1, bool)
-    most[star[on_sky]] = True
-    mixed = np.flatnonzero(most[star] & ~on_sky)
+    has_rotator = np.zeros(star.max() + 1, bool)
+    has_rotator[star[on_sky]] = True
+    mixed = np.flatnonzero(has_rotator[star] & ~on_sky)
     if mixed.size:
         what = f"is missing in {rows_text(mixed)}, but other rows of the same ID have it"
         raise place.fail(what, "ROTATOR", "give it for all rows of a star, or for none")
@@ -154,18 +149,18 @@ def _with_colours(
     place.refuse(error < 0, "is below 0", "TEFF_ERR", "standard errors in K")
     error = np.where(np.isnan(teff), 0.0, error)
     colour = numbers("BP_RP")
-    asked = np.isnan(teff) & np.isfinite(colour)
-    if not asked.any():
+    from_colour = np.isnan(teff) & np.isfinite(colour)
+    if not from_colour.any():
         return points, error
-    made, off = temperature_of(np.where(asked, colour, np.nan), numbers("BP_RP_ERR"))
-    within = np.isfinite(made)
+    temperature, off = temperature_of(np.where(from_colour, colour, np.nan), numbers("BP_RP_ERR"))
+    within = np.isfinite(temperature)
     source.remarks.append(f"TEFF of {int(within.sum())} rows is made of BP_RP ({SOURCE})")
-    if beyond := int(np.sum(asked & ~within)):
+    if beyond := int(np.sum(from_colour & ~within)):
         limits = f"{LIMITS[0]:g} … {LIMITS[1]:g} mag"
         source.remarks.append(
             f"BP_RP of {beyond} rows lies beyond {limits}: their errors are those of unknown colours"
         )
-    settings = dataclasses.replace(points.settings, teff=np.where(within, made, teff))
+    settings = dataclasses.replace(points.settings, teff=np.where(within, temperature, teff))
     return dataclasses.replace(points, settings=settings), np.where(within, off, error)
 
 
@@ -197,8 +192,8 @@ def _bits(source: InputTable, name: str, cameras: int, place: Place) -> Bool[np.
     elif values.dtype.kind == "f":
         missing = missing | np.isnan(values)
     several = values.dtype.kind == "b" and values.shape[1] > 1 and values.shape[1] != cameras  # single bits
-    whole = values.dtype.kind in "iubf" and np.all(missing | (values == np.round(values)))
-    if not whole or (values.shape[1] not in (1, cameras) and not several):
+    integers = values.dtype.kind in "iubf" and np.all(missing | (values == np.round(values)))
+    if not integers or (values.shape[1] not in (1, cameras) and not several):
         what = f"is neither one integer in a row nor {cameras}"
         raise place.fail(what, name, "bits as in a calibration set")
     flagged = (values != 0) & ~missing
@@ -271,9 +266,9 @@ def _by_position(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n
         numeric_column(source, name, Column("float", unit, missing=np.nan))
         for name, unit in (("RA", "deg"), ("DEC", "deg"), ("MJD", "d"))
     )
-    known = np.isfinite(ra) & np.isfinite(dec)
+    located = np.isfinite(ra) & np.isfinite(dec)
     name = np.zeros(len(ra), int)
-    name[known] = same_stars(ra[known], dec[known], SAME_PLACE)
+    name[located] = same_stars(ra[located], dec[located], SAME_PLACE)
     # Two stars of one exposure are two stars, however close: by time, or by the place in the field where it is unknown.
     cell = np.round(np.stack([points.x, points.y], axis=1) / ANOTHER_PLACE)
     exposure = np.where(
@@ -284,7 +279,7 @@ def _by_position(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n
     )
     crowded = np.zeros(name.max() + 1, bool)
     crowded[name[count[of.reshape(-1)] > 1]] = True
-    alone = ~known | crowded[name]
+    alone = ~located | crowded[name]
     star = _numbered(name, alone, points)
     if (several := len(star) - star.max() - 1) > 0:
         source.remarks.append(
@@ -306,13 +301,13 @@ def _copies(
     Noise does not repeat to the digits of a float32 in two cameras or more: such rows are one measurement, that with
     most cameras is kept.
     """
-    seen = np.isfinite(counts)
-    measured = seen.any(axis=1)
+    counted = np.isfinite(counts)
+    measured = counted.any(axis=1)
     same = equal_rows([*counts.T, *sigma.T, points.x, points.y])
-    for pattern in np.unique(seen[measured & ~seen.all(axis=1)], axis=0):
+    for pattern in np.unique(counted[measured & ~counted.all(axis=1)], axis=0):
         cameras = np.flatnonzero(pattern)
-        rows = np.flatnonzero(seen[:, cameras].all(axis=1)) if len(cameras) > 1 else cameras[:0]
-        rows = rows[np.argsort(-seen[rows].sum(axis=1), kind="stable")]
+        rows = np.flatnonzero(counted[:, cameras].all(axis=1)) if len(cameras) > 1 else cameras[:0]
+        rows = rows[np.argsort(-counted[rows].sum(axis=1), kind="stable")]
         group = equal_rows(
             [*counts[rows][:, cameras].T, *sigma[rows][:, cameras].T, points.x[rows], points.y[rows]]
         )
@@ -324,7 +319,7 @@ def _copies(
     settings = points.settings
     angles = [np.mod(angle, 360.0) for angle in (*settings.positions.values(), rotator)]
     _, band = np.unique(settings.filter, return_inverse=True)
-    order = np.argsort(-seen.sum(axis=1), kind="stable")
+    order = np.argsort(-counted.sum(axis=1), kind="stable")
     group = equal_rows([same, star, band.reshape(-1), *angles])
     first = order[np.unique(group[order], return_index=True)[1]]
     copy = measured & ~np.isin(np.arange(len(star)), first)

@@ -3,7 +3,7 @@
 Asked are, of the residuals of `star_residuals`:
 
 noise       Σ χ² against Σ ν, from both sides: N_ERR too small or too large
-rows        what the rows of one star have in common: rows that are there twice, noise that is correlated
+rows        the common part of the rows of one star: rows that are there twice, noise that is correlated
 places      stars that disagree together at one place of the field (`places`)
 changes     the mean residual of every camera and how it grows with X, Y, time and flux, light that is added to every
             row, and all parameters of the optics; the strongest is fitted with the errors of the calibration and
@@ -26,8 +26,17 @@ from scipy import special
 
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.text import some, with_error, with_minus_sign
+from walop_jax.io.text import with_error, with_minus_sign
 from walop_jax.likelihood.inverses import whitening
+from walop_jax.science.instrument_changes import (
+    ALARM,
+    MOST_LIKELY,
+    RIVAL,
+    InstrumentChange,
+    PossibleChange,
+    chance_of,
+    threshold,
+)
 from walop_jax.science.left_over_sky import LeftOverSky
 from walop_jax.science.places import DisagreeingPlace, places_of
 from walop_jax.science.star_residuals import (
@@ -38,6 +47,7 @@ from walop_jax.science.star_residuals import (
     SINGULAR,
     Scale,
     StarResiduals,
+    Weights,
     beside_fitted,
     chance_of_scale,
     eliminated,
@@ -49,8 +59,6 @@ from walop_jax.science.star_residuals import (
     shared_by_rows,
 )
 
-ALARM = 1e-4
-RIVAL = 11.0
 NOISE_MATTERS = 1.1
 """Factor on χ² below which, and above the inverse of which, errors are left as they are (5 % of N_ERR)."""
 _MOST_CHANGES = 6
@@ -58,76 +66,9 @@ _ROUNDS = 8
 _SETTLED = 0.05  # standard errors
 _FARTHEST = 5.0  # standard errors in every direction: no calibration is so far off by chance
 _REFERENCE = 1e6  # electron
-_SEEN = 2.33  # one-sided 99 %
 
 Vector = Float[np.ndarray, " r"]  # a number for each row
 CAMERA_KINDS = ("gain", "x", "y", "time", "flux", "light")
-
-
-class ChangeQuestion(NamedTuple):
-    """One thing that may have changed: a camera, in one of `CAMERA_KINDS`, or a parameter of the optics."""
-
-    kind: str
-    name: str
-    unit: str
-    camera: int = -1
-    parameter: int = -1
-
-    @property
-    def of_camera(self) -> bool:
-        """True if a camera has changed, not the optics."""
-        return self.camera >= 0
-
-    def words(self, size: float, error: float) -> str:
-        """A size of it in words."""
-        direction, amount = ("brighter", "fainter")[size < 0], abs(size)
-        if not self.of_camera:
-            larger = ("larger", "smaller")[size < 0]
-            return f"{self.name} {larger} by {with_error(amount, error)} {self.unit}".rstrip()
-        if self.kind == "light":
-            return f"{with_error(amount, error)} electrons too {('many', 'few')[size < 0]} in every row of {self.name}"
-        where = {
-            "x": " at the edge of the field along +X",
-            "y": " at the edge of the field along +Y",
-            "time": " at the end of the catalogue than in its middle",
-            "flux": " for every 10⁶ electrons",
-        }.get(self.kind, "")
-        return f"{self.name} {direction} by {with_error(100 * amount, 100 * error)} %{where}"
-
-
-class FoundChange(NamedTuple):
-    """A change that was found: what, by how much, standard error, and its significance (standard errors)."""
-
-    question: ChangeQuestion
-    size: float
-    error: float
-    sigma: float
-
-
-@dataclasses.dataclass(frozen=True)
-class InstrumentChange:
-    """A change of the instrument since it was calibrated: the simplest description, and all as good (it included)."""
-
-    best: FoundChange
-    alike: tuple[FoundChange, ...]
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras it may be; empty if it may be the optics."""
-        if not all(entry.question.of_camera for entry in self.alike):
-            return ()
-        return tuple(dict.fromkeys(entry.question.name for entry in self.alike))
-
-    def words(self) -> str:
-        """The change in a sentence."""
-        text = f"changed since the calibration, {abs(self.best.sigma):.0f} σ: {self._words(self.best)}"
-        rivals = [self._words(entry) for entry in self.alike if entry.question != self.best.question]
-        if not rivals:
-            return text
-        return f"{text}. These rows cannot distinguish it from {some(rivals, 4)}"
-
-    def _words(self, found: FoundChange) -> str:
-        return found.question.words(found.size, found.error)
 
 
 class Growth(NamedTuple):
@@ -157,11 +98,11 @@ class CatalogueCheck(Displayed):
     """Findings from the stars of a catalogue together.
 
     `noise` is χ² per degree of freedom behind the changes (1 expected; without outliers) and `noise_p` its chance;
-    `rows` the factor by which the variance of what the rows of a star share exceeds N_ERR, None where every star has
+    `rows` the factor by which the common variance of the rows of a star exceeds N_ERR, None where every star has
     one row, and `rows_p` its chance beside `noise`. `scale` are the factors on the photon covariance of stars of one
     row and of several: 1 unless errors are off. `tests` are the `asked` questions in their first answer; `smallest` is
     the gain change of the camera seen best that would be found in 99 % of cases (nan: none). `stars` and `rows_used`
-    count what was looked at; `growth` holds the units of X, Y and time; stars of `places` disagree together; `sky` is
+    count the sample; `growth` holds the units of X, Y and time; stars of `places` disagree together; `sky` is
     the light of the sky left over (None: its level is not stated).
     """
 
@@ -173,7 +114,7 @@ class CatalogueCheck(Displayed):
     rows: float | None
     rows_p: float
     scale: tuple[float, float]
-    tests: tuple[FoundChange, ...]
+    tests: tuple[PossibleChange, ...]
     changes: tuple[InstrumentChange, ...]
     smallest: float
     growth: Growth = IN_UNITS
@@ -187,7 +128,7 @@ class CatalogueCheck(Displayed):
 
     @property
     def noise_is_off(self) -> bool:
-        """True if N_ERR is not what the counts scatter by."""
+        """True if the counts do not scatter by N_ERR."""
         off = not 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS
         return self.noise > NO_NOISE and self.noise_p < self.alarm and off and not self.rows_agree
 
@@ -237,11 +178,8 @@ class CatalogueCheck(Displayed):
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
 
-        def entry(found: FoundChange) -> dict[str, Any]:
-            q = found.question
-            return {"kind": q.kind, "name": q.name, "unit": q.unit} | {
-                k: float(getattr(found, k)) for k in ("size", "error", "sigma")
-            }
+        def entry(change: PossibleChange) -> dict[str, Any]:
+            return {key: getattr(change, key) for key in ("kind", "name", "unit", "size", "error", "sigma")}
 
         return {
             "holds": self.holds,
@@ -271,22 +209,19 @@ class CatalogueCheck(Displayed):
             "SIGMA": "SIZE / ERROR",
             "UNIT": "unit of SIZE",
         }
-        rows = [t.question._asdict() | t._asdict() for t in self.tests]
         return astropy_table(
-            {name: (np.array([row[name.lower()] for row in rows]), "", text) for name, text in about.items()}
+            {
+                name: (np.array([getattr(test, name.lower()) for test in self.tests]), "", text)
+                for name, text in about.items()
+            }
         )
 
     def display(self) -> Display:
         """The verdict, the noise, and the answers for every camera."""
         rows = tuple(
-            (
-                t.question.name,
-                t.question.kind,
-                with_error(t.size, t.error),
-                with_minus_sign(f"{t.sigma:+.1f}"),
-            )
+            (t.name, t.kind, with_error(t.size, t.error), with_minus_sign(f"{t.sigma:+.1f}"))
             for t in self.tests
-            if t.question.of_camera
+            if t.camera
         )
         smallest = (
             f"{100 * self.smallest:.2g} %"
@@ -307,7 +242,7 @@ NOTHING_TO_SPARE = CatalogueCheck(0, 0, 0, 1.0, 1.0, None, 1.0, (1.0, 1.0), (), 
 
 
 class CatalogueSearch:
-    """The columns of all questions, then of the errors of the calibration; what has been found so far.
+    """The columns of all questions, then of the errors of the calibration.
 
     `cameras` are names; `parameters` names and units of those of `stars.parameters()`, of which the first, as many as
     `stars.plain` has, are asked as well; `root` is a square root of their covariance, C = root rootᵀ. `at` are the
@@ -335,15 +270,15 @@ class CatalogueSearch:
         kinds = [kind for kind in CAMERA_KINDS if kind != "time" or self.growth.half > 0]
         self.kinds = kinds
         units = {"flux": "per 1e6 electron", "light": "electron"}
+        self.cameras = tuple(cameras)
         self.questions = [
-            ChangeQuestion(kind, name, units.get(kind, ""), camera=k)
+            PossibleChange(name, True, kind=kind, unit=units.get(kind, ""))
             for kind in kinds
-            for k, name in enumerate(cameras)
+            for name in cameras
         ]
         plain = stars.plain.shape[-1]
         self.questions += [
-            ChangeQuestion("optics", name, unit, parameter=p)
-            for p, (name, unit) in enumerate(parameters[:plain])
+            PossibleChange(name, False, kind="optics", unit=unit) for name, unit in parameters[:plain]
         ]
         # Columns: those of the cameras, all parameters, two of the colours; from them questions and nuisances are made.
         count, shown = len(kinds) * len(cameras), len(root)
@@ -397,27 +332,30 @@ class CatalogueSearch:
                 several = max(single, rows.value)
             variances = self.variance * np.where(stars.rows > 1, several, single)
             matrix, score = normal_matrix(
-                stars, residual, lambda part, _: self._columns(part), scale.kept / variances, scale.share
+                stars,
+                residual,
+                lambda part, _: self._columns(part),
+                Weights(scale.kept / variances, scale.share),
             )
             matrix = self.mixing.T @ matrix @ self.mixing + np.diag(self.prior)
             return _Look(noise, rows, matrix, self.mixing.T @ score - self.prior * sizes)
 
         if stated:
             return look(noise._replace(value=1.0))
-        found = look(noise)
-        # What all stars have in common is no noise: weights come from the scatter about the gains that fit them best.
+        weighted = look(noise)
+        # A common shift of all stars is no noise: weights come from the scatter about the gains that fit them best.
         for _ in range(ABOUT_GAINS if is_off(noise, self._alarm) else 0):
-            gains, fitted = self._gains(found)
+            gains, fitted = self._gains(weighted)
             about = beside_fitted(scale_of(self._left(sizes + gains)), dof, fitted)
             if about.worth < FEW:
                 break
             off = is_off(about, self._alarm)
-            found = look(about, of_few(about, threshold(self._alarm)) if off else 1.0)
-        return found
+            weighted = look(about, of_few(about, threshold(self._alarm)) if off else 1.0)
+        return weighted
 
     def _gains(self, look: _Look) -> tuple[Float[np.ndarray, " c"], int]:
         """The gains of the cameras that fit the stars best, among all sizes, and how many numbers these are."""
-        cameras = sum(question.kind == "gain" for question in self.questions)
+        cameras = len(self.cameras)
         order = [*range(cameras), *range(self.asked, len(look.score))]
         gains = np.zeros_like(look.score)
         matrix, score = eliminated(look.matrix[np.ix_(order, order)], look.score[order], cameras)
@@ -426,7 +364,7 @@ class CatalogueSearch:
         return gains, root.shape[1]
 
     def answer(self) -> CatalogueCheck:
-        """All questions, then again behind what was found."""
+        """All questions, then again behind the changes that were detected."""
         sizes = self.start
         chosen: list[int] = []
         look = self._looked(sizes)
@@ -444,7 +382,7 @@ class CatalogueSearch:
         answers = tests
         while len(chosen) < _MOST_CHANGES:
             strongest = max(range(self.asked), key=lambda n: abs(answers[n].sigma), default=-1)
-            if strongest < 0 or strongest in chosen or _chance(answers[strongest].sigma) >= self._alarm:
+            if strongest < 0 or strongest in chosen or chance_of(answers[strongest].sigma) >= self._alarm:
                 break
             chosen.append(strongest)
             look, sizes = self._settled(look, sizes, chosen)
@@ -466,7 +404,7 @@ class CatalogueSearch:
             smallest=smallest,
             growth=self.growth,
         )
-        # χ² of rows that repeat each other says nothing of N_ERR: what they share does.
+        # χ² of rows that repeat each other does not test N_ERR: their common part does.
         single = noise.value if check.noise_is_off else 1.0
         several = float(rows.value) if rows is not None and check.rows_agree else single
         check = dataclasses.replace(check, scale=(single, several))
@@ -476,13 +414,12 @@ class CatalogueSearch:
         self, found: CatalogueCheck, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int]
     ) -> tuple[DisagreeingPlace, ...]:
         """Places where stars disagree together, behind the changes and the errors of the calibration."""
-        cameras = [question.name for question in self.questions if question.kind == "gain"]
         single, several = (max(scale, found.noise, 1.0) for scale in found.scale)
         variance = self.variance * np.where(self.stars.rows > 1, several, single)
         for fitted in (False, True):  # the fit takes as long as all before it
             if fitted:
                 sizes = self._settled(look, sizes, chosen)[1]
-            places = places_of(self.stars, cameras, self._left(sizes), variance)
+            places = places_of(self.stars, self.cameras, self._left(sizes), variance)
             if not places:
                 break
         return places
@@ -513,12 +450,12 @@ class CatalogueSearch:
     def _alarm(self) -> float:
         return ALARM / (self.asked + 2)
 
-    def _suspicious(self, look: _Look, tests: list[FoundChange]) -> bool:
+    def _suspicious(self, look: _Look, tests: list[PossibleChange]) -> bool:
         """True if anything comes near an alarm."""
         near = 100.0 * self._alarm
         rows = 1.0 if look.rows is None else _chance_beside(look.rows, look.noise)
         strongest = max((abs(test.sigma) for test in tests), default=0.0)
-        return min(rows, chance_of_scale(look.noise), _chance(strongest)) < near
+        return min(rows, chance_of_scale(look.noise), chance_of(strongest)) < near
 
     def _settled(
         self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], *, stated: bool = False
@@ -538,24 +475,22 @@ class CatalogueSearch:
 
     def _beside(
         self, matrix: Float[np.ndarray, "c c"], score: Float[np.ndarray, " c"], chosen: list[int]
-    ) -> list[FoundChange]:
+    ) -> list[PossibleChange]:
         """Every question, alone beside `chosen`, which have no answer here."""
         free = [n for n in range(self.asked) if n not in chosen]
         order = [*free, *chosen, *range(self.asked, len(score))]
         remaining, along = eliminated(matrix[np.ix_(order, order)], score[order], len(free))
-        sizes = [FoundChange(question, 0.0, np.inf, 0.0) for question in self.questions]
+        sizes = [*self.questions]
         for n, information, slope in zip(free, np.diag(remaining), along, strict=True):
             if information > 1e-9 * matrix[n, n]:
                 error = float(information**-0.5)
-                sizes[n] = FoundChange(
-                    self.questions[n], float(slope * error**2), error, float(slope * error)
-                )
+                sizes[n] = sizes[n]._replace(size=float(slope * error**2), error=error)
         return sizes
 
     def _change(
         self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], asked: int
     ) -> InstrumentChange:
-        """Change that was found, and what describes the same residuals as well."""
+        """A detected change, and its rivals."""
         away = np.zeros_like(sizes)
         away[asked] = sizes[asked]
         score = look.score + look.matrix @ away
@@ -563,13 +498,13 @@ class CatalogueSearch:
         best = max(measured, key=lambda entry: entry.sigma**2)
         alike = [entry for entry in measured if entry.sigma**2 > best.sigma**2 - RIVAL]
         # A gain is the simplest of what describes the stars alike.
-        ranked = sorted(alike, key=lambda entry: (entry.question.kind != "gain", -abs(entry.sigma)))
+        ranked = sorted(alike, key=lambda entry: (entry.kind != "gain", -abs(entry.sigma)))
         return InstrumentChange(ranked[0], tuple(ranked))
 
-    def _smallest(self, tests: list[FoundChange]) -> float:
+    def _smallest(self, tests: list[PossibleChange]) -> float:
         """The gain change of one camera that raises the alarm in 99 % of cases."""
-        errors = [t.error for t in tests if t.question.kind == "gain" and np.isfinite(t.error)]
-        return (threshold(self._alarm) + _SEEN) * min(errors) if errors else np.nan
+        errors = [t.error for t in tests if t.kind == "gain" and np.isfinite(t.error)]
+        return (threshold(self._alarm) + MOST_LIKELY) * min(errors) if errors else np.nan
 
 
 class _Look(NamedTuple):
@@ -577,15 +512,6 @@ class _Look(NamedTuple):
     rows: Scale | None
     matrix: Float[np.ndarray, "c c"]
     score: Float[np.ndarray, " c"]
-
-
-def threshold(chance: float) -> float:
-    """Standard deviations that a normal number exceeds, to either side, with this probability."""
-    return float(-special.ndtri(0.5 * chance))
-
-
-def _chance(sigma: float) -> float:
-    return float(2.0 * special.ndtr(-abs(sigma)))
 
 
 def _chance_beside(rows: Scale, noise: Scale) -> float:

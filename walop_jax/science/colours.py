@@ -6,7 +6,7 @@ Source      Mucciarelli, Bellazzini & Massari 2021, A&A 653, A90, table 1: dwarf
             giants (0.33 < C < 1.81, scatter 83 K), Gaia EDR3.
 Here        The mean of both in the range of both: a catalogue of a field says not which a star is. The error holds the
             larger scatter, half their difference, and the error of C.
-Reddening   C is taken as observed. What the instrument asks of T is the slope of the spectrum that arrives, and dust
+Reddening   C is taken as observed. T stands for the slope of the spectrum that arrives at the instrument, and dust
             makes a spectrum in a red filter look like that of a cooler star.
 """
 

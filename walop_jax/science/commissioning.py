@@ -1,4 +1,4 @@
-"""Go or no-go: what a calibration must show before stars are measured with it, and what the exposures lack for it."""
+"""Go or no-go: requirements on a calibration before stars are measured with it, and gaps in its exposures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from walop_jax.science.field_accuracy import SHARE, FieldAccuracy
 
 @dataclasses.dataclass(frozen=True)
 class Requirement:
-    """Something that is asked of a calibration: whether it is met, what was found, and what to do if not.
+    """A requirement on a calibration: whether it is met, the value, and advice if not.
 
     One that is not `needed` is no reason against a go.
     """
@@ -31,7 +31,7 @@ def requirements(
     verdict: Verdict, message: str, accuracy: FieldAccuracy | None, calset: CalibrationSet | None
 ) -> tuple[Requirement, ...]:
     """Requirements on a fit with its verdict; `accuracy` is that of p over the field, `calset` its data, if known."""
-    found = [
+    checks = [
         Requirement(
             "the fit has reached its minimum", verdict.converged, message or "converged",
             "look at the data with walop-jax inspect",
@@ -43,7 +43,7 @@ def requirements(
         ),
     ]  # fmt: skip
     if accuracy is not None:
-        most, goal = accuracy.goal / 2, two_digits(100 * accuracy.goal)
+        allowed, goal = accuracy.goal / 2, two_digits(100 * accuracy.goal)
         limit = accuracy.limited_by.split(" (")[0]
         for where, reached, needed in (
             ("50 % of the field", accuracy.median, True),
@@ -51,22 +51,22 @@ def requirements(
         ):
             cause = f", most of it from {limit}" if limit else ""
             advice = (
-                f"{two_digits((reached / most) ** 2)} times the light, over several nights (walop-jax stack); "
+                f"{two_digits((reached / allowed) ** 2)} times the light, over several nights (walop-jax stack); "
                 "walop-jax plan says which exposures"
             )
             if not needed and accuracy.without_u > 1.0 - SHARE:
                 strip = f"{100 * accuracy.without_u:.0f} % of the field"
                 cause = f", worst beside the {strip} where one exposure carries almost no information on u"
                 advice = "observe the stars there with the calibration plate at 22.5° as well"
-            text = f"p known to {two_digits(100 * most)} % in {where}"
+            text = f"p known to {two_digits(100 * allowed)} % in {where}"
             value = f"{two_digits(100 * reached)} %{cause}"
-            found.append(Requirement(text, reached <= most, value, advice, needed))
+            checks.append(Requirement(text, reached <= allowed, value, advice, needed))
         for name, effect in unmeasured(accuracy.not_measured).items():
-            text = f"what moves stars by {two_digits(100 * most)} % is measured"
+            text = f"what moves stars by {two_digits(100 * allowed)} % is measured"
             lacking = f"{name} not measured, {off_by(*effect.error)} at the usual size"
-            found.append(Requirement(text, effect.error[0] <= most, lacking, effect.remedy))
+            checks.append(Requirement(text, effect.error[0] <= allowed, lacking, effect.remedy))
         if accuracy.hidden > 0:
-            found.append(
+            checks.append(
                 Requirement(
                     f"no undetectable error exceeds {goal} %",
                     accuracy.hidden <= accuracy.goal,
@@ -76,7 +76,7 @@ def requirements(
                 )
             )
     for finding in () if calset is None else inspect(calset).findings:
-        found.append(
+        checks.append(
             Requirement(
                 "exposures and errors",
                 False,
@@ -85,22 +85,22 @@ def requirements(
                 needed=finding.severity == "fault",
             )
         )
-    return tuple(found)
+    return tuple(checks)
 
 
 def is_go(asked: Sequence[Requirement]) -> bool:
     """True if everything that is needed is met."""
-    return all(each.met for each in asked if each.needed)
+    return all(need.met for need in asked if need.needed)
 
 
 def requirement_rows(asked: Sequence[Requirement]) -> tuple[tuple[str, str, str], ...]:
     """A row for each requirement: ok, NO where it is needed, advice where it is not; the requirement, the result."""
     return tuple(
-        ("ok" if each.met else "NO" if each.needed else "advice", each.what, each.found) for each in asked
+        ("ok" if need.met else "NO" if need.needed else "advice", need.what, need.found) for need in asked
     )
 
 
 def requirement_advice(asked: Sequence[Requirement]) -> tuple[str, ...]:
-    """Advice on requirements that are not met, what is needed first."""
-    ordered = sorted(asked, key=lambda each: not each.needed)
-    return tuple(f"{each.found}: {each.advice}" for each in ordered if not each.met)
+    """Advice on requirements that are not met, the needed ones first."""
+    ordered = sorted(asked, key=lambda need: not need.needed)
+    return tuple(f"{need.found}: {need.advice}" for need in ordered if not need.met)

@@ -2,7 +2,7 @@
 
 Panopoulou et al. 2025 (ApJS 276, 15) ask that catalogues of stellar polarisation share one tabular format. The names of
 columns that their compilation has at CDS (J/ApJS/276/15: Name, RAJ2000, DEJ2000, Gmag, Pol, e_Pol, PA, e_PA) are taken
-as they are there, p as a fraction; what a calibrated survey has beyond them (q, u with covariances, the part of the
+as they are there, p as a fraction; columns of a calibrated survey beyond them (q, u with covariances, the part of the
 calibration, Galactic values) has names of the same kind. Every column has a unit (or is a pure number), a UCD and a
 description.
 
@@ -24,6 +24,7 @@ from walop_jax.data.user_tables import InputTable, numeric_column, read_input_ta
 from walop_jax.io.errors import fail
 from walop_jax.io.plain_tables import astropy_table, faults_of_ucds
 from walop_jax.sky.directions import designations, galactic
+from walop_jax.sky.moon import sky_to_instrument
 
 REFERENCE = "Panopoulou et al. 2025, ApJS 276, 15"
 MJD_ZERO = 2400000.5
@@ -91,8 +92,7 @@ def to_galactic(
     qu: Float[np.ndarray, "n 2"], covariance: Float[np.ndarray, "n 2 2"], north: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
     """(q, u) and covariance from Galactic north, which has the position angle `north` (deg) at each star."""
-    cos, sin = np.cos(2.0 * np.deg2rad(north)), np.sin(2.0 * np.deg2rad(north))
-    turn = np.moveaxis(np.array([[cos, sin], [-sin, cos]]), 2, 0)
+    turn = np.stack(sky_to_instrument(np.array([1.0, 0.0]), np.array([0.0, 1.0]), north[:, None]), axis=1)
     return np.einsum("nij,nj->ni", turn, qu), turn @ covariance @ turn.swapaxes(1, 2)
 
 
@@ -102,9 +102,9 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
     Stars without a result, and those in the frame of the instrument, are left out, with a remark.
     Raises `DataError` where RA, DEC or a column of `apply` is missing.
     """
-    given = source.names
+    present = source.names
     for name, why in (("RA", "the sky"), ("DEC", "the sky"), ("QU_PHOTON", "walop-jax apply")):
-        if name not in given:
+        if name not in present:
             advice = (
                 "give RA and DEC of the stars to apply (walop-jax gather does)"
                 if why == "the sky"
@@ -142,28 +142,30 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
     systematic = covariance - _covariance(rows["Q_PHOTON"], rows["U_PHOTON"], rows["QU_PHOTON"])
     longitude, latitude, north = galactic(ra, dec)
     qu_gal, covariance_gal = to_galactic(qu, covariance, north)
-    made: dict[str, np.ndarray] = {
+    cells: dict[str, np.ndarray] = {
         "Name": designations(ra, dec), "GLON": longitude, "GLAT": latitude,
         "Inst": np.full(len(keep), str(source.table.meta.get("INSTRUME", "WALOP"))),
         "PA_gal": np.mod(number("EVPA")[keep] - north, 180.0),
     }  # fmt: skip
-    if "MJD" in given and np.isfinite(number("MJD")[keep]).any():
-        made["JD"] = number("MJD")[keep] + MJD_ZERO
+    if "MJD" in present and np.isfinite(number("MJD")[keep]).any():
+        cells["JD"] = number("MJD")[keep] + MJD_ZERO
     for end, matrix in (("", covariance), ("_sys", systematic), ("_gal", covariance_gal)):
-        made[f"e_q{end}"], made[f"e_u{end}"] = np.sqrt(np.maximum(np.einsum("nii->in", matrix), 0.0))
-        made[f"cov_qu{end}"] = matrix[:, 0, 1]
+        cells[f"e_q{end}"], cells[f"e_u{end}"] = np.sqrt(np.maximum(np.einsum("nii->in", matrix), 0.0))
+        cells[f"cov_qu{end}"] = matrix[:, 0, 1]
     for end, pair in (("", qu), ("_gal", qu_gal)):
-        made[f"q{end}"], made[f"u{end}"] = pair.T
+        cells[f"q{end}"], cells[f"u{end}"] = pair.T
     for name, entry in COLUMNS.items():
         if name == "Filter":
             rule = Column("str", missing="SDSS-r")
-            made[name] = numeric_column(source, entry.of, rule)[keep]
-        elif name == "GaiaID" and entry.of in given:
-            made[name] = np.asarray(source.table.columns[given.index(entry.of)])[keep]
-        elif entry.of in given:
+            cells[name] = numeric_column(source, entry.of, rule)[keep]
+        elif name == "GaiaID" and entry.of in present:
+            cells[name] = np.asarray(source.table.columns[present.index(entry.of)])[keep]
+        elif entry.of in present:
             column = number(entry.of)[keep]
-            made[name] = column.astype(np.int64) if name in _WHOLE else column
-    columns = {name: (made[name], entry.unit, entry.about) for name, entry in COLUMNS.items() if name in made}
+            cells[name] = column.astype(np.int64) if name in _WHOLE else column
+    columns = {
+        name: (cells[name], entry.unit, entry.about) for name, entry in COLUMNS.items() if name in cells
+    }
     carried = ("CALHASH", "PESTIM", "HOLDS", "TRUSTED", "ERRFROM")
     meta = {key: source.table.meta[key] for key in carried if key in source.table.meta}
     cards = {"POLCCONV": "IAU", "TIMESYS": "UTC", "RADESYS": "ICRS", "REFERENC": REFERENCE}
@@ -205,7 +207,7 @@ def check_common_table(table: Any) -> tuple[str, ...]:
     """
     if isinstance(table, str | os.PathLike):
         table = read_input_table(table, ("Pol",)).table
-    found = [
+    faults = [
         f"{name}: the column is missing"
         for name, entry in COLUMNS.items()
         if entry.needed and name not in table.colnames
@@ -213,16 +215,16 @@ def check_common_table(table: Any) -> tuple[str, ...]:
     for name in table.colnames:
         column, entry = table[name], COLUMNS.get(name)
         if not column.description:
-            found.append(f"{name}: has no description")
+            faults.append(f"{name}: has no description")
         if entry is not None and str(column.unit or "") != entry.unit:
-            found.append(f"{name}: the unit is {column.unit or 'none'}, not {entry.unit or 'none'}")
+            faults.append(f"{name}: the unit is {column.unit or 'none'}, not {entry.unit or 'none'}")
         if entry is not None and column.meta.get("ucd", entry.ucd) != entry.ucd:
-            found.append(f"{name}: the UCD is {column.meta['ucd']}, not {entry.ucd}")
-    found += faults_of_ucds({name: table[name].meta.get("ucd", "") for name in table.colnames})
+            faults.append(f"{name}: the UCD is {column.meta['ucd']}, not {entry.ucd}")
+    faults += faults_of_ucds({name: table[name].meta.get("ucd", "") for name in table.colnames})
     for card, value in (("POLCCONV", "IAU"), ("TIMESYS", "UTC")):
         if str(table.meta.get(card, value)) != value:
-            found.append(f"{card} is {table.meta[card]}, not {value}: is the sign of u that of the IAU?")
-    return tuple(found) if found else _wrong_numbers(table)
+            faults.append(f"{card} is {table.meta[card]}, not {value}: is the sign of u that of the IAU?")
+    return tuple(faults) if faults else _wrong_numbers(table)
 
 
 def _wrong_numbers(table: Any) -> tuple[str, ...]:
@@ -236,18 +238,19 @@ def _wrong_numbers(table: Any) -> tuple[str, ...]:
     qu, p = np.stack([c["q"], c["u"]], axis=1), np.hypot(c["q"], c["u"])
     longitude, latitude, north = galactic(c["RAJ2000"], c["DEJ2000"])
     turned, _ = to_galactic(qu, np.zeros((len(qu), 2, 2)), north)
-    seen, more = p > _SAME, 1.0 + _SAME
+    polarised, margin = p > _SAME, 1.0 + _SAME
     wrong = {
         "q, u: not finite": ~np.isfinite(p),
         "q, u: polarised by more than 1: in per cent?": p > 1.0 + 5.0 * np.hypot(c["e_q"], c["e_u"]),
         "e_q, e_u: not above 0": ~((c["e_q"] > 0) & (c["e_u"] > 0)),
-        "cov_qu: larger than e_q e_u": np.abs(c["cov_qu"]) > more * c["e_q"] * c["e_u"],
-        "e_q_sys, e_u_sys: larger than e_q, e_u": (c["e_q_sys"] > more * c["e_q"])
-        | (c["e_u_sys"] > more * c["e_u"]),
+        "cov_qu: larger than e_q e_u": np.abs(c["cov_qu"]) > margin * c["e_q"] * c["e_u"],
+        "e_q_sys, e_u_sys: larger than e_q, e_u": (c["e_q_sys"] > margin * c["e_q"])
+        | (c["e_u_sys"] > margin * c["e_u"]),
         "Pol: not the length of (q, u): in per cent, or debiased?": np.abs(c["Pol"] - p) > _SAME,
-        "PA: not half the angle of (q, u): is the sign of u that of the IAU?": seen
+        "PA: not half the angle of (q, u): is the sign of u that of the IAU?": polarised
         & (_apart(c["PA"], np.rad2deg(0.5 * np.arctan2(c["u"], c["q"]))) > _SAME_ANGLE),
-        "PA_gal: not PA from Galactic north": seen & (_apart(c["PA_gal"], c["PA"] - north) > _SAME_ANGLE),
+        "PA_gal: not PA from Galactic north": polarised
+        & (_apart(c["PA_gal"], c["PA"] - north) > _SAME_ANGLE),
         "q_gal, u_gal: not q, u from Galactic north": np.abs(c["q_gal"] - turned[:, 0])
         + np.abs(c["u_gal"] - turned[:, 1])
         > _SAME,

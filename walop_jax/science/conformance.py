@@ -27,7 +27,7 @@ Key = tuple[str, str]
 
 @dataclasses.dataclass(frozen=True)
 class Deviation:
-    """An answer that is not right: None stands for none; `mistake` names what would answer so, or is empty."""
+    """An answer that is not right: None stands for none; `mistake` is the usual one with that answer, or empty."""
 
     case: str
     quantity: str

@@ -1,6 +1,6 @@
-"""Detectors that are not linear: counts of a catalogue freed of what a calibration knows of them.
+"""Detectors that are not linear: counts of a catalogue, corrected with a calibration.
 
-Equation    reported(N, θ) = what was measured, solved for N by fixed-point steps;
+Equation    reported(N, θ) = counts as measured, solved for N by fixed-point steps;
             dN/dθ = −(∂reported/∂θ) / (∂reported/∂N)
 Symbols     N counts (electrons) that arrive, θ coefficients of the detectors
 Limits      Responses within some per cent of linear: each step gains as many digits as the first one is small.
@@ -25,7 +25,7 @@ _ROUNDS = 16
 
 
 def linearised(calibration: Calibration, counts: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-    """Counts as linear detectors would report them, where the calibration has found out what they do to counts."""
+    """Counts as linear detectors would report them, where the calibration knows their response."""
     instrument = calibration.model.instrument(calibration.values)
     if light.is_linear(instrument):
         return counts
@@ -40,7 +40,7 @@ def detector_slopes(
 ) -> Iterator[tuple[int, Float[np.ndarray, "r k"]]]:
     """Positions in `vectors.parameters` of those of the detectors, and d(linearised counts)/d(parameter).
 
-    `counts` are linearised. From reported(N, θ) = what was measured: dN/dθ = −(∂reported/∂θ) / (∂reported/∂N).
+    `counts` are linearised. From reported(N, θ) = counts as measured: dN/dθ = −(∂reported/∂θ) / (∂reported/∂N).
     """
     calibration = vectors.calibration
     template, values = calibration.model.template, jnp.asarray(calibration.values)

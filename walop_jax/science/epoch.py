@@ -1,7 +1,7 @@
-"""Does an old calibration still fit new data, and what has moved?
+"""Does an old calibration still fit new data, and which parameters have moved?
 
-The new set is fitted with the old model: plates, effects, priors and what is held. What both fits have in common, the
-instrument's parameters, is compared: Δ = new − old with the covariance V.
+The new set is fitted with the old model: plates, effects, priors and held values. The common parameters of
+both fits, those of the instrument, are compared: Δ = new − old with the covariance V.
 
     V = C_old + C_new − C_old P C_new − C_new P C_old
     T = Δᵀ V⁻¹ Δ                        everything at once: χ² for an instrument that has not changed
@@ -100,10 +100,10 @@ class Epoch(Displayed):
     `chi2_old` is of the new data with the old instrument; `star_errors` are statistics (per cent) of what stars would
     be off, outside the zone without u, if the old calibration were used and the new one true. `added` are the effects
     without which the new data are not explained, `same` says that old and new data are the same files. `new_trusted`
-    and `warnings` are what the new fit is worth.
+    and `warnings` are the verdict on the new fit.
 
     `fits` and all numbers of a comparison are None, and its lists empty, where the model of the old calibration
-    explained its own data and not the new ones, nor is it known what does.
+    explained its own data and not the new ones, and no other model is known to.
     """
 
     fits: bool | None
@@ -291,7 +291,7 @@ def added_amplitudes(old: Model, new: Model) -> list[str]:
 
 
 class MeasuredChange(NamedTuple):
-    """A change in units of `sigma`, for the parameters that were known at all, and V⁻¹ over what was measured of it.
+    """A change in units of `sigma`, for the parameters that were known at all, and V⁻¹ over the measured directions.
 
     `directions` is the number of those that were measured.
     """

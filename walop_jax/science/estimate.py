@@ -112,9 +112,7 @@ def estimate(
 
 
 def calibration_shift(
-    gain: Float[np.ndarray, "r 2 k"],
-    change: Float[np.ndarray, "r k m"],
-    star: Int[np.ndarray, " r"],
+    gain: Float[np.ndarray, "r 2 k"], change: Float[np.ndarray, "r k m"], star: Int[np.ndarray, " r"]
 ) -> Float[np.ndarray, "s 2 m"]:
     """Shift of every star's (q, u) when the model counts per unit flux of its rows change by `change`.
 

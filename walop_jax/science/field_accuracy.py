@@ -1,4 +1,4 @@
-"""Accuracy of the degree of polarisation over the field of a calibration, what limits it, and what could hide.
+"""Accuracy of the degree of polarisation over the field of a calibration, its limits, and mistakes that could hide.
 
 Stars with p ≤ 5 % at any angle, without photon noise. An error δm of the instrument matrix makes
 δ(q, u) = −M⁻¹ (δm₁ + δM (q, u)), hence its variance along the polarisation, averaged over the stars, is the error of p.
@@ -22,7 +22,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import two_digits
 from walop_jax.likelihood.inverses import whitening
 
-SHARE = 0.95  # of the field where one exposure measures u: what a calibration is judged by
+SHARE = 0.95  # of the field where one exposure measures u: the part that a calibration is judged by
 SIZE = 21  # points along each axis of the map
 COARSE = 8  # the same where the question is what limits it
 FEW_STARS = 20
@@ -90,21 +90,22 @@ class FieldAccuracy:
             return (
                 Shortfall("the calibration is not trusted", "walop-jax diagnose looks for what is missing"),
             )
-        most, lacks = self.goal / 2, []
-        for name, one in unmeasured(self.not_measured).items():
-            if one.error[0] > most:
+        allowed, lacks = self.goal / 2, []
+        for name, gap in unmeasured(self.not_measured).items():
+            if gap.error[0] > allowed:
                 lacks.append(
-                    Shortfall(f"{name} not measured, {off_by(*one.error)} at the usual size", one.remedy)
+                    Shortfall(f"{name} not measured, {off_by(*gap.error)} at the usual size", gap.remedy)
                 )
-        if self.reached > most:
-            if self.without_u > 1.0 - SHARE and self.median <= most:
+        if self.reached > allowed:
+            if self.without_u > 1.0 - SHARE and self.median <= allowed:
                 advice = "observe stars near the strip without u with the plate at 22.5° as well"
             else:
-                light = two_digits((self.reached / most) ** 2)  # errors fall with its square root
-                advice = f"{light} times the light; walop-jax plan RUN --goal {100 * most:.2g} says how long that takes"
+                light = two_digits((self.reached / allowed) ** 2)  # errors fall with its square root
+                goal = f"{100 * allowed:.2g}"
+                advice = f"{light} times the light; walop-jax plan RUN --goal {goal} says how long that takes"
             lacks.append(
                 Shortfall(
-                    f"{two_digits(100 * self.reached)} % in {self.judged}, {two_digits(100 * most)} % allowed",
+                    f"{two_digits(100 * self.reached)} % in {self.judged}, {two_digits(100 * allowed)} % allowed",
                     advice,
                 )
             )
@@ -125,7 +126,7 @@ class FieldAccuracy:
     @property
     def apart_from(self) -> str:
         """Restriction of the error of p where the data do not measure everything that matters; empty: none."""
-        if all(one.ahead for one in self.not_measured):
+        if all(mistake.ahead for mistake in self.not_measured):
             return " behind the telescope" if self.not_measured else ""
         return " apart from what is not measured"
 
@@ -134,29 +135,29 @@ class FieldAccuracy:
         return {
             "median": self.median, "share_below_goal": self.share, "goal": self.goal, "filter": self.filter,
             "limited_by": self.limited_by, "hidden": self.hidden, "hidden_by": self.hidden_by,
-            "hidden_worst": self.hidden_worst, "not_measured": [one.name for one in self.not_measured],
+            "hidden_worst": self.hidden_worst, "not_measured": [entry.name for entry in self.not_measured],
             "reached": self.reached, "good_enough": not self.shortfalls,
-            "shortfalls": [dataclasses.asdict(one) for one in self.shortfalls],
+            "shortfalls": [dataclasses.asdict(entry) for entry in self.shortfalls],
         }  # fmt: skip
 
     def facts(self, *, complete: bool = True) -> tuple[tuple[str, str], ...]:
-        """The answer in a few lines: how well, limited by what, and what could hide; of a `complete` model or not."""
+        """The answer in a few lines: accuracy, its limits, mistakes that could hide; of a `complete` model or not."""
         if not self.trusted:
             return (("p of a star", "not known: the calibration is not trusted"),)
-        known = f"{two_digits(100 * self.median)} %{self.apart_from} (median error for p ≤ 5 %)"
+        median_error = f"{two_digits(100 * self.median)} %{self.apart_from} (median error for p ≤ 5 %)"
         goal, lacks = f"{100 * self.goal:.3g} %", self.shortfalls
-        known += f"; below {goal} over {100 * self.share:.0f} % of the field"
-        lines = [("p of a star", known if complete else f"{known}, if nothing were missing")]
+        median_error += f"; below {goal} over {100 * self.share:.0f} % of the field"
+        lines = [("p of a star", median_error if complete else f"{median_error}, if nothing were missing")]
         if complete:
-            verdict = [f"no: {lacks[0].what}", *(one.what for one in lacks[1:])] if lacks else []
+            verdict = [f"no: {lacks[0].what}", *(lack.what for lack in lacks[1:])] if lacks else []
             verdict = verdict or [f"yes: {two_digits(100 * self.reached)} % in {self.judged}"]
             lines += zip([f"good for {goal}", *[""] * (len(verdict) - 1)], verdict, strict=True)
-            lines += [("what to do", one.advice) for one in lacks[:1] if one.advice != self.remedy]
+            lines += [("what to do", lack.advice) for lack in lacks[:1] if lack.advice != self.remedy]
         if self.limited_by:
             lines.append(("limited by", self.limited_by))
         if self.not_measured:
-            each = unmeasured(self.not_measured).items()
-            lines.append(("not measured", "; ".join(f"{name}: {off_by(*one.error)}" for name, one in each)))
+            gaps = unmeasured(self.not_measured).items()
+            lines.append(("not measured", "; ".join(f"{name}: {off_by(*lack.error)}" for name, lack in gaps)))
         if self.hidden > 0:
             lines += [("undetectable", off_by(self.hidden, self.hidden_worst)), ("caused by", self.hidden_by)]
         if self.hidden > 0 and self.remedy:
@@ -179,8 +180,8 @@ def reached(error: Float[np.ndarray, "*p"]) -> float:
 
 def judged(without_u: float) -> str:
     """The part of the field that `reached` is about, in words; `without_u` is the share that is left out."""
-    part = f"{100 * SHARE:.0f} % of the field"
-    return f"{part} with u in one exposure ({100 * (1.0 - without_u):.0f} %)" if without_u > 0 else part
+    field = f"{100 * SHARE:.0f} % of the field"
+    return f"{field} with u in one exposure ({100 * (1.0 - without_u):.0f} %)" if without_u > 0 else field
 
 
 def answered(result: FitResult, goal: float = GOAL) -> FitResult:
@@ -225,7 +226,7 @@ def field_accuracy(calibration: Calibration, size: int = SIZE, goal: float = GOA
         hidden_by="" if worst is None else worst.in_words,
         hidden_worst=nothing if worst is None else worst.error[1],
         remedy="" if worst is None else worst.remedy,
-        not_measured=tuple(one for one in mistakes if not one.measured),
+        not_measured=tuple(mistake for mistake in mistakes if not mistake.measured),
         trusted=calibration.verdict.trusted,
         without_u=float(np.mean(~with_u)),
         with_u=with_u,
@@ -239,18 +240,18 @@ def _limited_by(
     """The group of parameters with most of the variance of p, in the median of the field, in words."""
     form = p_forms(matrix, sample_stars(FEW_STARS)) @ slopes
     covariance = calibration.covariance
-    seen = form @ covariance
-    total = np.mean(np.sum(seen * form, axis=-1), axis=1)
-    parts = np.array([str(name).split(".")[0] for name in calibration.model.names])
+    projected = form @ covariance
+    total = np.mean(np.sum(projected * form, axis=-1), axis=1)
+    owners = np.array([str(name).split(".")[0] for name in calibration.model.names])
     shares = {}
-    for part in dict.fromkeys(parts.tolist()):
-        group = np.flatnonzero((parts == part) & (np.diag(covariance) > 0))
+    for owner in dict.fromkeys(owners.tolist()):
+        group = np.flatnonzero((owners == owner) & (np.diag(covariance) > 0))
         if group.size:
             root = whitening(covariance[np.ix_(group, group)], 1e-15)
-            gone = np.mean(np.sum((seen[..., group] @ root) ** 2, axis=-1), axis=1)
-            shares[part] = float(np.nanmedian(gone / total))
-    most = max(shares, key=lambda part: shares[part], default="")
-    if not most:
+            gone = np.mean(np.sum((projected[..., group] @ root) ** 2, axis=-1), axis=1)
+            shares[owner] = float(np.nanmedian(gone / total))
+    largest = max(shares, key=lambda owner: shares[owner], default="")
+    if not largest:
         return ""
-    share = f"{100 * min(shares[most], 1.0):.0f} % of the variance"
-    return f"{GROUPS.get(most, f'the parameters {most}.*')} ({share})"
+    share = f"{100 * min(shares[largest], 1.0):.0f} % of the variance"
+    return f"{GROUPS.get(largest, f'the parameters {largest}.*')} ({share})"

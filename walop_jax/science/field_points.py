@@ -12,12 +12,7 @@ from jaxtyping import Bool, Float
 from walop_jax.data.schema import EXPOSURES, TURN, Column, check, finite
 from walop_jax.data.settings import TEMPERATURE, Settings
 from walop_jax.data.units import Place
-from walop_jax.data.user_tables import (
-    InputTable,
-    empty_cells,
-    numeric_column,
-    read_input_table,
-)
+from walop_jax.data.user_tables import InputTable, empty_cells, numeric_column, read_input_table
 from walop_jax.io.errors import rows_text
 from walop_jax.model.instrument import Instrument
 
@@ -149,7 +144,7 @@ def true_matrices(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
     """X, Y (deg) and M21, M22, … of a table of true matrices, three for each arm.
 
-    Raises `DataError` for what is missing or not finite.
+    Raises `DataError` for values that are missing or not finite.
     """
     source = read_input_table(path)
     points = field_points(source, instrument)

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.camera_catalogues import CameraCatalogue
+from walop_jax.data.camera_catalogues import CameraCatalogue, sky_positions
 from walop_jax.data.schema import Column
-from walop_jax.data.user_tables import OF_STARS, in_memory, numeric_column, read_input_table, sky_positions
+from walop_jax.data.user_tables import OF_STARS, in_memory, numeric_column, read_input_table
 from walop_jax.io.errors import fail
 from walop_jax.sky.directions import NOT_MOVED, REACH, Pointing, Registration, mutual, registered
 
@@ -45,44 +45,42 @@ class Gathered:
 
 
 def gather(
-    catalogues: Sequence[CameraCatalogue],
-    names: Sequence[str],
-    pointing: Pointing,
-    tolerance: float = 1.0,
+    catalogues: Sequence[CameraCatalogue], names: Sequence[str], pointing: Pointing, tolerance: float = 1.0
 ) -> Gathered:
     """One catalogue of the stars of all cameras; `names` are those of the cameras, `tolerance` is in arcsec.
 
     Raises `DataError` for catalogues of different fields, and for those that have too few stars in common.
     """
-    places = [_place(one, pointing) for one in catalogues]
+    places = [_place(camera, pointing) for camera in catalogues]
     moves = _registrations(catalogues, places, tolerance)
-    texts = dict.fromkeys(text for one in catalogues for text in one.remarks)
+    texts = dict.fromkeys(text for camera in catalogues for text in camera.remarks)
     remarks = [
-        f"{', '.join(str(one.path) for one in catalogues if text in one.remarks)}: {text}" for text in texts
+        f"{', '.join(str(camera.path) for camera in catalogues if text in camera.remarks)}: {text}"
+        for text in texts
     ]
     remarks += _about_moves(moves, names, tolerance)
     places = [move.apply(place) for move, place in zip(moves, places, strict=True)]
     index, ambiguous, place = _matched(places, tolerance)
-    seen = index >= 0
-    _check_common(catalogues, seen, tolerance)
-    keep = seen.sum(axis=1) >= max(len(catalogues) - 1, min(len(catalogues), 2))
+    detected = index >= 0
+    _check_common(catalogues, detected, tolerance)
+    keep = detected.sum(axis=1) >= max(len(catalogues) - 1, min(len(catalogues), 2))
     if dropped := int(np.sum(~keep)):
         remarks.append(f"{dropped} stars that too few cameras see are left out of {len(keep)}")
-    index, ambiguous, place, seen = index[keep], ambiguous[keep], place[keep], seen[keep]
+    index, ambiguous, place, detected = index[keep], ambiguous[keep], place[keep], detected[keep]
     for k, name in enumerate(names):
-        others = np.delete(seen, k, axis=1).all(axis=1)
-        lost = int(np.sum(others & ~seen[:, k]))
-        if lost > MISSING * max(int(others.sum()), 1):
+        in_all_others = np.delete(detected, k, axis=1).all(axis=1)
+        lost = int(np.sum(in_all_others & ~detected[:, k]))
+        if lost > MISSING * max(int(in_all_others.sum()), 1):
             remarks.append(
-                f"{name} lacks {lost} of the {int(others.sum())} stars that all other cameras see: is its detection "
-                "threshold that of the others? Their q and u come from the others alone (FLAG 128)"
+                f"{name} lacks {lost} of the {int(in_all_others.sum())} stars that all other cameras see: is its "
+                "detection threshold that of the others? Their q and u come from the others alone (FLAG 128)"
             )
     if doubtful := int(ambiguous.any(axis=1).sum()):
         remarks.append(
             f"{doubtful} stars have two candidates within {tolerance:g} arcsec: not used in that camera"
         )
     columns, about = _columns(catalogues, pointing, index, ambiguous, place)
-    return Gathered(columns, pointing, moves, seen.sum(axis=1), (*remarks, *about))
+    return Gathered(columns, pointing, moves, detected.sum(axis=1), (*remarks, *about))
 
 
 def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
@@ -95,15 +93,15 @@ def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
     )
     ra, dec = sky_positions(source)
     near = made.pointing.separation(ra, dec) < FARTHEST
-    known = np.stack(made.pointing.field_of(ra[near], dec[near]), axis=1)
+    reference = np.stack(made.pointing.field_of(ra[near], dec[near]), axis=1)
     place = np.stack([made.columns[name][0] for name in "XY"], axis=1)
     bright = np.nan_to_num(np.nansum(made.columns["N"][0], axis=1))
     magnitude = numeric_column(source, "PHOT_G_MEAN_MAG", Column("float", missing=np.nan))[near]
-    move = registered(place, known, bright, np.nan_to_num(-magnitude, nan=-np.inf), tolerance)
+    move = registered(place, reference, bright, np.nan_to_num(-magnitude, nan=-np.inf), tolerance)
     if not move.pairs:
         what = f"has no stars in common with the cameras within {REACH / 60.0:g} arcmin"
         raise fail(what, file=source.path, advice="is it of this field? RA and DEC are in degrees")
-    _, stars, rows = mutual(move.apply(place), known, tolerance)
+    _, stars, rows = mutual(move.apply(place), reference, tolerance)
     columns = dict(made.columns)
     for name, (unit, about) in OF_STARS.items():
         if name in source.names:
@@ -139,13 +137,15 @@ def _registrations(
 ) -> tuple[Registration, ...]:
     """Shift and rotation of each camera, against the median of all."""
     first, moves = catalogues[0], [NOT_MOVED]
-    for one, place in zip(catalogues[1:], places[1:], strict=True):
-        move = registered(place, places[0], _brightness(one), _brightness(first), tolerance)
+    for camera, place in zip(catalogues[1:], places[1:], strict=True):
+        move = registered(place, places[0], _brightness(camera), _brightness(first), tolerance)
         if not move.pairs:
             apart = 60.0 * np.hypot(*(np.median(place, axis=0) - np.median(places[0], axis=0)))
             what = f"has no stars in common with {first.path} within {REACH / 60.0:g} arcmin"
             where = f" (their centres are {apart:.2g} arcmin apart)" if apart > 1.0 else ""
-            raise fail(what + where, file=one.path, advice="is it of the same field, and is its WCS right?")
+            raise fail(
+                what + where, file=camera.path, advice="is it of the same field, and is its WCS right?"
+            )
         moves.append(move)
     shift = np.median([move.shift for move in moves], axis=0)
     rotation = float(np.median([move.rotation for move in moves]))
@@ -184,11 +184,11 @@ def _matched(
         count = (index[stars] >= 0).sum(axis=1, keepdims=True)
         place[stars] = (count * place[stars] + places[k][rows]) / (count + 1)
         index[stars, k], ambiguous[stars, k] = rows, doubtful[rows]
-        more = np.full((len(new), cameras), -1)
-        more[:, k] = new
+        additions = np.full((len(new), cameras), -1)
+        additions[:, k] = new
         unsure = np.zeros((len(new), cameras), bool)
         unsure[:, k] = doubtful[new]
-        index, ambiguous = np.concatenate([index, more]), np.concatenate([ambiguous, unsure])
+        index, ambiguous = np.concatenate([index, additions]), np.concatenate([ambiguous, unsure])
         place = np.concatenate([place, places[k][new]])
     return index, ambiguous, place
 
@@ -202,12 +202,12 @@ def _check_common(
     catalogues: Sequence[CameraCatalogue], seen: Bool[np.ndarray, "s k"], tolerance: float
 ) -> None:
     """Refuse a camera that hardly shares stars with the others."""
-    both = seen & (seen.sum(axis=1, keepdims=True) > 1)
-    for one, here, common in zip(catalogues, seen.sum(axis=0), both.sum(axis=0), strict=True):
-        if common < FEWEST * here:
+    shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
+    for catalogue, count, common in zip(catalogues, seen.sum(axis=0), shared.sum(axis=0), strict=True):
+        if common < FEWEST * count:
             raise fail(
-                f"{common} of its {here} stars are matched with those of other cameras within {tolerance:g} arcsec",
-                file=one.path,
+                f"{common} of its {count} stars are matched with those of other cameras within {tolerance:g} arcsec",
+                file=catalogue.path,
                 advice="is it of the same field and WCS? --tolerance is in arcsec",
             )
 
@@ -220,21 +220,22 @@ def _columns(
     place: Float[np.ndarray, "s 2"],
 ) -> tuple[Columns, list[str]]:
     def of_cameras(values: Sequence[np.ndarray], missing: Any) -> np.ndarray:
-        seen = index >= 0
+        detected = index >= 0
         return np.stack(
-            [np.where(seen[:, k], one[index[:, k]], missing) for k, one in enumerate(values)], axis=1
+            [np.where(detected[:, k], column[index[:, k]], missing) for k, column in enumerate(values)],
+            axis=1,
         )
 
     ra, dec = pointing.sky_of(*place.T)
-    flag = of_cameras([one.flag for one in catalogues], 0)
+    flag = of_cameras([camera.flag for camera in catalogues], 0)
     columns: Columns = {
         "RA": (ra, "deg", "right ascension, ICRS"),
         "DEC": (dec, "deg", "declination, ICRS"),
         "X": (place[:, 0], "deg", "field coordinate"),
         "Y": (place[:, 1], "deg", "field coordinate"),
         "ROTATOR": (pointing.rotator_at(ra, dec), "deg", "position angle of +X at the star"),
-        "N": (of_cameras([one.flux for one in catalogues], np.nan), "", "electrons in each camera"),
-        "N_ERR": (of_cameras([one.error for one in catalogues], np.nan), "", "standard errors of N"),
+        "N": (of_cameras([camera.flux for camera in catalogues], np.nan), "", "electrons in each camera"),
+        "N_ERR": (of_cameras([camera.error for camera in catalogues], np.nan), "", "standard errors of N"),
         "N_FLAG": (
             (flag | np.where(ambiguous, BLEND, 0)).astype(np.int32),
             "",
@@ -243,15 +244,17 @@ def _columns(
     }
     remarks = []
     for name, (unit, about) in OF_STARS.items():
-        given = [k for k, one in enumerate(catalogues) if name in one.of_stars]
-        if not given:
+        with_column = [k for k, camera in enumerate(catalogues) if name in camera.of_stars]
+        if not with_column:
             continue
         texts = name == "SOURCE_ID"
-        each = [catalogues[k].of_stars.get(name) if k in given else None for k in range(len(catalogues))]
+        each_camera = [
+            catalogues[k].of_stars.get(name) if k in with_column else None for k in range(len(catalogues))
+        ]
         empty = "" if texts else np.nan
         filled = [
-            np.full(len(one), empty, object if texts else float) if v is None else v
-            for one, v in zip(catalogues, each, strict=True)
+            np.full(len(camera), empty, object if texts else float) if v is None else v
+            for camera, v in zip(catalogues, each_camera, strict=True)
         ]
         values, differ = _agreed(of_cameras(filled, empty), texts)
         if differ.any():
@@ -259,26 +262,27 @@ def _columns(
                 f"{name} is not the same in all cameras for {int(differ.sum())} stars: taken as unknown"
             )
         columns[name] = (_whole(values) if texts else values, unit, about)
-    for name in sorted({name for one in catalogues for name in one.of_exposure}):
-        each = {str(one.of_exposure.get(name)) for one in catalogues}
-        if len(each) > 1 and name != "MJD":
+    for name in sorted({name for camera in catalogues for name in camera.of_exposure}):
+        each_camera = {str(camera.of_exposure.get(name)) for camera in catalogues}
+        if len(each_camera) > 1 and name != "MJD":
             raise fail(
-                f"{name} is {' and '.join(sorted(each))} in catalogues of one exposure", advice="correct it"
+                f"{name} is {' and '.join(sorted(each_camera))} in catalogues of one exposure",
+                advice="correct it",
             )
-        value = next(one.of_exposure[name] for one in catalogues if name in one.of_exposure)
+        value = next(camera.of_exposure[name] for camera in catalogues if name in camera.of_exposure)
         columns[name] = (np.full(len(ra), value), "", "of the exposure")
     return columns, remarks
 
 
 def _agreed(values: np.ndarray, texts: bool) -> tuple[np.ndarray, Bool[np.ndarray, " s"]]:
     """The value that all cameras that have one agree on, and where they do not."""
-    known = values != "" if texts else np.isfinite(values.astype(float))
-    first = np.where(known.any(axis=1), known.argmax(axis=1), 0)
+    stated = values != "" if texts else np.isfinite(values.astype(float))
+    first = np.where(stated.any(axis=1), stated.argmax(axis=1), 0)
     value = values[np.arange(len(values)), first]
     same = (
         values == value[:, None] if texts else np.isclose(values.astype(float), value.astype(float)[:, None])
     )
-    differ = np.asarray(np.any(known & ~same, axis=1))
+    differ = np.asarray(np.any(stated & ~same, axis=1))
     return np.where(differ, "" if texts else np.nan, value), differ
 
 

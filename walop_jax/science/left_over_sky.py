@@ -17,10 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import optimize
 
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import with_error
 from walop_jax.science.catalogue import Catalogue
+from walop_jax.science.instrument_changes import MOST_LIKELY
 
 if TYPE_CHECKING:
     from walop_jax.science.apply import Stars
@@ -31,8 +33,6 @@ FEWEST = 50  # stars
 MOST = 20_000  # that are looked at
 FAR = 5.0  # standard deviations
 _ROUNDS = 4
-_HALVINGS = 25
-_SEEN = 2.33  # one-sided 99 %
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,12 +56,12 @@ class LeftOverSky:
     @property
     def bound(self) -> float:
         """The share that is not exceeded with a probability of 99 %."""
-        return float(np.hypot(*self.share) + _SEEN * self.errors.max())
+        return float(np.hypot(*self.share) + MOST_LIKELY * self.errors.max())
 
     def covariance(self, ratio: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2 2"]:
         """Covariance of its shift of stars with a `ratio` of sky to light, 0 where none was found."""
-        whole = np.outer(self.share, self.share) + np.diag(self.errors**2)
-        return np.where(self.found, ratio**2, 0.0)[:, None, None] * whole
+        of_share = np.outer(self.share, self.share) + np.diag(self.errors**2)
+        return np.where(self.found, ratio**2, 0.0)[:, None, None] * of_share
 
     def words(self) -> str:
         """The finding in a sentence."""
@@ -102,10 +102,10 @@ def left_over_sky(
         return None
     columns = np.stack([np.ones(len(chosen)), np.log10(light[chosen]), ratio[chosen]], axis=1)
     columns[:, 1] -= columns[:, 1].mean()
-    found = [_slope(columns, qu[chosen, k], photon[chosen, k, k]) for k in range(2)]
-    share, errors = np.array(found).T
+    slopes = [_slope(columns, qu[chosen, k], photon[chosen, k, k]) for k in range(2)]
+    share, errors = np.array(slopes).T
     return (
-        LeftOverSky(share, errors, len(chosen)) if np.isfinite(found).all() and (errors > 0).all() else None
+        LeftOverSky(share, errors, len(chosen)) if np.isfinite(slopes).all() and (errors > 0).all() else None
     )
 
 
@@ -115,11 +115,11 @@ def _slope(
     """Coefficient of the last column, and its error."""
     scatter, used = 0.0, np.ones(len(values), bool)
     for _ in range(_ROUNDS):
-        beta, _, left = _fitted(columns, values, variance + scatter, used)
-        scatter = _scatter(left[used], variance[used])
-        used = np.abs(left) < FAR * np.sqrt(variance + scatter)
-    beta, inverse, left = _fitted(columns, values, variance + scatter, used)
-    pull = np.where(used, left / (variance + scatter), 0.0)[:, None] * columns
+        beta, _, residual = _fitted(columns, values, variance + scatter, used)
+        scatter = _scatter(residual[used], variance[used])
+        used = np.abs(residual) < FAR * np.sqrt(variance + scatter)
+    beta, inverse, residual = _fitted(columns, values, variance + scatter, used)
+    pull = np.where(used, residual / (variance + scatter), 0.0)[:, None] * columns
     robust = inverse @ (pull.T @ pull) @ inverse
     return float(beta[2]), float(np.sqrt(max(inverse[2, 2], robust[2, 2])))
 
@@ -138,28 +138,28 @@ def _fitted(
 
 
 def _scatter(left: Float[np.ndarray, " s"], variance: Float[np.ndarray, " s"]) -> float:
-    """Variance beyond the stated one for which χ² of residuals is their number, less what was fitted."""
-    low, high, wanted = 0.0, float(np.mean(left**2)), len(left) - 3.0
-    if np.sum(left**2 / variance) <= wanted:
-        return 0.0
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if np.sum(left**2 / (variance + middle)) > wanted else (low, middle)
-    return 0.5 * (low + high)
+    """Variance beyond the stated one for which χ² of residuals is their number less three."""
+
+    def excess(scatter: float) -> float:
+        return float(np.sum(left**2 / (variance + scatter))) - (len(left) - 3.0)
+
+    # Where the scatter is the mean square of all residuals, χ² is below their number, but not less than three below.
+    highest = 2.0 * float(np.mean(left**2))
+    return float(optimize.brentq(excess, 0.0, highest)) if excess(0.0) > 0 else 0.0  # pyright: ignore[reportArgumentType]
 
 
 def with_sky(stars: Stars, catalogue: Catalogue) -> Stars:
-    """The stars with what the sky left in them may do, where the catalogue states its level."""
+    """The stars with errors and bounds of the sky left in them, where the catalogue states its level."""
     if catalogue.sky is None:
         return stars
-    both = np.isfinite(catalogue.counts) & np.isfinite(catalogue.sky)
-    sums = (np.where(both, one, 0.0).sum(axis=1) for one in (catalogue.counts, catalogue.sky))
-    light, level = (np.bincount(catalogue.star, one) for one in sums)
+    stated = np.isfinite(catalogue.counts) & np.isfinite(catalogue.sky)
+    sums = (np.where(stated, values, 0.0).sum(axis=1) for values in (catalogue.counts, catalogue.sky))
+    light, level = (np.bincount(catalogue.star, values) for values in sums)
     ratio = np.where(light > 0, level / np.where(light > 0, light, 1.0), np.nan)
-    found = left_over_sky(stars.qu, stars.photon, light, ratio)
-    if found is None:
+    leftover = left_over_sky(stars.qu, stars.photon, light, ratio)
+    if leftover is None:
         return stars
-    changed = stars.changed + np.nan_to_num(found.covariance(ratio))
-    flag = stars.flag | (Quality.CATALOGUE if found.found else 0)
-    check, bound = dataclasses.replace(stars.check, sky=found), found.bound * ratio
+    changed = stars.changed + np.nan_to_num(leftover.covariance(ratio))
+    flag = stars.flag | (Quality.CATALOGUE if leftover.found else 0)
+    check, bound = dataclasses.replace(stars.check, sky=leftover), leftover.bound * ratio
     return dataclasses.replace(stars, changed=changed, flag=flag, check=check, sky_bound=bound)

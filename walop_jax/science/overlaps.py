@@ -3,7 +3,7 @@
     χ² = Σ dᵀ W d      W = (C_photon + k C_calibration)⁻¹,  d = (q, u) of a row less the mean of its star, weighted by W
 
 Errors of the calibration are common to all stars and have k = `COMMON`, so that they raise no alarm by themselves. The
-sum of the cameras has no part in χ², so that it sees what no other check of a catalogue does.
+sum of the cameras has no part in χ², so that it sees errors that no other check of a catalogue does.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from scipy import special
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.science.apply import STAR_SAMPLE, apply
 from walop_jax.science.catalogue import Catalogue
+from walop_jax.science.instrument_changes import ALARM
 
 APART = 0.02  # deg: rows of a star that lie farther apart than that are at two places
-ALARM = 1e-4  # probability of a χ² as large
 COMMON = float(special.chdtri(1, ALARM))
 """Square of a normal deviate that is exceeded with that probability."""
 _OUTLIER = 1e-6  # of a row: left out
@@ -50,15 +50,20 @@ class Overlap:
         ]
 
 
-def at_several_places(catalogue: Catalogue) -> Bool[np.ndarray, " n"]:
-    """Rows of stars that are seen at several places of the field."""
-    apart = np.zeros(catalogue.star.max() + 1)
+def extents(catalogue: Catalogue) -> Float[np.ndarray, " s"]:
+    """The largest distance in X or Y (deg) between the rows of every star."""
+    extent = np.zeros(catalogue.star.max() + 1)
     for place in (catalogue.points.x, catalogue.points.y):
-        low, high = np.full(len(apart), np.inf), np.full(len(apart), -np.inf)
+        low, high = np.full(len(extent), np.inf), np.full(len(extent), -np.inf)
         np.minimum.at(low, catalogue.star, place)
         np.maximum.at(high, catalogue.star, place)
-        apart = np.maximum(apart, high - low)
-    return (apart > APART)[catalogue.star]
+        extent = np.maximum(extent, high - low)
+    return extent
+
+
+def at_several_places(catalogue: Catalogue) -> Bool[np.ndarray, " n"]:
+    """Rows of stars that are seen at several places of the field."""
+    return (extents(catalogue) > APART)[catalogue.star]
 
 
 def overlap(calibration: Calibration, catalogue: Catalogue, *, force: bool = False) -> Overlap | None:
@@ -70,11 +75,11 @@ def overlap(calibration: Calibration, catalogue: Catalogue, *, force: bool = Fal
     chosen &= catalogue.star < np.sort(catalogue.star[chosen])[:STAR_SAMPLE].max(initial=-1) + 1
     if not chosen.any() or not np.isfinite(catalogue.rotator[chosen]).any():
         return None
-    some = catalogue.of_rows(chosen)
-    each = apply(calibration, dataclasses.replace(some, star=np.arange(len(some))), force=force)
-    covariance = each.photon + COMMON * each.calibration
-    good = np.isfinite(each.qu).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
-    number, qu, covariance = some.star[good], each.qu[good], covariance[good]
+    subset = catalogue.of_rows(chosen)
+    by_row = apply(calibration, dataclasses.replace(subset, star=np.arange(len(subset))), force=force)
+    covariance = by_row.photon + COMMON * by_row.calibration
+    good = np.isfinite(by_row.qu).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    number, qu, covariance = subset.star[good], by_row.qu[good], covariance[good]
     weight = np.linalg.inv(covariance)
 
     def away(keep: Bool[np.ndarray, " r"]) -> Float[np.ndarray, "r 2"]:
@@ -86,8 +91,8 @@ def overlap(calibration: Calibration, catalogue: Catalogue, *, force: bool = Fal
         total[empty] = np.eye(2)
         return qu - np.linalg.solve(total, moment[..., None])[number, :, 0]
 
-    every = np.ones(len(qu), bool)
-    keep = special.chdtrc(2, np.einsum("ri,rij,rj->r", away(every), weight, away(every))) > _OUTLIER
+    all_rows = np.ones(len(qu), bool)
+    keep = special.chdtrc(2, np.einsum("ri,rij,rj->r", away(all_rows), weight, away(all_rows))) > _OUTLIER
     difference = away(keep)[keep]
     count = np.bincount(number[keep])
     dof, stars = 2 * int(np.sum(count[count > 1] - 1)), int(np.sum(count > 1))

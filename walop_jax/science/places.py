@@ -23,15 +23,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy import ndimage, optimize, special
+from scipy import ndimage, optimize
 
 from walop_jax.io.text import some, with_error
+from walop_jax.science.instrument_changes import ALARM, RIVAL, chance_of
 from walop_jax.science.star_residuals import StarResiduals, own_variance
 
-ALARM = 1e-4
-"""Probability that noise makes any place in a catalogue, at most."""
-RIVAL = 11.0
-"""Δχ² (over χ²/dof where that is above 1) within which another camera describes a place as well."""
 CUT = 3.0
 SIZES = (1 / 32, 1 / 16, 1 / 8, 1 / 4)
 """Sizes s that are looked for, as shares of the largest |X|, |Y| of the stars: 0.009 to 0.07° of a WALOP."""
@@ -106,7 +103,7 @@ def places_of(
 ) -> tuple[DisagreeingPlace, ...]:
     """Places of the field where stars disagree together, the most significant first; none in `alarm` of catalogues.
 
-    `cameras` are names. `residual` is that of `stars` or what is left of it behind changes, `variance` that of the
+    `cameras` are names. `residual` is that of `stars`, with or without changes, `variance` that of the
     residuals of every star over that of its noise (None: `own_variance`).
     """
     stars_seen = _seen(
@@ -120,7 +117,7 @@ def places_of(
     while len(places) < _MOST and remaining.sum() > 1:
         subset = _Seen(*(values[remaining] for values in stars_seen))
         centre, sigma, trials = _strongest(subset, extent)
-        if trials * 2.0 * special.ndtr(-abs(sigma)) >= alarm:
+        if trials * chance_of(sigma) >= alarm:
             break
         place = _described(subset, centre, sigma, cameras)
         places.append(place)

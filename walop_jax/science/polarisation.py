@@ -2,8 +2,8 @@
 
     p = √(q² + u²),    EVPA = ½ arctan2(u, q),    n = (q, u)/p,    t = (−u, q)/p
 
-Errors      σ_p² = nᵀ C n;  σ_EVPA = σ_t / 2p with σ_t² = tᵀ C t, and no more than 180°/√12, what a uniform
-            distribution has. Where p < 5 σ_p, (q, u) may as well lie on the other side of 0: there σ_EVPA is the rms
+Errors      σ_p² = nᵀ C n;  σ_EVPA = σ_t / 2p with σ_t² = tᵀ C t, and no more than 180°/√12, that of a
+            uniform distribution. Where p < 5 σ_p, (q, u) may as well lie on the other side of 0: there it is the rms
             distance, within half a turn, of the angles of a normal distribution about (q, u) from EVPA. Where C = 1 and
             m = |(q, u)|, the angle α of the vectors from that of their mean has the density
             f(α) = φ(m) (1 + b Φ(b)/φ(b)) / √(2π), b = m cos α, φ and Φ the normal density and its integral
@@ -60,14 +60,14 @@ def polarisation(
     with np.errstate(divide="ignore", invalid="ignore"):
         if estimator == "MAS":
             # −expm1 keeps the difference of nearly equal numbers exact where p ≪ b.
-            taken = across * -np.expm1(-(p**2) / across) / (2.0 * p)
-            debiased = np.where(lit, p - np.where(across > 0, taken, 0.0), p)
+            bias = across * -np.expm1(-(p**2) / across) / (2.0 * p)
+            debiased = np.where(lit, p - np.where(across > 0, bias, 0.0), p)
         else:
             debiased = np.sqrt(np.maximum(p**2 - across, 0.0))
         error = np.minimum(np.rad2deg(np.sqrt(across) / (2.0 * p)), NO_ANGLE)
     weak = np.flatnonzero((p**2 < (1.0 - 1e-9) * _CERTAIN**2 * along) & (qq * uu > qu_**2))
-    for some in np.array_split(weak, len(weak) // _TOGETHER + 1):
-        error[some] = _spread_of_angles(qu[some], covariance[some])
+    for chunk in np.array_split(weak, len(weak) // _TOGETHER + 1):
+        error[chunk] = _spread_of_angles(qu[chunk], covariance[chunk])
     return Polarisation(
         degree=p,
         debiased=debiased,

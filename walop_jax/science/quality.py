@@ -22,6 +22,7 @@ from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.table_files import read_table_file
+from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.folder import locked
 from walop_jax.io.plain_tables import astropy_table, stacked, table_format, write_table
@@ -71,7 +72,7 @@ class Standard(NamedTuple):
 
 def standards(calibration: Calibration) -> list[Standard]:
     """The standards of a calibration as all else has measured them; none that the data do not measure."""
-    model, found = calibration.model, []
+    model, measured_stars = calibration.model, []
     names = [model.names[i] for i in model.positions("standard")]
     for name in (entry.removesuffix(".q") for entry in names if entry.endswith(".q")):
         pair = [model.index(f"{name}.{axis}") for axis in "qu"]
@@ -79,14 +80,14 @@ def standards(calibration: Calibration) -> list[Standard]:
         if not all(priors) or any(model.parameters[i].tie for i in pair):
             continue
         catalogue, width = np.array(priors, float).T
-        here = np.linalg.inv(calibration.covariance[np.ix_(pair, pair)])
-        added = here - np.diag(width**-2.0)
+        information = np.linalg.inv(calibration.covariance[np.ix_(pair, pair)])
+        added = information - np.diag(width**-2.0)
         if np.linalg.eigvalsh(width[:, None] * added * width).min() < HELD:
             continue
         covariance = np.linalg.inv(added)
-        measured = covariance @ (here @ calibration.values[pair] - catalogue / width**2)
-        found.append(Standard(name, measured, covariance, catalogue, width**2))
-    return found
+        measured = covariance @ (information @ calibration.values[pair] - catalogue / width**2)
+        measured_stars.append(Standard(name, measured, covariance, catalogue, width**2))
+    return measured_stars
 
 
 def _mean(values: Sequence[float], variances: Sequence[float]) -> tuple[float, float]:
@@ -122,7 +123,7 @@ def numbers_of(stars: Sequence[Standard]) -> dict[str, float]:
         (d := star.measured - star.catalogue) @ np.linalg.solve(star.covariance + np.diag(star.variance), d)
         for star in stars
     ]
-    angles, ratios = (_mean([value for value, _ in each], [v for _, v in each]) for each in (angle, ratio))
+    angles, ratios = (_mean([value for value, _ in pairs], [v for _, v in pairs]) for pairs in (angle, ratio))
     return {
         "NSTD": len(polarised),
         "ANGLE": angles[0],
@@ -148,7 +149,7 @@ def quality_row(
     if accuracy is None:
         field = field_accuracy(calibration)
         accuracy = {} if field is None else {"median": field.median, "hidden": field.hidden}
-    known = {
+    of_field = {
         name: np.nan if (value := accuracy.get(name)) is None else float(value)
         for name in ("median", "hidden")
     }
@@ -168,8 +169,8 @@ def quality_row(
         "TRUSTED": verdict.trusted,
         "CHI2DOF": verdict.chi2 / max(verdict.dof, 1),
         **numbers_of(standards(calibration)),
-        "ACCURACY": known["median"],
-        "HIDDEN": known["hidden"],
+        "ACCURACY": of_field["median"],
+        "HIDDEN": of_field["hidden"],
         **{f"{GAIN}_{name.upper()}": float(gain) for name, gain in gains},
     }
 
@@ -238,20 +239,20 @@ def read_nights(path: Path) -> Any:
 def joined(old: Any, new: Any) -> tuple[Any, list[str]]:
     """Both tables as one, in the order of the nights, and remarks; the later row of a night is kept."""
     rows = stacked(old, new)
-    kept: dict[tuple[str, ...], int] = {}
-    seen, remarks = set[str](), []
+    latest: dict[tuple[str, ...], int] = {}
+    hashes, remarks = set[str](), []
     for number, row in enumerate(rows):
         key, content = tuple(str(row[name]) for name in SAME), str(row["CALHASH"])
-        if content in seen:
+        if content in hashes:
             remarks.append(f"{row['RUN']}: this calibration is in the table already")
             continue
-        if key in kept:
-            remarks.append(f"{row['RUN']}: takes the place of {rows[kept[key]]['RUN']} in night {key[1]}")
-        seen.add(content)
-        kept[key] = number
-    made = rows[sorted(kept.values())]
-    made.sort(["NIGHT", "FILTERS"])
-    return made, remarks
+        if key in latest:
+            remarks.append(f"{row['RUN']}: takes the place of {rows[latest[key]]['RUN']} in night {key[1]}")
+        hashes.add(content)
+        latest[key] = number
+    table = rows[sorted(latest.values())]
+    table.sort(["NIGHT", "FILTERS"])
+    return table, remarks
 
 
 def judge(table: Any, limits: Limits) -> Any:
@@ -290,11 +291,9 @@ def append(path: str | os.PathLike[str], new: Any, limits: Limits) -> tuple[Any,
     Nothing is lost where it is killed, and of two processes the second one is told of the first.
     """
     table_format(path)
-    there = Path(path)
-    if not there.parent.is_dir():
-        raise fail(f"the folder {there.parent} does not exist", file=path, advice="create it first")
-    with locked(there.parent / f".walop-quality-{there.name}-lock", path):
-        table, remarks = joined(read_nights(there), new) if there.exists() else joined(new[:0], new)
+    target = check_output(path, overwrite=True)
+    with locked(target.parent / f".walop-quality-{target.name}-lock", path):
+        table, remarks = joined(read_nights(target), new) if target.exists() else joined(new[:0], new)
         table = judge(table, limits)
-        write_table(there, table, overwrite=True)
+        write_table(target, table, overwrite=True)
     return table, remarks

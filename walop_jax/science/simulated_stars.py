@@ -80,9 +80,9 @@ def simulated_stars(
     vectors = sky_vectors(instrument, layout, x, y)[:, np.asarray(layout.band_of)[:, 0], :, :3]
     expected = flux[:, None] * np.einsum("pc,pcks,ps->pk", colour_weights(teff, COLOURS), vectors, stokes)
     if not light.is_linear(instrument):
-        one = jax.tree.map(lambda leaf: leaf[:1], layout.exposures)
+        single = jax.tree.map(lambda leaf: leaf[:1], layout.exposures)
         expected = np.asarray(
-            jax.vmap(lambda n: light.detected(instrument, one, n[None])[0])(array(expected))
+            jax.vmap(lambda n: light.detected(instrument, single, n[None])[0])(array(expected))
         )
     noise = PhotonNoise(plan.read_noise)
     counts, sigma = (expected, noise.sigma(expected)) if noiseless else noise.draw(photons, expected)

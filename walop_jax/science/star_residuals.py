@@ -9,8 +9,8 @@ of counts of shape c (over σ) and size β leaves P c β.
 
 Normal matrix   Q = Σ w κ cᵀ P c,  score  g = Σ w cᵀ r over the stars that are kept; both of any list of columns. A
                 camera's gain has the column m in that camera. The sum over all cameras is flux: P c = 0.
-Calibration     Its errors θ, of covariance C, are columns like others, with the prior θᵀ C⁻¹ θ: what the calibration
-                does not know is no alarm (`eliminated`).
+Calibration     Its errors θ, of covariance C, are columns like others, with the prior θᵀ C⁻¹ θ: errors of the
+                calibration raise no alarm (`eliminated`).
 Trimmed         Stars of χ² > q, with P(χ²_ν > q) = `TRIMMED`, are not used. For a normal distribution cut at a radius
                 covariance and response are both smaller by κ = P(χ²_{ν+2} < q) (about 0.99), so that estimates are
                 unbiased and errors known; what lies far off, however far, has no influence.
@@ -44,7 +44,7 @@ FEW = 4
 ABOUT_GAINS = 2
 """Rounds in which the scale of stars is found about the gains that fit them best, and these with that scale."""
 SINGULAR = 1e-10
-"""Share of the largest eigenvalue below which stars say nothing of a direction of what is fitted to them."""
+"""Share of the largest eigenvalue below which stars do not measure a direction of the fitted numbers."""
 ROUNDING = 1e-12
 """Share of its square that a column must have once flux, q and u are fitted: less is rounding, of either sign."""
 Matrix = Float[np.ndarray, "c c"]
@@ -52,7 +52,7 @@ Matrix = Float[np.ndarray, "c c"]
 
 @dataclasses.dataclass(frozen=True)
 class StarResiduals:
-    """Rows of stars, ready to be asked what has changed; rows of a star follow each other, numbered from 0.
+    """Rows of stars for tests of changes; rows of a star follow each other, numbered from 0.
 
     `residual`, `model` and `tangent` (derivatives of the model to q, u, flux projected) are over σ, and 0 where a
     camera is not used; `root` is 1/σ. `photon` is the covariance H of a star's (q, u). `x`, `y`
@@ -130,7 +130,7 @@ class StarResiduals:
         )
 
     def blocks(self) -> Iterator[tuple[slice, slice, StarResiduals]]:
-        """Slices of stars and of rows, some `CHECKED_ROWS` of these, each with what it holds."""
+        """Slices of stars and of rows, some `CHECKED_ROWS` of these, each with its part."""
         first = self.first
         cuts = np.searchsorted(first, np.arange(0, len(self), CHECKED_ROWS))
         for start, stop in zip(cuts, [*cuts[1:], len(first)], strict=True):
@@ -181,21 +181,21 @@ def own_variance(stars: StarResiduals) -> Float[np.ndarray, " s"]:
     return 1.0 + spread / np.clip(stars.dof, 1, stars.model.shape[1] - 1)
 
 
+class Weights(NamedTuple):
+    """Weights of stars: `inverse` is 1/variance of the residuals, 0 for those left out, `share` is κ."""
+
+    inverse: Float[np.ndarray, " s"]
+    share: Float[np.ndarray, " s"]
+
+
 Columns = Callable[[StarResiduals, slice], Float[np.ndarray, "r k c"]]
 """Columns of some stars and their rows."""
 
 
 def normal_matrix(
-    stars: StarResiduals,
-    residual: Float[np.ndarray, "r k"],
-    columns: Columns,
-    weight: Float[np.ndarray, " s"],
-    share: Float[np.ndarray, " s"],
+    stars: StarResiduals, residual: Float[np.ndarray, "r k"], columns: Columns, weights: Weights
 ) -> tuple[Matrix, Float[np.ndarray, " c"]]:
-    """Q and g (head of this file) of columns; `weight` is 1/variance of a star's residuals, 0 for those left out.
-
-    `residual` is that of `stars` or what is left of it behind changes; `share` is κ.
-    """
+    """Q and g (head of this file) of columns; `residual` is that of `stars`, with or without changes."""
     matrix, score, diagonal = np.zeros((0, 0)), np.zeros(0), np.zeros(0)
     for numbers, rows, subset in stars.blocks():
         values = columns(subset, rows)
@@ -203,7 +203,7 @@ def normal_matrix(
         count = len(free)
         if not score.size:
             matrix, score, diagonal = np.zeros((count, count)), np.zeros(count), np.zeros(count)
-        w, k = weight[numbers], share[numbers]
+        w, k = weights.inverse[numbers], weights.share[numbers]
         scaled = np.sqrt(w * k)
         flat = (free * scaled[subset.star, None]).reshape(count, -1)
         half = np.linalg.cholesky(subset.photon).swapaxes(1, 2) @ along * scaled[:, None, None]
@@ -298,7 +298,7 @@ def is_off(scale: Scale, alarm: float) -> bool:
 def shared_by_rows(
     stars: StarResiduals, residual: Float[np.ndarray, "r k"], variance: Float[np.ndarray, " s"]
 ) -> Scale | None:
-    """The factor by which what the rows of a star have in common exceeds its expectation; None where all have one.
+    """The factor by which the common part of the rows of a star exceeds its expectation; None where all have one.
 
     T = Σ_k (Σ_j r_jk)² over cameras k and rows j has expectation tr I and variance 2 tr I², I the covariance of the
     sums: T · ν / tr I is near χ² with ν = (tr I)² / tr I² degrees of freedom (Satterthwaite 1946).

@@ -15,11 +15,11 @@ once        h = 1 in a single group
 All cameras together are flux: no history of theirs leaves a trace. Asked are the gains of cameras and of arms (all
 cameras of one), their gradients over the field (of any direction φ: β cos φ x + β sin φ y, as χ² of two numbers), spots
 (`watch_spots`) and the numbers of the optics (thicknesses, axes of plates, …). One correction for all of it: noise
-raises an alarm in one of 1/`ALARM` catalogues, at z₀; what is seen in 99 % is (z₀ + 2.33) σ_β. What was found competes
-with all others of the same history: those that describe the stars as well are told together, and a camera is named
-only if no other is among them. A number of the optics that would have to change by more than `FARTHEST` widths of its
-prior explains nothing: its columns are first-order, and no optics moves that far. If only such a number describes the
-stars, they have changed by something that has no name here.
+raises an alarm in one of 1/`ALARM` catalogues, at z₀; the size seen in 99 % is (z₀ + 2.33) σ_β. A detected change
+competes with all others of the same history: those that describe the stars as well are told together, and a camera is
+named only if no other is among them. A number of the optics that would have to change by more than `FARTHEST` widths of
+its prior explains nothing: its columns are first-order, and no optics moves that far. If only such a number describes
+the stars, they have changed by something that has no name here.
 """
 
 from __future__ import annotations
@@ -40,7 +40,15 @@ from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.science.apply import residuals_of
 from walop_jax.science.catalogue import Catalogue
-from walop_jax.science.catalogue_check import ALARM, RIVAL, threshold
+from walop_jax.science.instrument_changes import (
+    ALARM,
+    MOST_LIKELY,
+    RIVAL,
+    UNNAMED,
+    History,
+    PossibleChange,
+    threshold,
+)
 from walop_jax.science.star_residuals import (
     ABOUT_GAINS,
     CROWDED,
@@ -50,6 +58,7 @@ from walop_jax.science.star_residuals import (
     TRIMMED,
     Scale,
     StarResiduals,
+    Weights,
     beside_fitted,
     eliminated,
     is_off,
@@ -58,13 +67,11 @@ from walop_jax.science.star_residuals import (
     of_few,
     own_variance,
 )
-from walop_jax.science.watch_found import UNNAMED, History, Suspect, Watch, WatchedChange
+from walop_jax.science.watch_found import Watch, WatchedChange
 from walop_jax.science.watch_readings import Answers, Readings
 from walop_jax.science.watch_spots import SpotFound, Spots, of_stars, profile
 
 WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen to 10⁻⁵
-SEEN = 2.33
-"""Standard deviations above the alarm from which 99 % are found."""
 MOST_GROUPS = 150
 """Exposure groups that are told apart; neighbours of more are joined."""
 RIVALS = (
@@ -78,7 +85,7 @@ RIVALS = (
     "telescope_polarisation",
     "filter_shift",
 )
-"""Effects of the optics that may be what has changed, beside the parameters of the model."""
+"""Effects of the optics that may have changed, beside the parameters of the model."""
 _CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
 _MOST_CHANGES = 4
 _ROUNDS = 6
@@ -114,7 +121,7 @@ def watch(
 
 
 def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[Catalogue], tuple[str, ...]]:
-    """Catalogues with a time in every row, the number of the catalogue where none has any; what was left out."""
+    """Catalogues with a time in every row, the number of the catalogue where none has any; remarks on rows left out."""
     has_time = [np.isfinite(catalogue.time) for catalogue in catalogues]
     if not any(map(np.any, has_time)):
         numbered = enumerate(catalogues)
@@ -198,29 +205,27 @@ class Watching:
 
     # --------------------------------------------------------------------------------------------- noise
 
-    def weights(
-        self, residual: Float[np.ndarray, "r k"]
-    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Scale]:
-        """1/variance of every star (0: left out), κ, and the scale of all of them.
+    def weights(self, residual: Float[np.ndarray, "r k"]) -> tuple[Weights, Scale]:
+        """Weights of the stars, and the scale of all of them.
 
         A change that stars of a night have in common is no noise: where χ² is not what N_ERR says, weights come from
         the scatter about the gains that fit each group best, if there are stars enough to know it.
         """
-        weight, share, scale, off = self._scaled(residual, np.zeros(len(self.time)))
+        weights, scale, off = self._scaled(residual, np.zeros(len(self.time)))
         # The gains, then their gradients as well if the scatter about the gains is not that of noise.
         for kinds in (1, 3):
             for _ in range(ABOUT_GAINS if off else 0):
-                remaining, fitted = self._behind_gains(residual, weight, share, kinds * len(self.cameras))
+                remaining, fitted = self._behind_gains(residual, weights, kinds * len(self.cameras))
                 rescaled = self._scaled(remaining, fitted)
-                if rescaled[2].worth < FEW:
-                    return weight, share, scale
-                weight, share, _, off = rescaled
-        return weight, share, scale
+                if rescaled[1].worth < FEW:
+                    return weights, scale
+                weights, _, off = rescaled
+        return weights, scale
 
     def _scaled(
         self, residual: Float[np.ndarray, "r k"], fitted: Float[np.ndarray, " g"]
-    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Scale, bool]:
-        """Weights behind numbers fitted in every group, κ, the scale; True if any scale is not that of N_ERR."""
+    ) -> tuple[Weights, Scale, bool]:
+        """Weights behind numbers fitted in every group, the scale; True if any scale is not that of N_ERR."""
         chi2 = self.stars.chi2(residual) / self.variance
         dof, alarm = self.stars.dof.astype(float), ALARM / (len(self.time) + 1)
         least = 1.0 if np.median(self.variance) > CROWDED else 0.0
@@ -240,18 +245,14 @@ class Watching:
             larger = of_few(local, self.alarm) if fitted.any() else 1.0
             variance = max(local.value, least) * larger if mine else common
             weight[members], share[members] = np.where(local.kept, 1.0 / variance, 0.0), local.share
-        return weight / self.variance, share, overall, several
+        return Weights(weight / self.variance, share), overall, several
 
     def _behind_gains(
-        self,
-        residual: Float[np.ndarray, "r k"],
-        weight: Float[np.ndarray, " s"],
-        share: Float[np.ndarray, " s"],
-        count: int,
+        self, residual: Float[np.ndarray, "r k"], weights: Weights, count: int
     ) -> tuple[Float[np.ndarray, "r k"], Float[np.ndarray, " g"]]:
         """Residuals behind the first `count` columns as they fit each group best, and how many numbers these are."""
         groups = len(self.time)
-        blocks, slopes = self._by_group(*self.scan(residual, weight, share))
+        blocks, slopes = self._by_group(*self.scan(residual, weights))
         size, fitted = np.zeros((groups, count)), np.zeros(groups)
         for g in range(groups):
             root = whitening(blocks[g, :count, g, :count], SINGULAR)
@@ -266,10 +267,7 @@ class Watching:
     # -------------------------------------------------------------------------------------------- columns
 
     def scan(
-        self,
-        residual: Float[np.ndarray, "r k"],
-        weight: Float[np.ndarray, " s"],
-        share: Float[np.ndarray, " s"],
+        self, residual: Float[np.ndarray, "r k"], weights: Weights
     ) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
         """Q and g of `columns` in all groups (group, column), errors of the calibration eliminated."""
         stars, count, groups = self.stars, self.readings.columns_count, len(self.time)
@@ -279,7 +277,7 @@ class Watching:
         score, pull = np.zeros(groups * count), np.zeros(nuisances)
         diagonal = np.zeros((groups, count))
         for numbers, rows, subset in stars.blocks():
-            group, w, k = self.group[rows], weight[numbers], share[numbers]
+            group, w, k = self.group[rows], weights.inverse[numbers], weights.share[numbers]
             values = np.concatenate([self.readings.columns(subset), self._errors(subset)], axis=-1)
             np.add.at(diagonal, group, np.sum(values[..., :count] ** 2, axis=1) * (w * k)[subset.star, None])
             free, along = subset.projected(values)
@@ -292,7 +290,7 @@ class Watching:
             mixed = np.einsum("arc,nrc->ran", shapes, free[count:], optimize=True)
             np.add.at(cross.reshape(groups, count, nuisances), group, mixed)
             nuisance += nuisance_columns @ nuisance_columns.T
-            # What the stars take by their q and u: sums over the rows of a star in each group.
+            # The part taken by q and u of the stars: sums over the rows of a star in each group.
             half = np.linalg.cholesky(subset.photon).swapaxes(1, 2)
             row = half[subset.star] @ np.einsum("rik,ark->ria", subset.tangent, shapes, optimize=True)
             pair, where = np.unique(subset.star * groups + group, return_inverse=True)
@@ -321,7 +319,7 @@ class Watching:
         of_star: Int[np.ndarray, " p"],
         of_group: Int[np.ndarray, " p"],
     ) -> None:
-        """Take what the stars take from the matrix: between all groups that a star is in."""
+        """Subtract the part taken by the stars, between all groups that a star is in."""
         pairs = np.bincount(of_star)
         alone = pairs[of_star] == 1
         products = np.einsum("pia,pib->pab", sums[alone], sums[alone])
@@ -347,10 +345,10 @@ class Watching:
     def _errors(self, part: StarResiduals) -> Float[np.ndarray, "r k n"]:
         return np.concatenate([part.parameters() @ self.root, part.colour], axis=-1)
 
-    def suspects(self, found: Answers) -> list[Suspect]:
+    def suspects(self, found: Answers) -> list[PossibleChange]:
         """Every reading with the histories compared, the most significant first; those too large for theirs last."""
         listed = [
-            Suspect(
+            PossibleChange(
                 reading.name, reading.kind != "optics", self.histories[n], float(found.size[n, k]),
                 float(found.error[n, k]), reading.unit, reading.kind,
                 () if reading.across is None else (float(found.angle[n, k]),),
@@ -362,7 +360,7 @@ class Watching:
         return sorted(listed, key=lambda entry: (not self.readings.possible(entry), -abs(entry.sigma)))
 
     def without(
-        self, residual: Float[np.ndarray, "r k"], change: Suspect, size: float
+        self, residual: Float[np.ndarray, "r k"], change: PossibleChange, size: float
     ) -> Float[np.ndarray, "r k"]:
         """Residuals behind a change."""
         grown = change.history.over(self.time)[self.group, None] * size
@@ -375,11 +373,11 @@ class Watching:
     def watch(self) -> Watch:
         """Changes, the strongest first, until nothing is left."""
         residual, changes = self.stars.residual, []
-        weight, share, scale = self.weights(residual)
-        matrix, score = self.scan(residual, weight, share)
+        weights, scale = self.weights(residual)
+        matrix, score = self.scan(residual, weights)
         while len(changes) < _MOST_CHANGES:
             answers = self.answers(matrix, score)
-            ways = [self.spotted(residual, weight, share)]
+            ways = [self.spotted(residual, weights)]
             if np.abs(answers.size / answers.error).max() > self.alarm:
                 ways.append(self.settled(residual, answers))
             if (chosen := self._likeliest([way for way in ways if way is not None])) is None:
@@ -389,18 +387,16 @@ class Watching:
             if change.best.kind == "spot":
                 x, y, radius, edge = change.best.place
                 self.spoilt |= profile(self.spots.x, self.spots.y, (x, y, 1.5 * radius, edge)) > 0
-            weight, share, scale = self.weights(residual)
-            matrix, score = self.scan(residual, weight, share)
-        remarks = self.alone(residual, weight, scale)
+            weights, scale = self.weights(residual)
+            matrix, score = self.scan(residual, weights)
+        remarks = self.alone(residual, weights, scale)
         return dataclasses.replace(self.told(changes, matrix, score, scale), remarks=remarks)
 
-    def alone(
-        self, residual: Float[np.ndarray, "r k"], weight: Float[np.ndarray, " s"], whole: Scale
-    ) -> tuple[str, ...]:
+    def alone(self, residual: Float[np.ndarray, "r k"], weights: Weights, whole: Scale) -> tuple[str, ...]:
         """A remark on stars that were left out as they disagree by more than noise ever does."""
         dof = np.maximum(self.stars.dof.astype(float), 1e-12)
         chi2 = self.stars.chi2(residual) / (self.variance * max(whole.value, 1.0))
-        odd = (weight == 0) & (self.stars.dof > 0) & (chi2 > special.chdtri(dof, ALARM / len(dof)))
+        odd = (weights.inverse == 0) & (self.stars.dof > 0) & (chi2 > special.chdtri(dof, ALARM / len(dof)))
         if not odd.any():
             return ()
         worst = self.stars.first[np.argmax(np.where(odd, chi2, 0.0))]
@@ -430,17 +426,17 @@ class Watching:
         return self.readings.answers(*self._by_group(matrix, score), self.shapes)
 
     def settled(self, residual: Float[np.ndarray, "r k"], answers: Answers) -> Settled:
-        """A change with its rivals, and what is left behind it.
+        """A change with its rivals, and the residuals behind it.
 
         Histories compared are the best of each kind and camera and their neighbours. The fit is repeated with the
         stars that it keeps.
         """
-        best: Suspect | None = None
+        best: PossibleChange | None = None
         total, remaining, alike = 0.0, residual, []
         for _ in range(_ROUNDS):
             if best is not None:
-                weight, share, _ = self.weights(remaining)
-                answers = self.answers(*self.scan(self.without(remaining, best, -total), weight, share))
+                weights, _ = self.weights(remaining)
+                answers = self.answers(*self.scan(self.without(remaining, best, -total), weights))
             ranked = self.suspects(answers)
             if abs(ranked[0].sigma) < self.alarm or not self.readings.possible(ranked[0]):
                 ranked.sort(key=lambda entry: -abs(entry.sigma))
@@ -453,7 +449,8 @@ class Watching:
             moved = abs(best.size - total) / best.error
             total = best.size
             remaining = self.without(residual, best, total)
-            if before is not None and before.thing == best.thing and moved < _SETTLED:
+            same = before is not None and (*before.thing, before.history) == (*best.thing, best.history)
+            if same and moved < _SETTLED:
                 break
         assert best is not None
         if not self.readings.possible(best):
@@ -461,26 +458,19 @@ class Watching:
             alike = [best]
         return self._dated(best, alike), remaining
 
-    def _dated(self, best: Suspect, alike: list[Suspect]) -> WatchedChange:
+    def _dated(self, best: PossibleChange, alike: list[PossibleChange]) -> WatchedChange:
         began = self.time[[entry.history.start for entry in alike]]
         when = float(self.time[best.history.start]), (float(began.min()), float(began.max()))
         return WatchedChange(best, tuple(alike), *when)
 
-    def spotted(
-        self,
-        residual: Float[np.ndarray, "r k"],
-        weight: Float[np.ndarray, " s"],
-        share: Float[np.ndarray, " s"],
-    ) -> Settled | None:
-        """A step in a spot of the field, and what is left behind it; None where noise makes as much."""
+    def spotted(self, residual: Float[np.ndarray, "r k"], weights: Weights) -> Settled | None:
+        """A step in a spot of the field, and the residuals behind it; None where noise makes as much."""
         # Stars that lie off may be those of the spot.
         common = np.zeros(len(self.time) + 1)
-        np.maximum.at(common, self.pool, weight * self.variance)
-        variances, members = common[self.pool] / self.variance, self.readings.members
+        np.maximum.at(common, self.pool, weights.inverse * self.variance)
+        of_all, members = weights._replace(inverse=common[self.pool] / self.variance), self.readings.members
         strongest: tuple[SpotFound, int, Any, Any] | None = None
-        for start, (z, root) in enumerate(
-            of_stars(self.stars, self.group, members, residual, variances, share)
-        ):
+        for start, (z, root) in enumerate(of_stars(self.stars, self.group, members, residual, of_all)):
             z[self.spoilt] = 0.0
             spot = self.spots.strongest(z)
             if spot is not None and spot.strength > max(
@@ -491,22 +481,14 @@ class Watching:
             return None
         spot, start, z, root = strongest
         place, described = self.spots.refined(spot, z, root)
-        best = Suspect(
-            self.readings.of_cameras[spot.unit].name,
-            True,
-            History("step", start),
-            0.0,
-            np.inf,
-            "",
-            "spot",
-            place,
-        )
-        ranked, weight = [best], np.where(described, variances, weight)
+        name, since = self.readings.of_cameras[spot.unit].name, History("step", start)
+        ranked = [PossibleChange(name, True, since, kind="spot", place=place)]
+        weights = weights._replace(inverse=np.where(described, of_all.inverse, weights.inverse))
         for _ in range(2):  # which cameras, and from when on
             best = ranked[0]
             questions = [best._replace(name=reading.name) for reading in self.readings.of_cameras]
             questions += [best._replace(history=History("step", g)) for g in range(len(self.time))]
-            if not (ranked := self._sized(residual, questions, weight, share)):
+            if not (ranked := self._sized(residual, questions, weights)):
                 return None
         best = ranked[0]
         if abs(best.sigma) < self.alarm_of_spots or not self.readings.possible(best):
@@ -515,12 +497,8 @@ class Watching:
         return self._dated(best, alike), self.without(residual, best, best.size)
 
     def _sized(
-        self,
-        residual: Float[np.ndarray, "r k"],
-        asked: list[Suspect],
-        weight: Float[np.ndarray, " s"],
-        share: Float[np.ndarray, " s"],
-    ) -> list[Suspect]:
+        self, residual: Float[np.ndarray, "r k"], asked: list[PossibleChange], weights: Weights
+    ) -> list[PossibleChange]:
         """Changes with size and error, each alone, the most significant first; without those that no star sees."""
 
         def columns(part: StarResiduals, rows: slice) -> Float[np.ndarray, "r k c"]:
@@ -530,7 +508,7 @@ class Watching:
             ]
             return np.concatenate([np.stack(steps, axis=-1), self._errors(part)], axis=-1)
 
-        matrix, score = normal_matrix(self.stars, residual, columns, weight, share)
+        matrix, score = normal_matrix(self.stars, residual, columns, weights)
         count, diagonal = len(asked), np.diag(matrix)
         matrix = matrix + np.diag((np.arange(len(matrix)) >= count).astype(float))
         remaining, pull = eliminated(matrix, score, count)
@@ -561,7 +539,7 @@ class Watching:
         score: Float[np.ndarray, " c"],
         whole: Scale,
     ) -> Watch:
-        """The record: gains are what is left behind the changes, and the changes that each camera may be."""
+        """The record: gains are those behind the changes, and the changes that each camera may be."""
         groups, cameras = len(self.time), len(self.cameras)
         blocks, slopes = self._by_group(matrix, score)
         gain, error, smallest = (np.full((groups, cameras), np.nan) for _ in range(3))
@@ -575,7 +553,9 @@ class Watching:
                 gain[:, k] += 0.0 if mine is None else mine.size * mine.history.over(self.time)
             error[:, k] = np.where(variances > 0, variances, np.nan) ** -0.5
             information = np.einsum("gh,gf,fh->h", steps, blocks[:, k, :, k], steps, optimize=True)
-            smallest[:, k] = (self.alarm + SEEN) * np.where(information > 0, information, np.nan) ** -0.5
+            smallest[:, k] = (self.alarm + MOST_LIKELY) * np.where(
+                information > 0, information, np.nan
+            ) ** -0.5
         chi2 = self.stars.chi2(self.stars.residual)
         dof = self.stars.dof
         pairs = np.unique(self.stars.star * groups + self.group)

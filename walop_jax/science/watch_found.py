@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,83 +11,28 @@ from jaxtyping import Float, Int
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import some, two_digits, with_minus_sign
-from walop_jax.science.catalogue_check import NOISE_MATTERS, ChangeQuestion
+from walop_jax.science.catalogue_check import NOISE_MATTERS
+from walop_jax.science.instrument_changes import UNNAMED, InstrumentChange, PossibleChange
 
 SCATTERED = 4.0
 """χ² per degree of freedom from which stars in which no change is found do not say that a calibration holds."""
-_DATE = 1e3  # times above are dates, not numbers of groups
-
-
-class History(NamedTuple):
-    """Course of a change: `kind` is step, drift or once; `start` the group it began in."""
-
-    kind: str
-    start: int
-
-    def over(self, time: Float[np.ndarray, " g"]) -> Float[np.ndarray, " g"]:
-        """Its size in every group, 1 at most."""
-        number = np.arange(len(time))
-        if self.kind == "once":
-            return (number == self.start).astype(float)
-        if self.kind == "step":
-            return (number >= self.start).astype(float)
-        return np.clip((time - time[self.start]) / max(time[-1] - time[self.start], 1e-300), 0.0, 1.0)
-
-
-UNNAMED = "unnamed"
-"""Kind and name of a change that nothing in its range describes."""
-
-
-class Suspect(NamedTuple):
-    """Possible change: of cameras or a number of the optics, by how much, and its significance.
-
-    `kind` is gain (a camera), arm (its cameras together, NAME+NAME), gradient or spot (of a camera or an arm), optics,
-    or `UNNAMED`. `place` is the direction of a gradient (deg, from X towards Y), whose size is that at the edge of the
-    field, or centre and radius (deg) and the sharpness of the edge (`watch_spots`) of a spot, whose size is that at
-    its centre.
-    """
-
-    name: str
-    camera: bool
-    history: History
-    size: float
-    error: float
-    unit: str
-    kind: str = "gain"
-    place: tuple[float, ...] = ()
-
-    @property
-    def members(self) -> tuple[str, ...]:
-        """The cameras that it is of."""
-        return tuple(self.name.split("+")) if self.camera else ()
-
-    @property
-    def of_gain(self) -> bool:
-        """True if cameras have changed as a whole."""
-        return self.kind in ("gain", "arm")
-
-    @property
-    def thing(self) -> tuple[str, str, History]:
-        """Kind and name of the change, and its course in time."""
-        return self.kind, self.name, self.history
-
-    @property
-    def sigma(self) -> float:
-        """Size in standard errors."""
-        return self.size / self.error
+FIRST_DATE = 1e3  # times above are dates, not numbers of groups
+_COURSES = {
+    "step": "from {} on",
+    "drift": "at the end, drifting since {}",
+    "once": "in the exposures of {} only",
+}
 
 
 @dataclasses.dataclass(frozen=True)
-class WatchedChange:
-    """A change: the best description, those that describe the stars as well, and when (MJD, or the group's number).
+class WatchedChange(InstrumentChange):
+    """A change and when it began (MJD, or the number of the group).
 
-    It began at `time`, or, as others describe the stars as well, at any `between` the first and the last of theirs.
+    That is at `time`, or, as others describe the stars as well, at any `between` the first and the last of theirs.
     """
 
-    best: Suspect
-    alike: tuple[Suspect, ...]
-    time: float
-    between: tuple[float, float]
+    time: float = np.nan
+    between: tuple[float, float] = (np.nan, np.nan)
 
     @property
     def camera(self) -> str | None:
@@ -99,35 +44,16 @@ class WatchedChange:
     def words(self) -> str:
         """The change in a sentence."""
         date, *ends = (
-            f"MJD {time:.4f}" if time > _DATE else f"group {time:g}" for time in (self.time, *self.between)
+            f"MJD {time:.4f}" if time > FIRST_DATE else f"group {time:g}"
+            for time in (self.time, *self.between)
         )
-        how = {
-            "step": "from {} on",
-            "drift": "at the end, drifting since {}",
-            "once": "in the exposures of {} only",
-        }
-        when = how[self.best.history.kind].format(date)
+        when = _COURSES[self.best.history.kind].format(date)
         spread = f"; it began between {ends[0]} and {ends[1]}" if ends[0] != ends[1] else ""
         significance = f"({abs(self.best.sigma):.0f} σ{spread})"
-        rivals = {e.thing[:2]: e for e in self.alike if e.thing[:2] != self.best.thing[:2]}
-        if not rivals:
-            return f"{_words(self.best)} {when} {significance}"
-        listed = some([_words(entry) for entry in (self.best, *rivals.values())], 5, " or ")
-        return f"{when} {significance}, one of these, which the stars cannot tell apart: {listed}"
-
-
-def _words(entry: Suspect) -> str:
-    if entry.kind == UNNAMED:
-        return "a change that no camera, arm or place of the field makes, nor a number of the optics within its range"
-    size, error, where = entry.size, entry.error, ""
-    if entry.kind == "gradient":
-        where = f" at the edge of the field {round(entry.place[0]) % 360}° from X towards Y"
-    elif entry.kind == "spot":
-        x, y, radius = (with_minus_sign(f"{value:.3f}") for value in entry.place[:3])
-        where = f" in a spot at X = {x}°, Y = {y}°, within {radius}°"
-    kind, camera = ("gain", 0) if entry.camera else ("optics", -1)
-    name = " and ".join(entry.members) or entry.name
-    return ChangeQuestion(kind, name, entry.unit, camera).words(size, error) + where
+        if not self.rivals:
+            return f"{self.best.words()} {when} {significance}"
+        either = some([entry.words() for entry in (self.best, *self.rivals)], 5, " or ")
+        return f"{when} {significance}, one of these, which the stars cannot tell apart: {either}"
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -160,7 +86,7 @@ class Watch(Displayed):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A sentence for every change, and one if N_ERR is not what the counts scatter by."""
+        """A sentence for every change, and one if the counts do not scatter by N_ERR."""
         texts = (*(change.words() for change in self.changes), *self.remarks)
         if 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS:
             return texts
@@ -172,7 +98,7 @@ class Watch(Displayed):
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
 
-        def plain(entry: Suspect) -> dict[str, Any]:
+        def plain(entry: PossibleChange) -> dict[str, Any]:
             start = float(self.time[entry.history.start])
             return entry._asdict() | {"history": entry.history.kind, "start": start, "sigma": entry.sigma}
 
@@ -224,11 +150,11 @@ class Watch(Displayed):
         return astropy_table(columns)
 
     def display(self) -> Display:
-        """The verdict, what has changed, what would have been seen, and the groups."""
+        """The verdict, the changes, the smallest step seen, and the groups."""
         percent = 100.0
         rows = tuple(
             (
-                f"{self.time[g]:.4f}" if self.time[g] > _DATE else f"{self.time[g]:g}",
+                f"{self.time[g]:.4f}" if self.time[g] > FIRST_DATE else f"{self.time[g]:g}",
                 f"{self.stars[g]}",
                 f"{self.chi2[g]:.2f}",
                 *(

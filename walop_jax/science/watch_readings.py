@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.science.instrument_changes import PossibleChange
 from walop_jax.science.star_residuals import ROUNDING, StarResiduals
-from walop_jax.science.watch_found import Suspect
 from walop_jax.science.watch_spots import profile
 
 FARTHEST = 10.0
@@ -96,7 +96,7 @@ class Readings:
         x, y = (gains * (place / self.edge)[:, None, None] for place in (part.x, part.y))
         return np.concatenate([gains, x, y, part.plain[..., self.seen]], axis=-1)
 
-    def signature(self, part: StarResiduals, change: Suspect) -> Float[np.ndarray, "r k"]:
+    def signature(self, part: StarResiduals, change: PossibleChange) -> Float[np.ndarray, "r k"]:
         """The change of the counts over σ by a change of unit size, where it is largest in time."""
         if change.kind == "spot":
             cameras = np.array([name in change.members for name in self.cameras])
@@ -108,11 +108,11 @@ class Readings:
                 weight[column] += factor * value
         return self.columns(part) @ weight
 
-    def possible(self, change: Suspect) -> bool:
+    def possible(self, change: PossibleChange) -> bool:
         """True unless a number of the optics would have to change by more than it can."""
         return abs(change.size) <= (1.0 if change.kind == "spot" else self._of(change).widest)
 
-    def _of(self, change: Suspect) -> Reading:
+    def _of(self, change: PossibleChange) -> Reading:
         return next(
             reading for reading in self.listed if (reading.kind, reading.name) == (change.kind, change.name)
         )

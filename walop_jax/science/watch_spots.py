@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import optimize, sparse, spatial, special
 
-from walop_jax.science.star_residuals import FEW, ROUNDING, TRIMMED, StarResiduals
+from walop_jax.science.star_residuals import FEW, ROUNDING, TRIMMED, StarResiduals, Weights
 
 RADII = (0.5, 0.25, 0.125)  # of the distance of the edge of the field
 WIDEST = 0.7  # the same, of any spot
@@ -120,21 +120,20 @@ def of_stars(
     group: Int[np.ndarray, " r"],
     members: Float[np.ndarray, "k c"],
     residual: Float[np.ndarray, "r k"],
-    weight: Float[np.ndarray, " s"],
-    share: Float[np.ndarray, " s"],
+    weights: Weights,
 ) -> Iterator[tuple[Float[np.ndarray, "s c"], Float[np.ndarray, "s c"]]]:
     """For every exposure group the gain of cameras from it on, by each star alone, in standard errors; and 1/σ of it.
 
-    Both are 0 where a star does not see it. `members` are 1 for the cameras that are taken together; weights are those
-    of `normal_matrix`.
+    Both are 0 where a star does not see it. `members` are 1 for the cameras that are taken together.
     """
     columns: list[list[np.ndarray]] = [[], [], [], []]
     for numbers, rows, subset in stars.blocks():
-        heavy = np.sqrt(weight[numbers] * share[numbers])[subset.star, None]
+        inverse = weights.inverse[numbers]
+        heavy = np.sqrt(inverse * weights.share[numbers])[subset.star, None]
         free, _ = subset.projected(subset.model[..., None] * members)
         half = np.linalg.cholesky(subset.photon).swapaxes(1, 2)[subset.star]
         along = half @ np.einsum("rik,ark->ria", subset.tangent, free, optimize=True)
-        columns[0].append((subset.model * residual[rows]) @ members * weight[numbers][subset.star, None])
+        columns[0].append((subset.model * residual[rows]) @ members * inverse[subset.star, None])
         columns[1].append(np.sum(free**2, axis=-1).T * heavy**2)
         columns[2].append(along * heavy[..., None])
         columns[3].append(subset.model**2 @ members * heavy**2)

@@ -356,5 +356,5 @@ class InExposures:
 
 
 def in_exposures(change: Change, exposures: ExposureArrays, x: Any = 0.0, y: Any = 0.0) -> Float[Array, " e"]:
-    """The factor of a change in every exposure, 0 where what it asks for is not known."""
+    """The factor of a change in every exposure, 0 where the condition that it needs is unknown."""
     return jnp.nan_to_num(change.factor(InExposures(exposures, x, y))) * jnp.ones(exposures.hours.shape[0])
