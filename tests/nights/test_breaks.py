@@ -101,7 +101,7 @@ def test_of_names_that_explain_a_break_alike_one_that_stars_can_be_corrected_for
     data = series(7, change)
     (first,) = breaks.find(data, LAWS, ())[0]
     assert first.alike
-    (second,), laws, _ = breaks.find(data, LAWS, (), lambda name: name != first.name)
+    (second,), laws, _ = breaks.find(data, LAWS, (), lambda parameter: parameter.name != first.name)
     assert second.name in first.alike
     assert first.name in second.alike
     assert second.z**2 > first.z**2 - breaks.RIVAL
