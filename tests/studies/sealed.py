@@ -6,8 +6,8 @@ What is hidden in a set depends on its number and the seed alone, and is drawn f
 line with the sentences of a diagnosis (kinds, places and factors are other ones), and its light path is that of
 `tests/oracle`. A twelfth of the sets each holds nothing, or a mistake of the tables; the others
 
-    optics       M → (1 + a g f s A) M at a place of the train: ahead of the polariser, in it and turning with it,
-                 behind it, behind the collimator, ahead of the analyser of one half
+    optics       M → exp(a g f s A) M, to second order, at a place of the train: ahead of the polariser, in it and
+                 turning with it, behind it, behind the collimator, ahead of the analyser of one half
     detectors    counts of a camera or a half × (1 + a g f), or × (1 + a g (N/N₀)^γ), or + a share of the light of
                  another place of the same camera
     sky          polarisation added to the Moon sky, or to standards, by a law of time, angle or star
@@ -281,9 +281,9 @@ def counts(
         elif one.where == "polariser":  # a layer that turns with it
             two = 2 * np.radians(np.nan_to_num(data["clp_angle"]))
             back = np.stack([state[:, 0], *_turned(state, two), state[:, 3]], axis=1)
-            own = back @ one.generator.T
+            own = h * (back @ one.generator.T) + 0.5 * h**2 * (back @ one.second.generator.T)
             turned = np.stack([own[:, 0], *_turned(own, -two), own[:, 3]], axis=1)
-            state = np.where(data["clp_in"][:, None], state + h * turned, state)
+            state = np.where(data["clp_in"][:, None], state + turned, state)
         elif one.where in ("moon", "standards"):
             chosen = data["kind"] == ("moon" if one.where == "moon" else "standard")
             angle = 6.0 * one.generator[1, 2] + (0.0 if one.where == "moon" else 1.0) * data["source"]
@@ -297,6 +297,9 @@ def counts(
         band = forward.gauss(*forward.band(*data["filters"][name][:2], teff), NODES)
         plain, added = vectors(params, x, y, band, one)
         seen = plain[row[here]] + g[here, None, None] * added[row[here]]
+        if one is not None:
+            square = vectors(params, x, y, band, one.second)[1]
+            seen += (g[here] ** 2)[:, None, None] * square[row[here]]
         light[here] = np.einsum("rki,ri->rk", seen, state[here])
     brightness = np.random.default_rng(len(row)).uniform(0.7, 1.0, len(row))
     expected = 4.0 * ELECTRONS * brightness[:, None] * light
@@ -328,7 +331,7 @@ def truth(
     seen = plain
     if one is not None:
         h = one.star * one.size * one.field(x, y)
-        seen = plain + one.star * added
+        seen = plain + one.star * added + one.star**2 * vectors(params, x, y, band, one.second)[1]
         if one.where == "ahead of polariser":
             seen = seen + h[:, None, None] * (seen @ one.generator)
         elif one.where == "gain":

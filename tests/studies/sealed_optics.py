@@ -39,6 +39,16 @@ class Hidden(NamedTuple):
     cameras: np.ndarray
     gamma: float = 0.0
 
+    @property
+    def second(self) -> Hidden:
+        """The term ½ h² A² of exp(h A): without it counts behind crossed polarisers would be negative."""
+        return self._replace(
+            size=0.5 * self.size**2,
+            generator=self.generator @ self.generator,
+            field=lambda x, y: self.field(x, y) ** 2,
+            colour=lambda w: self.colour(w) ** 2,
+        )
+
 
 def vectors(
     params: dict[str, Any],

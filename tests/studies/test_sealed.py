@@ -50,6 +50,19 @@ def test_light_that_is_lost_everywhere_is_a_matter_of_throughput(where):
     np.testing.assert_allclose(added, lost, atol=1e-15)
 
 
+def test_crossed_polarisers_give_no_less_than_no_light():
+    """A turn of 10⁻³ rad behind the polariser: rows of the matrix exponential, to the third order of the turn."""
+    turn = np.zeros((4, 4))
+    turn[1, 2], turn[2, 1] = -1.0, 1.0
+    one = hidden("behind polariser", turn, field=lambda x, y: np.ones(x.shape))
+    plain, added = vectors(params(), X, Y, BAND, one)
+    seen = plain + added + vectors(params(), X, Y, BAND, one.second)[1]
+    turned = np.array([[np.cos(1e-3), -np.sin(1e-3)], [np.sin(1e-3), np.cos(1e-3)]])
+    exact = plain.copy()
+    exact[..., 1:3] = plain[..., 1:3] @ turned
+    np.testing.assert_allclose(seen, exact, atol=1e-9)
+
+
 def test_a_drawn_perturbation_is_near_a_physical_one():
     """To first order no light gains a degree of polarisation beyond 1."""
     rng = np.random.default_rng(1)
