@@ -69,6 +69,7 @@ WORSE = 1.2
 PLACES, STAR_SECONDS = 400, 60.0
 NODES = 24  # of the band: 10⁻⁹ of the whole table
 ELECTRONS = 1e6
+EDGES, BAND = np.linspace(-0.3, 0.3, 25), np.linspace(0.54, 0.71, 35)
 
 
 # ------------------------------------------------------------------------------------------------------- what is drawn
@@ -176,14 +177,17 @@ def draw(rng: np.random.Generator, calset: CalibrationSet) -> Hidden:
     if where in ("moon", "standards"):
         star = 0.0
     size = 10.0 ** rng.uniform(-3.6, -2.1)
+    made, colour = generators(rng), over_colour(rng)
+    if min(field(*np.meshgrid(EDGES, EDGES)).min(), colour(BAND).min(), values.min()) < 0.0:
+        made[np.diag_indices(4)] = 0.0  # a depolariser with the other sign would polarise
     text = f"{where}, {field_name}, {law_name}, {size:.1e}"
     return Hidden(
         text,
         where,
         size,
-        generators(rng),
+        made,
         field,
-        over_colour(rng),
+        colour,
         values,
         star,
         cameras,
