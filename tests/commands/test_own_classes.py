@@ -31,7 +31,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from walop_jax.model.elements import Element
+from walop_jax.model.elements.base import Element
 from walop_jax.model.parameters import number
 
 

@@ -24,7 +24,7 @@ def test_every_command_states_the_largest_of_one_table():
     (check,) = [one for one in walop.certify(fitted).checks if one.name == "protection"]
     assert percent(facts["undetectable"]) == percent(level) == percent(check.found)
     worst = limits.mistakes[0]
-    assert worst.name in facts["from"]
+    assert worst.name in facts["caused by"]
     assert worst.name in level
     assert worst.name in check.found
     assert worst.error[0] == max(one.error[0] for one in limits.mistakes)

@@ -100,7 +100,7 @@ def calibration_of(given: Product, effects: Effects = None) -> Calibration:
     from walop_jax.calibration.product import read_calibration
 
     held: Any = fit_of(given)
-    if isinstance(held, Fitted):
+    if isinstance(held, Fitted) and not hasattr(held, "folder"):  # a `Run` is read again
         there = held if isinstance(held, Calibration) else Calibration.from_fit(held)  # pyright: ignore[reportArgumentType]
         return there if there.path is not None else dataclasses.replace(there, path=Path(IN_MEMORY))
     return read_calibration(folder_of(held), catalogue_of(effects))
