@@ -51,9 +51,9 @@ def mixture(weights: Vector, values: Float[np.ndarray, "k n"], covariances: Sequ
 def known_apart_from(covariance: Matrix, at: Int[np.ndarray, " k"]) -> Matrix:
     """Covariance of all others once the parameters `at` are known: C − C_a C_aa⁺ C_aᵀ, 0 in their own rows."""
     across = covariance[:, at]
-    left = covariance - across @ pseudo_inverse(covariance[np.ix_(at, at)], 1e-12) @ across.T
-    left[at], left[:, at] = 0.0, 0.0
-    return 0.5 * (left + left.T)
+    conditional = covariance - across @ pseudo_inverse(covariance[np.ix_(at, at)], 1e-12) @ across.T
+    conditional[at], conditional[:, at] = 0.0, 0.0
+    return 0.5 * (conditional + conditional.T)
 
 
 def moved(others: Matrix, basis: Matrix, rows: Float[np.ndarray, "r ..."]) -> Float[np.ndarray, "f ..."]:
@@ -62,8 +62,8 @@ def moved(others: Matrix, basis: Matrix, rows: Float[np.ndarray, "r ..."]) -> Fl
     `basis` is an orthonormal one of the columns.
     """
     unit, norm = unit_columns(others)
-    found = np.linalg.lstsq(basis.T @ unit, -(basis.T @ rows), rcond=None)[0]
-    return found / norm.reshape(-1, *[1] * (rows.ndim - 1))
+    scaled = np.linalg.lstsq(basis.T @ unit, -(basis.T @ rows), rcond=None)[0]
+    return scaled / norm.reshape(-1, *[1] * (rows.ndim - 1))
 
 
 def distinct(

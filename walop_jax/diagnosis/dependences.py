@@ -70,8 +70,8 @@ class Dependences:
 
     def of(self, form: str) -> Iterator[tuple[str, ...]]:
         """The groups of one form."""
-        name, _, most = form.partition(" to ")
-        yield from getattr(self, f"_{name.replace(' ', '_').lower()}")(*map(int, most.split()))
+        name, _, limit = form.partition(" to ")
+        yield from getattr(self, f"_{name.replace(' ', '_').lower()}")(*map(int, limit.split()))
 
     def _steady(self) -> Iterator[tuple[str, ...]]:
         yield ("",)
@@ -148,9 +148,9 @@ class Dependences:
     def _spell(self) -> Iterator[tuple[str, ...]]:
         """From a time until another: all of them, or of many exposures an eighth, a quarter or half of them."""
         times = self._moments()
-        some, lengths = evenly(times), (STEPS // 8, STEPS // 4, STEPS // 2)
-        each = itertools.chain(*(zip(some, some[length:], strict=False) for length in lengths))
-        for spell in itertools.combinations(times, 2) if len(times) <= FEW else each:
+        starts, lengths = evenly(times), (STEPS // 8, STEPS // 4, STEPS // 2)
+        spells = itertools.chain(*(zip(starts, starts[length:], strict=False) for length in lengths))
+        for spell in itertools.combinations(times, 2) if len(times) <= FEW else spells:
             yield (between(*spell),)
 
     def _night(self) -> Iterator[tuple[str, ...]]:
@@ -176,11 +176,11 @@ class Dependences:
 
     def _patch(self) -> Iterator[tuple[str, ...]]:
         """Every patch of the Moon sky, which is an exposure, and all of them."""
-        each = [f"exposure {number}" for number in np.flatnonzero(self.exposures.direct("moon"))]
-        if 0 < len(each) <= limits.FREE_EXPOSURES:
-            yield from zip(each)
-            if len(each) > 1:
-                yield tuple(each)
+        patches = [f"exposure {number}" for number in np.flatnonzero(self.exposures.direct("moon"))]
+        if 0 < len(patches) <= limits.FREE_EXPOSURES:
+            yield from zip(patches)
+            if len(patches) > 1:
+                yield tuple(patches)
 
 
 def varies(values: np.ndarray) -> bool:

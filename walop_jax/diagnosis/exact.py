@@ -86,14 +86,14 @@ def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
 
     Priors of amplitudes are those of the fit at all `SCALES`.
     """
-    known, model = set(base.model.names), extended.model
+    base_names, model = set(base.model.names), extended.model
     widths = [
         p.prior[1] if p.prior is not None else (p.loose or p.scale)
         for p in model.parameters
-        if p.name not in known and p.free and p.tie is None
+        if p.name not in base_names and p.free and p.tie is None
     ]
     amplitudes = [i for effect in model.effect_names for i in amplitude_positions(model, effect)]
-    at = [i for i in amplitudes if model.names[i] not in known]
+    at = [i for i in amplitudes if model.names[i] not in base_names]
     gain = 0.5 * (base.posterior.objective - extended.posterior.objective)
     occam = 0.5 * (_log_determinant(extended) - _log_determinant(base))
     at_all_scales = _of_amplitudes(extended, at) - _of_amplitudes(extended, at, np.ones(1))
@@ -121,14 +121,14 @@ def try_effect(base: FitResult, instance: Effect, context: Context, prior_shapes
     )
 
 
-def try_sentences(base: FitResult, said: Described, context: Context, count: int) -> Trial:
+def try_sentences(base: FitResult, description: Described, context: Context, count: int) -> Trial:
     """Add sentences to the fitted model, beside those that it has, and fit again; they are among `count` of them."""
     model = base.model
     if Described.name in model.effect_names:
         earlier = model.instrument(base.values).effect(Described.name)
         assert isinstance(earlier, Described)
-        said, model = earlier.joined(said), model_without(model, Described.name)
-    return try_model(base, Described, with_effects(model, [said], context), base.values, count)
+        description, model = earlier.joined(description), model_without(model, Described.name)
+    return try_model(base, Described, with_effects(model, [description], context), base.values, count)
 
 
 def try_model(
@@ -158,22 +158,24 @@ def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int) -> 
     ]
     best = max(trials, key=lambda t: t.evidence if _converged(t) else -np.inf)
     alike = [t for t in trials if _converged(t) and t.evidence > best.evidence - thresholds.EVEN_ODDS]
-    told = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best, thresholds.SEPARATION))
-    return dataclasses.replace(best, alternatives=tuple(told))
+    alternatives = dict.fromkeys(
+        in_words(t.instance) for t in alike if _differ(t, best, thresholds.SEPARATION)
+    )
+    return dataclasses.replace(best, alternatives=tuple(alternatives))
 
 
 def _converged(trial: Trial) -> bool:
     return trial.fit is not None and trial.fit.converged
 
 
-def _differ(one: Trial, other: Trial, separation: float) -> bool:
-    assert one.fit is not None
-    assert other.fit is not None
-    if one.instance.choices() != other.instance.choices():
+def _differ(first: Trial, second: Trial, separation: float) -> bool:
+    assert first.fit is not None
+    assert second.fit is not None
+    if first.instance.choices() != second.instance.choices():
         return True
-    at = one.fit.model.positions(one.effect.name)
-    sigma = np.maximum(one.fit.sigma[at], other.fit.sigma[at])
-    away = np.asarray(values_of(one.instance)) - np.asarray(values_of(other.instance))
+    at = first.fit.model.positions(first.effect.name)
+    sigma = np.maximum(first.fit.sigma[at], second.fit.sigma[at])
+    away = np.asarray(values_of(first.instance)) - np.asarray(values_of(second.instance))
     return bool(np.any(np.abs(away) > separation * np.where(sigma > 0, sigma, np.inf)))
 
 
@@ -215,13 +217,13 @@ def beyond_prior(result: FitResult, name: str) -> dict[str, float]:
     """Amplitudes of an effect that lie beyond the prior of their declaration, widened or not, in its widths."""
     effect = result.model.template.effect(name)
     declared = {f"{name}.{leaf.name}": leaf.width for leaf in leaves(effect)}
-    found = {}
+    far = {}
     for i in amplitude_positions(result.model, name):
         p = result.model.parameters[i]
         widths = abs(float(result.values[i]) - p.prior[0]) / (declared[p.name] or np.inf)  # type: ignore[index]
         if widths > PRIOR_EDGE:
-            found[p.name.removeprefix(f"{name}.")] = widths
-    return found
+            far[p.name.removeprefix(f"{name}.")] = widths
+    return far
 
 
 def evidence_of_presence(result: FitResult, name: str) -> float:
@@ -245,8 +247,8 @@ def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarra
     effect = result.model.template.effect(name)
     if effect.kind.is_structural():
         model = model_without(result.model, name)
-        kept = [result.model.index(n) for n in model.names]
-        bare = Likelihood.of(result.calset, model).residuals(result.values[kept])[1]
+        indices = [result.model.index(n) for n in model.names]
+        bare = Likelihood.of(result.calset, model).residuals(result.values[indices])[1]
     else:
         values = result.values.copy()
         values[result.model.positions(name)] = np.asarray(values_of(effect.at_neutral(context)))

@@ -60,12 +60,12 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
         alive.sort(key=lambda item: -item[1].log_bayes)
         (probe, score), best = alive[0], alive[0][1].log_bayes
         mean = float(np.logaddexp.reduce([s.log_bayes for _, s in alive]) - np.log(len(shapes)))
-        others = [
+        alternatives = [
             item
             for item in alive[1 : thresholds.MOST_SHAPES]
             if item[1].log_bayes > best - max(thresholds.WITHIN, 0.2 * best)
         ]
-        ranked.append(Ranked(effect, probe, score, mean, tuple(others)))
+        ranked.append(Ranked(effect, probe, score, mean, tuple(alternatives)))
     return sorted(ranked, key=lambda item: -item.log_bayes)
 
 
@@ -94,14 +94,14 @@ def shortest(item: Ranked, most: int = thresholds.MOST_TOGETHER) -> Described:
     information = np.linalg.pinv(item.score.covariance, hermitian=True)
     scores, widths = information @ item.score.amplitudes, item.probe.widths
 
-    def worth(some: Sequence[int]) -> float:
-        return log_bayes(information[np.ix_(some, some)], scores[some], widths[some])
+    def worth(indices: Sequence[int]) -> float:
+        return log_bayes(information[np.ix_(indices, indices)], scores[indices], widths[indices])
 
     subset = list(range(len(widths)))
-    subsets = [list(some) for n in subset for some in itertools.combinations(subset, n + 1) if n < most]
+    subsets = [list(indices) for n in subset for indices in itertools.combinations(subset, n + 1) if n < most]
     while len(subset) > most:
         subsets.append(subset)
-        subset = max(([i for i in subset if i != one] for one in subset), key=worth)
+        subset = max(([i for i in subset if i != index] for index in subset), key=worth)
     best = max(subsets, key=worth)
     amplitudes = np.linalg.lstsq(information[np.ix_(best, best)], scores[best], rcond=None)[0]
     return Described.combine([item.probe.group[i] for i in best], amplitudes)
@@ -142,10 +142,10 @@ class Evidence:
         """Sentences in order of evidence, each less what it pays for being one of so many."""
         price = float(np.log(max(len(self.sentences), 1)))  # all of them share the prior of one name
         scored = [(probe, self.table[probe.name]) for probe in self.sentences]
-        found = [
+        candidates = [
             Ranked(Described, p, score, score.log_bayes - price) for p, score in scored if score.testable
         ]
-        return sorted(found, key=lambda item: -item.log_bayes)
+        return sorted(candidates, key=lambda item: -item.log_bayes)
 
     @cached_property
     def significant(self) -> list[Ranked]:
@@ -200,10 +200,12 @@ class Evidence:
         space, scores, square = self.space, self.scores, self.square
         names, table, needed = list(self.patterns), self.table, []
         while len(needed) < thresholds.MOST_PATTERNS:
-            left = [s for s in map(table.__getitem__, names) if s.testable and self._p(s) < thresholds.ALARM]
-            if not left:
+            significant = [
+                s for s in map(table.__getitem__, names) if s.testable and self._p(s) < thresholds.ALARM
+            ]
+            if not significant:
                 break
-            best = max(left, key=lambda s: s.log_bayes)
+            best = max(significant, key=lambda s: s.log_bayes)
             needed.append((best.name, self._p(best)))
             names.remove(best.name)
             space, reduce = space.with_base([best.name])
@@ -241,7 +243,9 @@ class Evidence:
             table=space.table_after(self.table, scores),
             probes=[p for p in self.probes if p.effect is not effect or effect is Described],
             sentences=[probe for probe in self.sentences if probe is not item.probe],
-            parts=[(probe, {one for one in effects if one is not effect}) for probe, effects in self.parts],
+            parts=[
+                (probe, {kind for kind in effects if kind is not effect}) for probe, effects in self.parts
+            ],
             chi2=self.chi2 - item.score.statistic * (self.table.noise_scale * self.scale) ** 2,
             dof=self.dof - item.score.rank,
         )
@@ -261,11 +265,11 @@ class Evidence:
 
     def nearest(self, by_candidate: Mapping[str, float]) -> dict[str, float]:
         """The smallest number of each effect among those of its probes."""
-        found: dict[str, float] = {}
+        nearest: dict[str, float] = {}
         for probe in self.probes:
             effect = probe.effect.name
-            found[effect] = min(by_candidate[probe.name], found.get(effect, np.inf))
-        return found
+            nearest[effect] = min(by_candidate[probe.name], nearest.get(effect, np.inf))
+        return nearest
 
     def close(self, item: Ranked) -> tuple[str, ...]:
         """Effects that could follow what a candidate would explain, by linear steps; the nearest first."""
@@ -282,9 +286,11 @@ class Evidence:
         least, apart = max(0.0, item.log_bayes - thresholds.IMPROBABLE), self.apart(item)
         length, limit = len(item.score.amplitudes), thresholds.SEPARATION * self.floor
         alike = {p.name for p in self.sentences if len(p.widths) <= length and apart[p.name] < limit}
-        others = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
-        others = [r for r in others if r.probe is not item.probe and not set(own) & set(said_by(r.probe))]
-        return tuple(r.probe.name for r in others[: thresholds.MOST_CLASSES])
+        candidates = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
+        candidates = [
+            r for r in candidates if r.probe is not item.probe and not set(own) & set(said_by(r.probe))
+        ]
+        return tuple(r.probe.name for r in candidates[: thresholds.MOST_CLASSES])
 
     def held_in_part(self, item: Ranked) -> tuple[str, ...]:
         """Effects of which a part, by itself, is not improbable beside a candidate; parts share the prior of theirs."""
@@ -382,21 +388,21 @@ class Examination(Evidence):
 
     def untestable(self, catalogue: Sequence[EffectKind]) -> tuple[str, ...]:
         """Effects that these data cannot show at any plausible size."""
-        seen = {probe.effect.name for probe in self.probes if self.table[probe.name].testable}
-        seen.update(self.result.model.effect_names)
+        testable = {probe.effect.name for probe in self.probes if self.table[probe.name].testable}
+        testable.update(self.result.model.effect_names)
         return tuple(
-            effect.name for effect in catalogue if effect.name not in seen and not effect.is_structural()
+            effect.name for effect in catalogue if effect.name not in testable and not effect.is_structural()
         )
 
     def separation(self, name: str, change: Vector) -> dict[str, float]:
         """Distance (σ) of each rival from an active effect that changes the residuals (data rows) by `change`."""
-        own = self.absorbed[name]
-        whole = np.pad(change, (0, len(self.design.residual) - len(change)))
-        projected = own.rest(whole)
-        space = dataclasses.replace(self.bare, gram=self.bare.gram + own.columns.T @ own.columns)
-        scores = self.products(projected) + own.columns.T @ (own.basis.T @ projected)
-        found = self.nearest(separations(space, scores, float(projected @ projected)))
-        return {rival: apart / self.floor for rival, apart in found.items()}
+        absorbed = self.absorbed[name]
+        padded = np.pad(change, (0, len(self.design.residual) - len(change)))
+        projected = absorbed.rest(padded)
+        space = dataclasses.replace(self.bare, gram=self.bare.gram + absorbed.columns.T @ absorbed.columns)
+        scores = self.products(projected) + absorbed.columns.T @ (absorbed.basis.T @ projected)
+        distances = self.nearest(separations(space, scores, float(projected @ projected)))
+        return {rival: apart / self.floor for rival, apart in distances.items()}
 
     def products(self, rows: Vector) -> Vector:
         """Products of the projected columns of all candidates with rows."""
@@ -422,27 +428,27 @@ def examine(
     """
     active, design = result.model.effect_names, Design.of(result)
     inactive = [probe for probe in wanted if probe.effect.name not in active]
-    every = [*sentences, *(probe for probe, _ in parts)]
-    named, said = (
+    all_sentences = [*sentences, *(probe for probe, _ in parts)]
+    named, described = (
         (earlier.named, earlier.said)
         if earlier is not None and earlier.is_like(design)
-        else all_candidates(design.columns, inactive, every)
+        else all_candidates(design.columns, inactive, all_sentences)
     )
     probes = [probe for probe in inactive if probe.name in named]
-    sentences = tuple(probe for probe in sentences if probe.name in said)
-    known = [
+    sentences = tuple(probe for probe in sentences if probe.name in described)
+    listed_parts = [
         (probe, {effect for effect in effects if effect.name not in active})
         for probe, effects in parts
-        if probe.name in said
+        if probe.name in described
     ]
     patterns = [
-        dataclasses.replace(one, columns=one.columns.astype(np.float32))
-        for one in map(design.measured.candidate, strata(design.measured))
+        dataclasses.replace(item, columns=item.columns.astype(np.float32))
+        for item in map(design.measured.candidate, strata(design.measured))
     ]
     candidates = [
         *(named[probe.name] for probe in probes),
-        *(said[probe.name] for probe in sentences),
-        *(said[probe.name] for probe, _ in known),
+        *(described[probe.name] for probe in sentences),
+        *(described[probe.name] for probe, _ in listed_parts),
         *patterns,
     ]
     blocks = {candidate.name: candidate.block for candidate in candidates}
@@ -450,8 +456,8 @@ def examine(
     columns = [candidate.columns for candidate in candidates]
     absorbed = {}
     for name in active:
-        rest, basis = design.without(name)
-        absorbed[name] = _Absorbed(rest, basis, design.products(columns, basis).T)
+        projector, basis = design.without(name)
+        absorbed[name] = _Absorbed(projector, basis, design.products(columns, basis).T)
     exact = sum(len(probe.widths) for probe in probes)  # rivals may be the same to the last digit
     scale = result.noise_scale
     bare = ScoreSpace.projected(design.projector, names, widths, columns, scale=scale, exact=exact)
@@ -468,7 +474,7 @@ def examine(
         table=space.table(scores, square, space.smallest_p(rng)),
         probes=probes,
         sentences=sentences,
-        parts=known,
+        parts=listed_parts,
         patterns=[pattern.name for pattern in patterns],
         chi2=result.chi2,
         dof=result.dof,
@@ -476,7 +482,7 @@ def examine(
         result=result,
         design=design,
         named=named,
-        said=said,
+        said=described,
         blocks=blocks,
         bare=bare,
         columns=columns,

@@ -168,7 +168,7 @@ def _columns(data: DiagnosisFigureData) -> dict[str, Mapping[str, np.ndarray]]:
     count, many = len(all_of), np.arange(len(all_of))
 
     def stacked(name: str) -> np.ndarray:
-        return np.concatenate([getattr(one, name) for one in all_of])
+        return np.concatenate([getattr(comparison, name) for comparison in all_of])
 
     maps = ("before", "after", "explained", "mean_before", "mean_after", "rms_before", "rms_after")
     return {
@@ -176,9 +176,9 @@ def _columns(data: DiagnosisFigureData) -> dict[str, Mapping[str, np.ndarray]]:
         "SHARES": data.shares,
         "COMPARISONS": {
             "COMPARISON": many,
-            "EFFECT": np.array([one.effect for one in all_of]),
-            "COMBINATION": np.array([in_ascii(one.combination) for one in all_of]),
-            "HARMONIC": np.array([one.harmonic for one in all_of]),
+            "EFFECT": np.array([comparison.effect for comparison in all_of]),
+            "COMBINATION": np.array([in_ascii(comparison.combination) for comparison in all_of]),
+            "HARMONIC": np.array([comparison.harmonic for comparison in all_of]),
         },
         "FIELD": {
             "COMPARISON": np.repeat(many, len(points)),
@@ -202,8 +202,8 @@ def read_figure_data(path: str | os.PathLike[str]) -> DiagnosisFigureData:
     with open_fits(path, again) as opened:
         version = opened.hdus[0].header.get("DIAGVERS")
         if version != DIAGVERS:
-            found = "is missing" if version is None else f"is {version}, this program reads {DIAGVERS}"
-            raise fail(found, file=path, column="DIAGVERS", advice=again)
+            message = "is missing" if version is None else f"is {version}, this program reads {DIAGVERS}"
+            raise fail(message, file=path, column="DIAGVERS", advice=again)
         units = {hdu.name.strip().upper(): hdu for hdu in opened.hdus[1:]}
         tables: dict[str, dict[str, Any]] = {}
         for name, columns in _TABLES.items():
@@ -216,15 +216,15 @@ def _figure_data(tables: Mapping[str, Mapping[str, Any]]) -> DiagnosisFigureData
     field, curves, about = tables["FIELD"], tables["CURVES"], tables["COMPARISONS"]
     comparisons = []
     for number in about["COMPARISON"]:
-        here, there = field["COMPARISON"] == number, curves["COMPARISON"] == number
+        field_rows, curve_rows = field["COMPARISON"] == number, curves["COMPARISON"] == number
         maps = ("before", "after", "mean_before", "mean_after", "rms_before", "rms_after")
         comparisons.append(
             ResidualComparison(
                 effect=str(about["EFFECT"][number]),
                 combination=str(about["COMBINATION"][number]),
                 harmonic=int(about["HARMONIC"][number]),
-                **{name: field[name.upper()][here] for name in maps},
-                **{f"curve_{n}": curves[n.upper()][there] for n in ("before", "error", "after")},
+                **{name: field[name.upper()][field_rows] for name in maps},
+                **{f"curve_{n}": curves[n.upper()][curve_rows] for n in ("before", "error", "after")},
             )
         )
     first, rows = field["COMPARISON"] == 0, curves["COMPARISON"] == 0
@@ -292,8 +292,8 @@ def figure_data(diagnosis: Diagnosis) -> DiagnosisFigureData:
 
 
 def _unnamed_term(diagnosis: Diagnosis) -> bool:
-    known = [*diagnosis.before.model.effect_names, *(step.effect for step in diagnosis.steps)]
-    return FreeForm.name in diagnosis.after.model.effect_names and FreeForm.name not in known
+    names = [*diagnosis.before.model.effect_names, *(step.effect for step in diagnosis.steps)]
+    return FreeForm.name in diagnosis.after.model.effect_names and FreeForm.name not in names
 
 
 def compare_residuals(
@@ -310,9 +310,9 @@ def compare_residuals(
     size = np.sqrt(np.mean(pattern**2, axis=0))
     pattern = np.where(size > 0, pattern / np.where(size > 0, size, 1.0), 1.0)
     power = used.T.astype(float) @ pattern**2
-    known = np.where(power > 0, power, np.nan)
-    curves = [np.einsum("pek,pk->ek", cube, pattern) / known for cube in (before, after)]
-    scatter = np.sqrt(np.einsum("pek,pk->ek", after**2, pattern**2)) / known
+    weight = np.where(power > 0, power, np.nan)
+    curves = [np.einsum("pek,pk->ek", cube, pattern) / weight for cube in (before, after)]
+    scatter = np.sqrt(np.einsum("pek,pk->ek", after**2, pattern**2)) / weight
     rows = used.sum(axis=1, keepdims=True)
     rows = np.where(rows > 0, rows, np.nan)
     return ResidualComparison(

@@ -32,10 +32,10 @@ SHARE = 0.2  # a group is mentioned when it carries this share of the largest
 
 
 def _named(groups: dict[str, float]) -> str:
-    total, most = sum(groups.values()) or 1.0, max(groups.values(), default=0.0)
+    total, largest = sum(groups.values()) or 1.0, max(groups.values(), default=0.0)
     order = sorted(groups.items(), key=lambda group: -group[1])
     shares = ((name, round(value / total, 3)) for name, value in order)
-    least = SHARE * round(most / total, 3)
+    least = SHARE * round(largest / total, 3)
     return ", ".join(f"{name} {100 * share:.0f}%" for name, share in shares if share >= least)
 
 
@@ -93,21 +93,21 @@ def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
     cube = design.cube(rows)
     square = cube**2
     e, names = design.fit.calset.exposures, design.fit.model.template.cameras.names
-    by_exposure, seen = square.sum(axis=(0, 2)), design.measured.used.sum(axis=0)
+    by_exposure, point_counts = square.sum(axis=(0, 2)), design.measured.used.sum(axis=0)
 
     def grouped(labels: np.ndarray) -> str | None:
-        found, plan = (
+        shares, plan = (
             {str(label): float(of[labels == label].sum()) for label in np.unique(labels)}
-            for of in (by_exposure, seen)
+            for of in (by_exposure, point_counts)
         )
-        return _differing(found, plan)
+        return _differing(shares, plan)
 
     stood = {prefix: positions_of(e, prefix) for prefix in design.measured.likelihood.plan.moving}
     harmonics, field = _harmonics(design, cube)
     settings = np.unique(
         [e.kind, e.filter, *(at.astype(str) for at in stood.values())], axis=1, return_inverse=True
     )[1]
-    trend = _trend(e, settings.ravel(), np.sqrt(by_exposure / np.maximum(len(names) * seen, 1)))
+    trend = _trend(e, settings.ravel(), np.sqrt(by_exposure / np.maximum(len(names) * point_counts, 1)))
     cameras = dict(zip(names, square.sum(axis=(0, 1)).tolist(), strict=True))
     return {
         "camera": _differing(cameras, dict.fromkeys(names, 1.0)),
@@ -121,8 +121,8 @@ def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
 
 def _differing(groups: dict[str, float], plan: dict[str, float]) -> str | None:
     """Shares of groups in words where a tenth of the whole lies elsewhere than in the plan."""
-    total, whole = sum(groups.values()) or 1.0, sum(plan.values()) or 1.0
-    moved = 0.5 * sum(abs(groups[name] / total - plan[name] / whole) for name in groups)
+    total, plan_total = sum(groups.values()) or 1.0, sum(plan.values()) or 1.0
+    moved = 0.5 * sum(abs(groups[name] / total - plan[name] / plan_total) for name in groups)
     return _named(groups) if moved > DIFFERENT else None
 
 
@@ -140,12 +140,12 @@ def _trend(e: Exposures, settings: Int[np.ndarray, " e"], rms: Float[np.ndarray,
     base = np.linalg.svd(columns, full_matrices=False)
     base = base[0][:, base[1] > 1e-9 * base[1][0]]
     order = np.argsort(np.argsort(e.mjd)).astype(float)
-    left = [one - base @ (base.T @ one) for one in (order, rms)]
-    size = [float(np.linalg.norm(one)) for one in left]
+    residuals = [column - base @ (base.T @ column) for column in (order, rms)]
+    size = [float(np.linalg.norm(column)) for column in residuals]
     free = len(e) - base.shape[1]
     if free < FEWEST_FREE or size[0] < 1e-9 * len(e) or size[1] < DIFFERENT * float(np.linalg.norm(rms)):
         return 0.0
-    return float(left[0] @ left[1]) / (size[0] * size[1])
+    return float(residuals[0] @ residuals[1]) / (size[0] * size[1])
 
 
 # -------------------------------------------------------------------------------------------------------- what is found
@@ -295,20 +295,20 @@ class Diagnosis(Drawn):
     @property
     def caution(self) -> str:
         """Caution about these findings; empty when there is none."""
-        parts = []
+        cautions = []
         if self.ended:
-            parts.append(
+            cautions.append(
                 f"the search ended after {self.ended} with this model, the best so far: allow more minutes, if it was "
                 "you who set them, or start from it as --model"
             )
         looked_at = len(self.after.calset.points)
         if looked_at < self.points:
-            parts.append(
+            cautions.append(
                 f"{looked_at} of {self.points} field points were looked at, and fitted: refit all of them with the "
                 "model found"
             )
         if len(self.steps) > thresholds.MOST_NAMES:
-            parts.append(
+            cautions.append(
                 f"{len(self.steps)} names were needed: something that is not in the catalogue can look like several "
                 "that are"
             )
@@ -316,26 +316,26 @@ class Diagnosis(Drawn):
             f"{s.effect}.{name} ({widths:.0f} widths)" for s in self.steps for name, widths in s.far.items()
         ]
         if far:
-            parts.append(f"far beyond its prior, which was widened: {', '.join(far)}")
+            cautions.append(f"far beyond its prior, which was widened: {', '.join(far)}")
         weak = [s.effect for s in self.steps if s.robust_ratio > thresholds.LARGEST_ROBUST_RATIO]
         if weak:
-            parts.append(
+            cautions.append(
                 f"errors of {', '.join(weak)} are too small by more than a factor "
                 f"{thresholds.LARGEST_ROBUST_RATIO:g} if single exposures have disturbances of their own"
             )
-        return "; ".join(parts)
+        return "; ".join(cautions)
 
     def to_table(self) -> Any:
         """The parameters of all effects that were found, as an astropy table."""
-        found = [(s, name, *entry) for s in self.steps for name, entry in s.parameters.items()]
+        rows = [(s, name, *entry) for s in self.steps for name, entry in s.parameters.items()]
         return astropy_table(
             {
-                "EFFECT": (np.array([s.effect for s, *_ in found], "U32"), "", "effect"),
-                "PARAMETER": (np.array([name for _, name, *_ in found], "U96"), "", "its parameter"),
-                "VALUE": (np.array([v for _, _, v, _, _ in found], float), "", "fitted value"),
-                "SIGMA": (np.array([s for _, _, _, s, _ in found], float), "", "standard error"),
-                "UNIT": (np.array([u for *_, u in found], "U16"), "", "unit of the numbers of this row"),
-                "P_VALUE": (np.array([s.p_value for s, *_ in found], float), "", "corrected for all tried"),
+                "EFFECT": (np.array([s.effect for s, *_ in rows], "U32"), "", "effect"),
+                "PARAMETER": (np.array([name for _, name, *_ in rows], "U96"), "", "its parameter"),
+                "VALUE": (np.array([v for _, _, v, _, _ in rows], float), "", "fitted value"),
+                "SIGMA": (np.array([s for _, _, _, s, _ in rows], float), "", "standard error"),
+                "UNIT": (np.array([u for *_, u in rows], "U16"), "", "unit of the numbers of this row"),
+                "P_VALUE": (np.array([s.p_value for s, *_ in rows], float), "", "corrected for all tried"),
             },
             {"VERDICT": self.verdict},
         )
@@ -428,61 +428,61 @@ def _step(step: Step) -> dict[str, Any]:
     near = sorted(step.separation.items(), key=lambda s: s[1])
     return {name: getattr(step, name) for name in _AS_THEY_ARE} | {
         "parameters": {n: {"value": v, "sigma": s, "unit": unit} for n, (v, s, unit) in entries.items()},
-        "sentences": [_sentence(*one) for one in step.told],
+        "sentences": [_sentence(*entry) for entry in step.told],
         "change_of_qu": _number(step.change_of_qu),
         "robust_error_ratio": _number(step.robust_ratio),
         "separation_sigma": {name: value for name, value in near if math.isfinite(value)},
     }
 
 
-def _members(one: ClassOf) -> dict[str, Any]:
+def _members(addition: ClassOf) -> dict[str, Any]:
     return {
-        "added": one.added,
-        "members": [{"name": m.name, "probability": m.probability} for m in one.members],
-        "spread_of_p": one.spread,
-        "stated_error_of_p": one.stated,
-        "farthest_element_sigma": one.off,
+        "added": addition.added,
+        "members": [{"name": m.name, "probability": m.probability} for m in addition.members],
+        "spread_of_p": addition.spread,
+        "stated_error_of_p": addition.stated,
+        "farthest_element_sigma": addition.off,
     }
 
 
-def sentences(found: Mapping[str, Any]) -> Iterator[str]:
+def sentences(content: Mapping[str, Any]) -> Iterator[str]:
     """Sentences beside the numbers of a diagnosis, from the content of diagnosis.json: `print`, the command and the
     page say the same."""
-    for step in found["steps"]:
+    for step in content["steps"]:
         yield from _of_step(step)
-    left = found.get("unexplained")
-    if left:
-        yield left["description"]
-        if left.get("free_form"):
+    remainder = content.get("unexplained")
+    if remainder:
+        yield remainder["description"]
+        if remainder.get("free_form"):
             yield (
-                f"added as a free-form term ({', '.join(left['free_form'])}): χ² {left['chi2_before']:.1f} → "
-                f"{left['chi2_after']:.1f}"
+                f"added as a free-form term ({', '.join(remainder['free_form'])}): χ² {remainder['chi2_before']:.1f} → "
+                f"{remainder['chi2_after']:.1f}"
             )
-    choices = found.get("choices", ())
-    fitted = [one for one in choices if one["better_by"] is not None]
+    choices = content.get("choices", ())
+    fitted = [choice for choice in choices if choice["better_by"] is not None]
     if choices:
         yield f"{len(choices)} other descriptions of the instrument were compared, {len(fitted)} of them fitted"
-    for one in fitted:
-        sense = "smaller" if one["better_by"] > 0 else "larger"
-        yield f"{one['change']}: χ² {sense} by {abs(one['better_by']):.4g}"
-    for alike in found.get("classes", ())[:_CLASSES]:
+    for choice in fitted:
+        sense = "smaller" if choice["better_by"] > 0 else "larger"
+        yield f"{choice['change']}: χ² {sense} by {abs(choice['better_by']):.4g}"
+    for alike in content.get("classes", ())[:_CLASSES]:
         yield (
             f"before anything was added {alike['effect']} was significant too; these data cannot distinguish it from "
             f"{some(alike['equivalent'], _ALIKE)}; what would: {alike['separated_by']}"
         )
-    if found.get("cannot_be_tested"):
-        yield f"not tested, since these data cannot show it: {', '.join(found['cannot_be_tested'])}"
-    if found.get("caution"):
-        yield found["caution"]
+    if content.get("cannot_be_tested"):
+        yield f"not tested, since these data cannot show it: {', '.join(content['cannot_be_tested'])}"
+    if content.get("caution"):
+        yield content["caution"]
 
 
 def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
     """The sentences about one effect that was found."""
     name = step["effect"]
-    for told in step.get("sentences", ()):
-        yield f"{told['words']}: {told['tested_by']}"
-    for other in step.get("alternatives", ()):
-        yield f"{name}: equally consistent with {other}"
+    for sentence in step.get("sentences", ()):
+        yield f"{sentence['words']}: {sentence['tested_by']}"
+    for alternative in step.get("alternatives", ()):
+        yield f"{name}: equally consistent with {alternative}"
     held = ""
     if step.get("heldout_before") is not None and step.get("heldout_after") is not None:
         means = f"{step['heldout_before']:.3g} → {step['heldout_after']:.3g}"
@@ -539,7 +539,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
             for choice in diagnosis.choices
         ],
         "classes": diagnosis.classes,
-        "members": [_members(one) for one in diagnosis.members],
+        "members": [_members(addition) for addition in diagnosis.members],
         "cannot_be_tested": diagnosis.untestable,
         "chi2_per_dof_before": diagnosis.before.chi2 / max(diagnosis.before.dof, 1),
         "chi2_per_dof_after": diagnosis.after.chi2 / max(diagnosis.after.dof, 1),
@@ -547,7 +547,9 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
             {
                 "p_value": turn.p_value,
                 "added": turn.added,
-                "asked": [{**one._asdict(), "evidence": _number(one.evidence)} for one in turn.asked],
+                "asked": [
+                    {**reason._asdict(), "evidence": _number(reason.evidence)} for reason in turn.asked
+                ],
             }
             for turn in diagnosis.rounds
         ],

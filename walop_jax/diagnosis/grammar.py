@@ -87,17 +87,17 @@ def hypotheses(
     catalogue: Sequence[EffectKind], instrument: Instrument, exposures: Exposures, points: int
 ) -> Hypotheses:
     """The one list of what a diagnosis looks for, the verdict of a fit is held against, and limits are given beside."""
-    context, every = effect_context(instrument, exposures), sentences(instrument, exposures, points)
+    context, all_probes = effect_context(instrument, exposures), sentences(instrument, exposures, points)
     effects = applicable(catalogue, context, instrument)
-    alone, parts = beside_names(every, effects, context, instrument)
-    return Hypotheses(effects, tuple(probes(effects, context)), alone, parts, every)
+    alone, partial = beside_names(all_probes, effects, context, instrument)
+    return Hypotheses(effects, tuple(probes(effects, context)), alone, partial, all_probes)
 
 
 # ------------------------------------------------------------------------------------- names that are sentences
 
 
 def beside_names(
-    every: Sequence[Probe], catalogue: Sequence[EffectKind], context: Context, instrument: Instrument
+    all_probes: Sequence[Probe], catalogue: Sequence[EffectKind], context: Context, instrument: Instrument
 ) -> tuple[list[Probe], list[tuple[Probe, frozenset[EffectKind]]]]:
     """The groups that are no effect of a catalogue by another name: those that none holds, and parts, with the holders.
 
@@ -108,20 +108,20 @@ def beside_names(
         for group in effect.probes(context):
             texts = frozenset(group[0].in_sentences(instrument))
             if len(texts) <= sum(
-                np.size(getattr(one, name)) for one in group for name in effect.amplitudes()
+                np.size(getattr(member, name)) for member in group for name in effect.amplitudes()
             ):
                 effects_as_sentences.append((texts, effect))
-    alone, parts = [], []
-    for probe in every:
+    alone, partial = [], []
+    for probe in all_probes:
         texts_of_probe = frozenset(said_by(probe))
         holders = frozenset(effect for texts, effect in effects_as_sentences if texts > texts_of_probe)
         if any(texts == texts_of_probe for texts, _ in effects_as_sentences):
             continue
         if holders:
-            parts.append((probe, holders))
+            partial.append((probe, holders))
         else:
             alone.append(probe)
-    return alone, parts
+    return alone, partial
 
 
 def retimed(sentence: Sentence, exposures: Exposures, end: int) -> list[Sentence]:
@@ -132,13 +132,13 @@ def retimed(sentence: Sentence, exposures: Exposures, end: int) -> list[Sentence
     times = starts_of_steps(exposures)
     if [factor.form for factor in sentence.grows_with] != ["hours"]:
         return []
-    given = [float(text) for text in sentence.grows_with[0].given]
-    at = int(np.argmin(np.abs(times - given[end])))
-    if abs(times[at] - given[end]) > ROUNDED:
+    hours = [float(text) for text in sentence.grows_with[0].given]
+    at = int(np.argmin(np.abs(times - hours[end])))
+    if abs(times[at] - hours[end]) > ROUNDED:
         return []
     reach = -(-len(times) // STEPS)
     near = times[max(at - reach, 0) : at + reach + 1]
-    spans = [(time, given[1]) if end == 0 else (given[0], time) for time in near]
+    spans = [(time, hours[1]) if end == 0 else (hours[0], time) for time in near]
     return [dataclasses.replace(sentence, factors=(between(*span),)) for span in spans if span[0] < span[1]]
 
 
@@ -162,8 +162,8 @@ class Subject(NamedTuple):
     @classmethod
     def of(cls, *bases: Base, inside: Mask | None = None, **among: Sequence[Base]) -> Subject:
         """Each alone, and all of several together."""
-        every = [tuple(itertools.chain(*bases))][: len(bases) - 1]
-        return cls({"alone": bases, "all": every, **among}, (), inside)
+        together = [tuple(itertools.chain(*bases))][: len(bases) - 1]
+        return cls({"alone": bases, "all": together, **among}, (), inside)
 
 
 def _base(kinds: Iterable[str], where: str, place: str, origin: str = "") -> Base:
@@ -181,8 +181,8 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
         for over, along, among in KINDS[first.kind].grows(instrument, first).tried:
             patterns = [PATTERNS[name] for name in over if over_field or name == "even"]
             factors = itertools.chain(*map(shown.of, along))
-            every = itertools.chain(*(bases.get(name, ()) for name in among))
-            for group, pattern, base in itertools.product(factors, patterns, every):
+            alternatives = itertools.chain(*(bases.get(name, ()) for name in among))
+            for group, pattern, base in itertools.product(factors, patterns, alternatives):
                 pairs = [tuple(filter(None, pair[::order])) for pair in itertools.product(group, pattern)]
                 yield tuple(sentence.times(*pair) for sentence in base for pair in pairs)
 
@@ -238,18 +238,22 @@ def _places(instrument: Instrument, exposures: Exposures) -> Iterator[list[tuple
 
 
 def _of_plates(instrument: Instrument, exposures: Exposures) -> Iterator[Subject]:
-    each = {place: instrument.element(place) for place in instrument.places(WavePlate)}
-    seen = {place: exposures.position(plate.moves).inside for place, plate in each.items() if plate.moves}
-    plates = {place: plate for place, plate in each.items() if place not in seen or seen[place].any()}
-    if fixed := [place for place in plates if place not in seen]:
+    wave_plates = {place: instrument.element(place) for place in instrument.places(WavePlate)}
+    inside = {
+        place: exposures.position(plate.moves).inside for place, plate in wave_plates.items() if plate.moves
+    }
+    plates = {
+        place: plate for place, plate in wave_plates.items() if place not in inside or inside[place].any()
+    }
+    if fixed := [place for place in plates if place not in inside]:
         yield Subject.of(*(_base(("axis",), "of", place) for place in fixed))
-    for place in [place for place in plates if place in seen]:
-        yield Subject.of(_base(("axis",), "of", place), inside=seen[place])
+    for place in [place for place in plates if place in inside]:
+        yield Subject.of(_base(("axis",), "of", place), inside=inside[place])
     for place, plate in plates.items():
         layers = [f"{place}.{layer.name}" for layer in plate.layers]  # pyright: ignore[reportAttributeAccessIssue]
         yield Subject.of(tuple(Sentence("thickness", "of", layer) for layer in layers))
-        for kind, some in (("axis", layers[1:]), ("cut", layers)):
-            yield from (Subject.of(_base((kind,), "of", layer)) for layer in some)
+        for kind, affected in (("axis", layers[1:]), ("cut", layers)):
+            yield from (Subject.of(_base((kind,), "of", layer)) for layer in affected)
     if plates and varies(exposures.temp):
         yield Subject.of(tuple(Sentence("thermal", "of", place) for place in plates))
     for pair in probed_gaps(instrument.units) if plates else ():

@@ -70,38 +70,40 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     fit = design.fit
     usual = usual_exposure(fit.calset, fit.model.template)
     instrument = fit.model.instrument(fit.values)
-    found = list(_mistakes(design, singles, usual))
-    along = np.array([one.along for one in found]).reshape(len(found), -1).T
+    mistakes = list(_mistakes(design, singles, usual))
+    along = np.array([mistake.along for mistake in mistakes]).reshape(len(mistakes), -1).T
     changes = (fit.model.selection() @ design.taken_up(along)).T
-    turns = np.array([0.0 if one.effect is None else abs(turn_of(instrument, one.effect)) for one in found])
-    errors = _errors_of_stars(design, found, changes, usual) + 2.0 * LARGEST_P * turns
+    turns = np.array(
+        [0.0 if mistake.effect is None else abs(turn_of(instrument, mistake.effect)) for mistake in mistakes]
+    )
+    errors = _errors_of_stars(design, mistakes, changes, usual) + 2.0 * LARGEST_P * turns
     least, strong = _FAINT * errors.max(initial=0.0), np.linalg.norm(along, axis=0) > 1.0
     best: dict[str, tuple[int, bool, bool]] = {}
     for i in np.argsort(-errors, kind="stable").tolist():
-        one = found[i]
-        acts = one.acts or bool(turns[i] > 0.0)
+        mistake = mistakes[i]
+        acts = mistake.acts or bool(turns[i] > 0.0)
         # In the usual setting it is out of the beam; stars that are seen through it have it.
-        elsewhere = not (acts or one.informed or one.effect is None) and bool(
-            moves_with(one.effect, instrument)
+        elsewhere = not (acts or mistake.informed or mistake.effect is None) and bool(
+            moves_with(mistake.effect, instrument)
         )
-        if (errors[i] > least or not one.informed) if acts else (strong[i] or elsewhere):
-            best.setdefault(one.name, (i, acts, elsewhere))
-    unseen = {i for i, acts, _ in best.values() if acts and not found[i].informed}
+        if (errors[i] > least or not mistake.informed) if acts else (strong[i] or elsewhere):
+            best.setdefault(mistake.name, (i, acts, elsewhere))
+    unseen = {i for i, acts, _ in best.values() if acts and not mistakes[i].informed}
     always = unseen | {i for i, _, elsewhere in best.values() if elsewhere}
-    others = [i for i, *_ in best.values() if i not in always][:MOST_HIDDEN]
-    order = sorted([*always, *others], key=lambda i: -errors[i])
+    further = [i for i, *_ in best.values() if i not in always][:MOST_HIDDEN]
+    order = sorted([*always, *further], key=lambda i: -errors[i])
     acting = {i for i, acts, elsewhere in best.values() if acts or elsewhere}
-    some = [found[i] for i in order]
+    selected = [mistakes[i] for i in order]
     return Hidden(
-        names=tuple(one.name for one in some),
-        sizes=tuple(one.size for one in some),
-        units=tuple(one.unit for one in some),
+        names=tuple(mistake.name for mistake in selected),
+        sizes=tuple(mistake.size for mistake in selected),
+        units=tuple(mistake.unit for mistake in selected),
         changes=changes[order],
-        kinds=tuple(one.kind for one in some),
-        remedies=tuple(one.shown_by for one in some),
+        kinds=tuple(mistake.kind for mistake in selected),
+        remedies=tuple(mistake.shown_by for mistake in selected),
         acts=tuple(
-            as_text(one.effect) if one.effect is not None and i in acting else ""
-            for i, one in zip(order, some, strict=True)
+            as_text(mistake.effect) if mistake.effect is not None and i in acting else ""
+            for i, mistake in zip(order, selected, strict=True)
         ),
         measured=tuple(i not in unseen for i in order),
     )
@@ -112,23 +114,23 @@ def _mistakes(design: Design, singles: Singles, usual: int) -> Iterator[_Mistake
     of_stars = _Starlight(design, singles.asked, usual)
     p, first = local_p(thresholds.ALARM, len(singles.testable)), 0
     shown = set()
-    for one in singles.rivals:
-        count = len(one.candidate.widths)
+    for rival in singles.rivals:
+        count = len(rival.candidate.widths)
         at = slice(first, first + count)
         first += count
-        plausible, alive = np.broadcast_to(one.plausible, count), singles.alive[at]
+        plausible, alive = np.broadcast_to(rival.plausible, count), singles.alive[at]
         if not plausible.any():
             continue
-        least = noncentrality(p, max(singles.table[one.candidate.name].rank, 1), thresholds.PROBABILITY)
-        left = np.where(alive, singles.left[at], 1.0)
-        sizes = np.where(alive, np.minimum(plausible, np.sqrt(least / left)), plausible)
+        least = noncentrality(p, max(singles.table[rival.candidate.name].rank, 1), thresholds.PROBABILITY)
+        information = np.where(alive, singles.left[at], 1.0)
+        sizes = np.where(alive, np.minimum(plausible, np.sqrt(least / information)), plausible)
         along = singles.along[:, at] * sizes
-        if one.probe is not None:
-            shown.add(one.probe.name)
-            yield from of_stars.effects(one.probe, sizes, along, alive)
+        if rival.probe is not None:
+            shown.add(rival.probe.name)
+            yield from of_stars.effects(rival.probe, sizes, along, alive)
         else:
-            kind = EFFECT if one.stated is None else DATA
-            number = (one.candidate.name, kind, float(sizes[0]), one.unit, one.shown_by)
+            kind = EFFECT if rival.stated is None else DATA
+            number = (rival.candidate.name, kind, float(sizes[0]), rival.unit, rival.shown_by)
             yield _Mistake(*number, along[:, 0], bool(alive[0]))
     for probe in of_stars.asked:
         if probe.name not in shown:
@@ -146,13 +148,19 @@ class _Starlight:
         self.instrument = self.fit.model.instrument(self.fit.values)
         self.setting = first_setting(calset, self.instrument, exposure)
         columns = design.columns
-        changes = {p.name: [one for m in p.group for one in m.first_order(template)] for p in self.asked}
-        known = [name for name, some in changes.items() if some and all(map(columns.has, some))]
+        changes = {
+            p.name: [change for m in p.group for change in m.first_order(template)] for p in self.asked
+        }
+        differentiable = [name for name, terms in changes.items() if terms and all(map(columns.has, terms))]
         self.vectors, added = added_to_starlight(
-            columns, [one for name in known for one in changes[name]], exposure
+            columns, [change for name in differentiable for change in changes[name]], exposure
         )
-        ends = np.cumsum([len(changes[name]) for name in known])
-        self.added = dict(zip(known, np.split(added, ends[:-1], axis=-1), strict=True)) if known else {}
+        ends = np.cumsum([len(changes[name]) for name in differentiable])
+        self.added = (
+            dict(zip(differentiable, np.split(added, ends[:-1], axis=-1), strict=True))
+            if differentiable
+            else {}
+        )
 
     def effects(
         self,
@@ -183,21 +191,23 @@ def of_matrix(
     pairs: Sequence[tuple[int, int]],
 ) -> Float[np.ndarray, "p a 3"]:
     """Change of the instrument matrix, to first order, where the analysis vectors change."""
-    one, other = ([pair[i] for pair in pairs] for i in (0, 1))
-    light = vectors[:, one, :1] + vectors[:, other, :1]
-    matrix = (vectors[:, one] - vectors[:, other]) / light
-    return (added[:, one] - added[:, other] - matrix * (added[:, one, :1] + added[:, other, :1])) / light
+    first, second = ([pair[i] for pair in pairs] for i in (0, 1))
+    light = vectors[:, first, :1] + vectors[:, second, :1]
+    matrix = (vectors[:, first] - vectors[:, second]) / light
+    return (
+        added[:, first] - added[:, second] - matrix * (added[:, first, :1] + added[:, second, :1])
+    ) / light
 
 
 def _at_sizes(probe: Probe, sizes: Float[np.ndarray, " a"]) -> Iterator[tuple[str, Effect]]:
     """Each amplitude of a probe by itself: its parameter, and the effect with it at its size."""
-    rest = iter(sizes)
+    remaining = iter(sizes)
     for member in probe.group:
         for name in probe.effect.amplitudes():
             neutral = np.asarray(getattr(member, name), float)
             for at in np.ndindex(neutral.shape):
                 value = neutral.copy()
-                value[at] += next(rest)
+                value[at] += next(remaining)
                 yield name, member.replaced(**{name: jnp.asarray(value)})
 
 
@@ -212,13 +222,15 @@ def _errors_of_stars(
 ) -> Float[np.ndarray, " c"]:
     """Median over some field points of what mistakes do to q and u; 0 where these are not measured."""
     fit, points = design.fit, design.fit.calset.points
-    some = np.unique(np.linspace(0, len(points) - 1, STAR_POINTS).astype(int))
+    places = np.unique(np.linspace(0, len(points) - 1, STAR_POINTS).astype(int))
     instrument = fit.model.instrument(fit.values)
     setting: Settings = first_setting(fit.calset, instrument, exposure)
-    matrix, slopes = matrix_slopes(instrument, setting, fit.calset.filters, points.x[some], points.y[some])
-    found = np.zeros(len(mistakes))
-    for i, (one, moved) in enumerate(zip(mistakes, changes, strict=True)):
-        own = one.change[some] if isinstance(one.change, np.ndarray) else one.change
-        error = change_of_qu(matrix, matrix + (own - slopes @ moved))
-        found[i] = np.median(error[np.isfinite(error)]) if np.isfinite(error).any() else 0.0
-    return found
+    matrix, slopes = matrix_slopes(
+        instrument, setting, fit.calset.filters, points.x[places], points.y[places]
+    )
+    errors = np.zeros(len(mistakes))
+    for i, (mistake, moved) in enumerate(zip(mistakes, changes, strict=True)):
+        direct = mistake.change[places] if isinstance(mistake.change, np.ndarray) else mistake.change
+        error = change_of_qu(matrix, matrix + (direct - slopes @ moved))
+        errors[i] = np.median(error[np.isfinite(error)]) if np.isfinite(error).any() else 0.0
+    return errors

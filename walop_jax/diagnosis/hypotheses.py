@@ -101,9 +101,9 @@ def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) ->
     if effect.kind.over_field and len(calset.points) < FEWEST_POINTS:
         return False
     bare = dataclasses.replace(instrument, effects=())
-    asked = conditions_of_effect(bare, effect)
+    conditions = conditions_of_effect(bare, effect)
     stated = {name: getattr(calset.exposures, column.lower()) for name, column in CONDITIONS.items()}
-    return all(np.isfinite(stated[name]).any() for name in asked if name in stated)
+    return all(np.isfinite(stated[name]).any() for name in conditions if name in stated)
 
 
 def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Probe]) -> list[Probe]:
@@ -127,33 +127,45 @@ def all_candidates(
     shown = showable(likelihood.calset, template, effects)
     changes: dict[int, list[Change]] = {}
     for number, probe in enumerate([*shown, *sentences]):
-        each = [member.first_order(template) for member in probe.group]
-        if all(one and all(columns.has(change) for change in one) for one in each):
-            changes[number] = [change for one in each for change in one]
-    gaps = [sentence.gap for some in changes.values() for change in some for sentence in fringes_of(change)]
+        member_changes = [member.first_order(template) for member in probe.group]
+        if all(
+            changes_of_member and all(columns.has(change) for change in changes_of_member)
+            for changes_of_member in member_changes
+        ):
+            changes[number] = [change for changes_of_member in member_changes for change in changes_of_member]
+    gaps = [
+        sentence.gap
+        for probe_changes in changes.values()
+        for change in probe_changes
+        for sentence in fringes_of(change)
+    ]
     survives = columns.survives(gaps)
     blurred = {
         number
-        for number, some in changes.items()
-        if not all(survives[sentence.gap] for change in some for sentence in fringes_of(change))
+        for number, probe_changes in changes.items()
+        if not all(survives[sentence.gap] for change in probe_changes for sentence in fringes_of(change))
     }
-    kept = {number: some for number, some in changes.items() if number not in blurred}
-    exact = sum(len(some) for number, some in kept.items() if number < len(shown))
-    computed = columns.rounded([change for some in kept.values() for change in some], exact)
+    differentiable = {
+        number: probe_changes for number, probe_changes in changes.items() if number not in blurred
+    }
+    exact = sum(len(probe_changes) for number, probe_changes in differentiable.items() if number < len(shown))
+    computed = columns.rounded(
+        [change for probe_changes in differentiable.values() for change in probe_changes], exact
+    )
     named: dict[str, Candidate] = {}
     described: dict[str, Candidate] = {}
     first = [0, 0]
     for number, probe in enumerate([*shown, *sentences]):
         of_sentence = number >= len(shown)
-        if number in kept:
-            part = computed[of_sentence][:, first[of_sentence] : first[of_sentence] + len(probe.widths)]
+        if number in differentiable:
+            block = computed[of_sentence][:, first[of_sentence] : first[of_sentence] + len(probe.widths)]
             first[of_sentence] += len(probe.widths)
         elif number in blurred:
             continue
         else:
-            part = own_columns(likelihood, values, probe.group)
+            block = own_columns(likelihood, values, probe.group)
         into = described if of_sentence else named
-        into[probe.name] = Candidate(probe.name, part, probe.widths)
+        into[probe.name] = Candidate(probe.name, block, probe.widths)
     return named, described
 
 

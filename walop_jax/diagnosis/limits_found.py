@@ -117,7 +117,7 @@ class DetectionLimits(Displayed):
             },
             "untestable": list(self.untestable),
             "conditions": [dataclasses.asdict(entry) for entry in self.conditions],
-            "could_hide": [one._asdict() for one in self.could_hide],
+            "could_hide": [mistake._asdict() for mistake in self.could_hide],
         }
 
     @classmethod
@@ -135,7 +135,8 @@ class DetectionLimits(Displayed):
             untestable=tuple(document["untestable"]),
             conditions=_records(ConditionLimit, document.get("conditions", ()), "detected"),
             could_hide=tuple(
-                CouldHide(**{**one, "error": tuple(one["error"])}) for one in document.get("could_hide", ())
+                CouldHide(**{**entry, "error": tuple(entry["error"])})
+                for entry in document.get("could_hide", ())
             ),
         )
 
@@ -145,7 +146,7 @@ class DetectionLimits(Displayed):
 
         Of what is in `could_hide` the error stands there; of anything else that of its own limit.
         """
-        known = {one.name for one in self.could_hide}
+        names = {mistake.name for mistake in self.could_hide}
         effects = (
             CouldHide(
                 f"{e.effect}.{e.parameter}", EFFECT, e.detected[1], e.unit, "", True, False, e.error_of_qu
@@ -156,8 +157,14 @@ class DetectionLimits(Displayed):
         data = (
             CouldHide(e.what, DATA, e.size, e.unit, "", True, False, e.error_of_qu) for e in self.conditions
         )
-        others = [one for one in (*effects, *data) if one.name not in known and np.isfinite(one.error[0])]
-        return tuple(sorted((*self.could_hide, *others), key=lambda one: (-one.error[0], -one.error[1])))
+        further = [
+            mistake
+            for mistake in (*effects, *data)
+            if mistake.name not in names and np.isfinite(mistake.error[0])
+        ]
+        return tuple(
+            sorted((*self.could_hide, *further), key=lambda mistake: (-mistake.error[0], -mistake.error[1]))
+        )
 
     def display(self) -> Display:
         """The worst that could hide in a sentence; a row for each effect and parameter, and each number of the set."""
@@ -165,16 +172,17 @@ class DetectionLimits(Displayed):
         conditions = {entry.what: entry for entry in self.conditions}
         rows: list[tuple[str, ...]] = []
         for kind, title in ((EFFECT, "EFFECTS"), (DATA, "ERRORS IN THE DATA")):
-            some = [one for one in self.mistakes if one.kind == kind]
-            names = {one.name: one for one in some} | dict.fromkeys(
+            mistakes = [mistake for mistake in self.mistakes if mistake.kind == kind]
+            names = {mistake.name: mistake for mistake in mistakes} | dict.fromkeys(
                 name
                 for name in (effects if kind == EFFECT else conditions)
-                if name not in {o.name for o in some}
+                if name not in {mistake.name for mistake in mistakes}
             )
             if names:
                 rows.append((title, *("",) * (len(HEAD) - 1)))
             rows += [
-                self._row(name, one, effects.get(name), conditions.get(name)) for name, one in names.items()
+                self._row(name, mistake, effects.get(name), conditions.get(name))
+                for name, mistake in names.items()
             ]
         notes = (
             (f"cannot be detected in these data: {', '.join(self.untestable)}",) if self.untestable else ()
@@ -188,18 +196,26 @@ class DetectionLimits(Displayed):
         )
 
     def _row(
-        self, name: str, one: CouldHide | None, limit: DetectionLimit | None, condition: ConditionLimit | None
+        self,
+        name: str,
+        mistake: CouldHide | None,
+        limit: DetectionLimit | None,
+        condition: ConditionLimit | None,
     ) -> tuple[str, ...]:
-        error = "" if one is None else two_digits_range(*(100.0 * value for value in one.error))
-        remark = "" if one is None or one.measured else f"error at {two_digits(one.size)}, the usual size"
+        error = "" if mistake is None else two_digits_range(*(100.0 * value for value in mistake.error))
+        remark = (
+            ""
+            if mistake is None or mistake.measured
+            else f"error at {two_digits(mistake.size)}, the usual size"
+        )
         if limit is not None:
             named = two_digits(limit.named) if np.isfinite(limit.named) else "never"
             taken_for = ", ".join(limit.taken_for)
             return name, two_digits_range(*limit.detected), named, limit.unit, error, taken_for
         if condition is not None and not np.isfinite(condition.detected):
             remark = f"error at {two_digits(condition.size)} {condition.unit}".rstrip()
-        detected = np.inf if remark else one.size if one is not None else np.nan
-        unit = condition.unit if condition is not None else one.unit if one is not None else ""
+        detected = np.inf if remark else mistake.size if mistake is not None else np.nan
+        unit = condition.unit if condition is not None else mistake.unit if mistake is not None else ""
         return name, two_digits(detected) if np.isfinite(detected) else "never", "", unit, error, remark
 
     def protection_in_words(self) -> str:
@@ -223,10 +239,10 @@ class DetectionLimits(Displayed):
 def _records(kind: Any, entries: Any, endless: str) -> tuple[Any, ...]:
     """Records from plain data, where numbers that are not finite are null: ∞ in the field `endless`, NaN in others."""
 
-    def value(name: str, found: Any) -> Any:
-        if isinstance(found, list):
-            return tuple(value(name, one) for one in found)
-        return (np.inf if name == endless else np.nan) if found is None else found
+    def value(name: str, entry: Any) -> Any:
+        if isinstance(entry, list):
+            return tuple(value(name, element) for element in entry)
+        return (np.inf if name == endless else np.nan) if entry is None else entry
 
     names = [field.name for field in dataclasses.fields(kind)]
     return tuple(kind(**{name: value(name, entry[name]) for name in names}) for entry in entries)
@@ -234,7 +250,7 @@ def _records(kind: Any, entries: Any, endless: str) -> tuple[Any, ...]:
 
 def over_field(errors: Float[np.ndarray, "c p"]) -> tuple[float, float]:
     """Median and largest over the field, of the worst shape."""
-    known = errors[np.isfinite(errors).any(axis=1)]
-    if not known.size:
+    finite = errors[np.isfinite(errors).any(axis=1)]
+    if not finite.size:
         return float("nan"), float("nan")
-    return float(np.nanmedian(known, axis=1).max()), float(np.nanmax(known))
+    return float(np.nanmedian(finite, axis=1).max()), float(np.nanmax(finite))
