@@ -1,12 +1,12 @@
-"""The class of what a diagnosis has added: all that these data cannot tell from it, with what each does to stars.
+"""Equivalence class of each addition of a diagnosis: candidates indistinguishable from it, and their effect on stars.
 
 Additions    effects with a name, and groups of sentences. Of each the members of its class are all candidates that, in
-             its place, are not improbable (`thresholds.IMPROBABLE`), by one linear step (`class_average`). They are as
-             probable beforehand: that somebody has thought of a name for one does not make it true.
-Kinds        What is found in exposures of one KIND is a difference between that KIND and all others: which of the two
-             is wrong no residual can say. "In all other kinds, with the other sign" is a member, as probable.
-Stars        A member changes the matrix by its own column, and by what it moves the other parameters. Members that do
-             the same count once. The product is their mean, and its covariance has their spread: values and covariance
+             its place, are not improbable (`thresholds.IMPROBABLE`), by one linear step (`class_average`). Their
+             prior probabilities are equal: a name does not make a candidate more probable.
+Kinds        An effect in exposures of one KIND is a difference between that KIND and all others; residuals do not
+             show which of the two is wrong. "In all other kinds, with the other sign" is an equally probable member.
+Stars        A member changes the matrix by its own column, and through the shifts of the other parameters.
+             Equivalent members count once. The product is their mean, and its covariance has their spread: values and covariance
              of a model that holds all of them, each amplitude 0 in the models of the others.
 Limits       To first order. Structural effects, other descriptions and patterns of a single place have no sentence and
              no part in it.
@@ -40,10 +40,10 @@ from walop_jax.model.effects.change import Change as Sentence
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
-ALIKE = 0.5  # of the errors of the matrix: members that differ by less are one
-MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members that differ in what they do to stars
-LINEAR = 0.01  # of the evidence, which a linear step may miss
-LEAST_PROBABLE, PLAUSIBLE = 1e-3, 0.02  # of members that are kept, and of those that must not be far off
+ALIKE = 0.5  # of the errors of the matrix: members that differ by less count as one
+MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
+LINEAR = 0.01  # relative error of the evidence of a linear step
+LEAST_PROBABLE, PLAUSIBLE = 1e-3, 0.02  # of members in the average, and in the check of the farthest
 
 
 def classes_of(
@@ -55,8 +55,8 @@ def classes_of(
 ) -> tuple[ClassOf, ...]:
     """The classes of the effects of a model that have some names; without those of which the class is that alone.
 
-    `said` are the names of the groups of sentences that were added, `alike` those of effects and groups that were told
-    as not to be distinguished: of far larger residuals, where one linear step says little, they count as probable.
+    `said` are the names of the added groups of sentences, `alike` the effects and groups reported as indistinguishable:
+    with large residuals, where one linear step is inaccurate, they count as probable.
     """
     additions = list(_additions(state.result, context, names, said))
     if not additions or not state.result.model.template.cameras.pairs:
@@ -92,7 +92,7 @@ def _additions(
 
 
 def _groups(effect: Described, said: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """The sentences of a model as they were added, group by group; what no group holds stands by itself."""
+    """Sentences of a model in the groups of their addition; each ungrouped sentence is a group of its own."""
     ungrouped = list(effect.sentences)
     for name in said:
         group = tuple(text for text in ungrouped if text in name.split("; "))
@@ -125,7 +125,7 @@ class _Laid:
         )
 
     def added(self, sums: Sequence[Sum]) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
-        """Analysis vectors of a star at the field points, and what one unit of each amplitude adds to them."""
+        """Analysis vectors of a star at the field points, and their derivatives with respect to each amplitude."""
         missing = [amplitude for amplitude in dict.fromkeys(sums) if amplitude not in self._added]
         if missing or self._vectors is None:
             self._vectors, new = added_to_starlight(self.columns, missing, self.usual)
@@ -134,10 +134,10 @@ class _Laid:
         return self._vectors, np.stack(changes, axis=-1) if changes else np.zeros((*self._vectors.shape, 0))
 
     def class_of(self, name: str, at: Int[np.ndarray, " a"], lost: Vector, sums: tuple[Sum, ...]) -> ClassOf:
-        """The class of what has the amplitudes `at`, without which the residuals change by `lost`."""
+        """Class of the addition with the amplitudes `at`; without it the residuals change by `lost`."""
         step = _Step(self, at, lost)
         addition = step.told(name, sums)
-        # What was added is a candidate as well: it is itself, not one more of the class.
+        # The addition is among the candidates: it is no further member.
         rivals = (
             member for member in step.candidates(addition.evidence) if _texts(member.sums) != _texts(sums)
         )
@@ -160,7 +160,7 @@ class _Laid:
         return ClassOf(name, at, tuple(members), *self._spread(members))
 
     def _spread(self, members: Sequence[Likeness]) -> tuple[float, float, float]:
-        """Error of p of stars between members, that of the fit, and how far the farthest lies off (`ClassOf`)."""
+        """Error of p of stars between members, error of the fit, and largest deviation of a member (`ClassOf`)."""
         weights = np.array([member.probability for member in members])
         away = np.stack([member.change for member in members])
         away = away - np.tensordot(weights, away, 1)
@@ -197,11 +197,11 @@ class _Step:
         self.left = self.projector(design.residual + self.lost)
 
     def told(self, name: str, sums: tuple[Sum, ...]) -> Likeness:
-        """The member that was added, as the fit has it."""
+        """The addition itself as a member, with its fitted values."""
         fit, design, floor = self.laid.fit, self.laid.design, self.laid.state.floor
         positions = fit.model.free[self.at]
         column = design.jacobian[:, self.at]
-        column[design.rows :] = 0.0  # without its own prior, which comes in with the widths
+        column[design.rows :] = 0.0  # without its prior, which enters through the widths
         projected = self.projector(column)
         parameters = [fit.model.parameters[i] for i in positions.tolist()]
         widths = np.array([p.scale if p.prior is None else p.prior[1] for p in parameters])
@@ -213,7 +213,7 @@ class _Step:
         )  # fmt: skip
 
     def candidates(self, told: float) -> Iterator[Likeness]:
-        """Candidates that are not improbable beside what was added, the most probable first."""
+        """Candidates not improbable relative to the addition, the most probable first."""
         state, design = self.laid.state, self.laid.design
         projected = self.projector(design.jacobian[:, self.at])
         basis = projected @ whitening(projected.T @ projected)
@@ -298,7 +298,7 @@ class _Step:
         return Likeness(name, evidence, sums, amplitudes, covariance, values, slopes, change)
 
     def _can_be_said(self, sums: Sequence[Sum]) -> bool:
-        """True if a model can hold all sentences."""
+        """True if a model can include all sentences."""
         sentences = [sentence for amplitude in sums for _, sentence in amplitude]
         if not all(map(self.laid.columns.has, sums)):
             return False

@@ -1,11 +1,11 @@
-"""The product of a diagnosis: the mean over the classes of what was added, with their spread in its covariance.
+"""The product of a diagnosis: mean over the classes of its additions, with their spread in the covariance.
 
 Model        that of the fit with the sentences of all members of all classes. An amplitude is 0 in the models of the
-             others, so that values and covariance of the mixture (`class_average`) are all there is to it: the matrix,
+             others, so that values and covariance of the mixture (`class_average`) are sufficient: the matrix,
              errors of stars and maps follow as for any other calibration.
-Trust        Where members differ in what they do to stars by more than the goal, or by more than the errors of the fit,
-             only a class was named, and nothing of it is trusted: most of the error is then what is open.
-Limits       to first order; what was added to one and the other is taken as independent.
+Trust        Where the effects of members on stars differ by more than the goal, or by more than the errors of the fit,
+             only a class was identified and the product is not trusted: the ambiguity dominates the error.
+Limits       to first order; different additions are taken as independent.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Sum = tuple[tuple[float, Sentence], ...]
 
 FAR = 3.0  # errors of the product that no plausible member may lie from an element of it, in the median
 _SAME = 1e-9  # of a row of coefficients, which earlier rows must hold for it to be a combination of them
-_SHOWN = 4  # members that are told in a sentence
+_SHOWN = 4  # members listed in a sentence
 
 
 class Likeness(NamedTuple):
@@ -73,12 +73,12 @@ class ClassOf(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Members beside what was added."""
+        """Members other than the addition itself."""
         return tuple(member.name for member in self.members[1:])
 
 
 def with_average(result: FitResult, classes: Sequence[ClassOf]) -> FitResult:
-    """The fit whose calibration is the mean over the classes of what was added to its model."""
+    """The fit whose calibration is the mean over the classes of its additions."""
     if not classes:
         return result
     context = effect_context(result.model.template, result.calset.exposures)
@@ -87,9 +87,9 @@ def with_average(result: FitResult, classes: Sequence[ClassOf]) -> FitResult:
 
 
 def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Context) -> Calibration:
-    """The calibration of a fit as the mean over the classes of what was added, with their spread in its covariance.
+    """The calibration of a fit as the mean over the classes of its additions, with their spread in the covariance.
 
-    Its model holds all members, in sentences; what was added to one and the other is taken as independent.
+    Its model includes all members, as sentences; different additions are taken as independent.
     """
     if not classes:
         return calibration
@@ -202,14 +202,14 @@ def only_a_class(classes: Sequence[ClassOf]) -> Iterator[str]:
         names = some([f"{m.name} ({100 * m.probability:.0f} %)" for m in group.members[1:]], _SHOWN)
         yield (
             f"only a class of causes was named: {group.added} ({100 * group.members[0].probability:.0f} %) or {names}, "
-            f"and they differ in what they do to stars (p by {two_digits(100 * group.spread)} %, median, where the "
+            f"with different effects on stars (p by {two_digits(100 * group.spread)} %, median, where the "
             f"errors of the fit are {two_digits(100 * group.stated)} %; elements of the matrix by up to "
             f"{two_digits(group.off)} errors): {_deciding(group)}"
         )
 
 
 def _deciding(addition: ClassOf) -> str:
-    """Observations that would tell the members apart."""
+    """Observations that would distinguish the members."""
     tests = [
         s.tested_by for member in addition.members for amplitude in member.sums for _, s in amplitude[:1]
     ]

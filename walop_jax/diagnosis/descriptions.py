@@ -32,11 +32,11 @@ from walop_jax.model.specification import Model, model_without, with_effects
 CHOICE_ROWS = 6000
 """(Exposure, point) pairs on which other descriptions of an instrument are compared before any of them is fitted."""
 
-NO_DIFFERENCE = 1e-6  # change of the residuals, in standard deviations, that is none
+NO_DIFFERENCE = 1e-6  # smallest change of the residuals, in standard deviations
 
 
 def described_otherwise(model: Model, sentence: str, context: Context) -> Model:
-    """The model of the instrument changed as a sentence says, on top of what has been changed before."""
+    """The model with the change of a sentence applied to its instrument, after all earlier changes."""
     name = OtherDescription.name
     if name in model.effect_names:
         before = model.template.effect(name)
@@ -76,7 +76,7 @@ def other_descriptions(
         model = described_otherwise(result.model, choice.change, context)
         try:
             trial = try_model(result, OtherDescription, model, start, len(sentences))
-        except ValueError:  # a free parameter of what was left out has no prior: nothing holds it
+        except ValueError:  # a free parameter of a removed element has no prior and is undetermined
             continue
         assert trial.fit is not None
         gain = (result.posterior.objective - trial.fit.posterior.objective) * result.noise_scale**2
@@ -88,7 +88,7 @@ def other_descriptions(
 def _screened(
     result: FitResult, sentences: Iterable[str], context: Context
 ) -> Iterator[tuple[Choice, float, Vector]]:
-    """Each change that is one, with what it leaves, its gain in χ² and its place: the better of two places."""
+    """Every effective change with its residual fraction, gain in χ² and starting values: the better of two."""
     point_limit = max(1, CHOICE_ROWS // max(len(result.calset.exposures), 1))
     calset = thinned(result.calset, point_limit, neighbours=1)
     start = result.model.start.copy()  # but effects as they have been fitted
@@ -103,7 +103,7 @@ def _screened(
     for sentence in sentences:
         try:
             model = described_otherwise(result.model, sentence, context)
-        except NoSuchPlaceError:  # it leaves out what an effect of the model acts on
+        except NoSuchPlaceError:  # it removes an element that an effect of the model acts on
             continue
         changed, ratios = Likelihood.of(calset, model), []
         for design in places:

@@ -1,6 +1,6 @@
 """One fit laid out for linear algebra: residuals, Jacobian, priors as rows, and where every row comes from.
 
-Patterns without a name say what a disagreement could look like in any instrument of this kind. Each stratum perturbs
+Patterns without a name describe possible disagreements of any instrument of this kind. Each stratum perturbs
 the counts of the cameras, N_k → N_k + F · pattern, and is one candidate of the score test:
 
 vector          one element (q or u) of the analysis vector of one camera × field polynomials up to degree 4:
@@ -82,7 +82,7 @@ class Measured:
         self.model: Cube = (self.counts * self.weight - residual) / flux
         self.known = likelihood.flux_known
         self.cameras = likelihood.cameras
-        # Of the model, not of the counts: patterns that know the noise would find it in the residuals.
+        # Of the model, not of the counts: patterns correlated with the noise would match it in the residuals.
         unit = self.model / np.where(self.weight > 0, self.weight, 1.0)
         exposure_counts = np.maximum(self.used.sum(axis=1), 1)[:, None]
         self.level: Float[np.ndarray, "p k"] = (
@@ -96,7 +96,7 @@ class Measured:
 
     @property
     def has_gains(self) -> bool:
-        """True if exposures are seen at so many field points that gains of single ones are not all there is."""
+        """True if exposures have so many field points that gains of single exposures leave degrees of freedom."""
         return bool(self.used.sum() >= MANY_POINTS * self.used.any(axis=0).sum())
 
     @property
@@ -114,7 +114,7 @@ class Measured:
     def unit_model(self) -> Float[np.ndarray, "r k"]:
         """Weighted model of every used row, of unit length over the cameras with a flux in common; 0 if that is known.
 
-        Where exposures have no flux in common, a row without the part along it is what elimination of the flux leaves.
+        Where exposures have no flux in common, elimination of the flux removes the component of a row along it.
         """
         power = self.shared.summed(self.model**2)
         unit = self.model / np.sqrt(np.where(power > 0, power, 1.0))
@@ -308,7 +308,7 @@ class Design:
 
     @cached_property
     def columns(self) -> Columns:
-        """Columns of whatever the model has not."""
+        """Columns of changes that the model does not include."""
         return Columns(self.fit.likelihood, self.fit.values)
 
     @property
@@ -328,23 +328,23 @@ class Design:
 
     @cached_property
     def projector(self) -> Projector:
-        """Removes from columns what the free parameters could absorb."""
+        """Projection of columns off the space of the free parameters."""
         return Projector(self.jacobian, self.eliminated)
 
     @property
     def eliminated(self) -> int:
-        """Rows that carry no noise: one for every flux that was solved for, for every weak pull that does nothing."""
+        """Rows without noise: one for each fitted flux and for each ineffective weak constraint."""
         likelihood = self.fit.likelihood
         fluxes = round(float(self.measured.used.sum(axis=0) @ (likelihood.cameras - likelihood.data_per_row)))
         fitted = determined(self.jacobian.T @ self.jacobian, likelihood.weak)
         return fluxes + int((~likelihood.priors.known).sum()) - (len(likelihood.weak) - round(fitted))
 
     def _columns_of(self, name: str) -> Bool[np.ndarray, " f"]:
-        """True for the columns of the Jacobian that are those of an effect."""
+        """True for the columns of the Jacobian that belong to an effect."""
         return np.isin(self.fit.model.free, self.fit.model.positions(name))
 
     def without(self, name: str) -> tuple[Projector, Float[np.ndarray, "_ _"]]:
-        """Projector off all parameters but those of one effect, and an orthonormal basis of what these add to it."""
+        """Projector off all parameters but those of one effect, and an orthonormal basis of the columns of that effect."""
         of_effect = self._columns_of(name)
         projector = Projector(self.jacobian[:, ~of_effect], self.eliminated)
         projected = projector(self.jacobian[:, of_effect])

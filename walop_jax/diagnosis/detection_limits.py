@@ -1,4 +1,4 @@
-"""Power of a calibration set before anything is found in it: the sizes at which effects are detected and named.
+"""Power of a calibration set, ahead of any diagnosis: sizes at which effects are detected and identified.
 
 Everything is linear algebra on the columns of the score test (`score`), at a fit or at a plan without noise.
 
@@ -69,7 +69,7 @@ def detection_limits(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> DetectionLimits:
-    """Amplitudes at which the data behind a fit show each effect of `catalogue`, and what they cannot show.
+    """Detection limits of the data behind a fit for each effect of `catalogue`, and undetectable effects.
 
     The residuals of the fit are not used: a fit to noiseless counts of a plan serves as well. `seed` is that of the
     Monte Carlo threshold. Of a large set points spread over the field are looked at, as in `diagnose`.
@@ -103,7 +103,7 @@ def detection_limits(
 
 @dataclasses.dataclass(frozen=True)
 class _Column:
-    """One amplitude of one probe: where it is detected and named, and who stays how far from it then."""
+    """One amplitude of one probe: its detection and identification limits, and the distances of its rivals there."""
 
     probe: Probe
     number: int
@@ -114,7 +114,7 @@ class _Column:
 
 
 def _columns(examination: Examination, rivals: ScoreSpace, probe: Probe, p: float) -> list[_Column]:
-    """The amplitudes of a probe; `rivals` is the space of all effects, without what single exposures may have."""
+    """Amplitudes of a probe; `rivals` is the space of all effects, without the nuisance of single exposures."""
     space = examination.space
     at, alive, rank = space.places()[probe.name], space.alive, space.whitened[probe.name].shape[1]
     first, limits = rivals.places()[probe.name].start, []
@@ -141,7 +141,7 @@ def _columns(examination: Examination, rivals: ScoreSpace, probe: Probe, p: floa
 def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.ndarray, "c p"]:
     """Error of q and u at every field point from each column, at the amplitude that is just detected.
 
-    That is the width of its prior at most: what is plausible where the data would show only more.
+    It is at most the width of its prior: the plausible size where the detection limit is larger.
     Of an effect with many shapes that of the median amplitude stands for all; the others are NaN.
     """
     design, result = examination.design, examination.result
@@ -186,7 +186,7 @@ def _has_fringes(probe: Probe, template: Instrument) -> bool:
 
 
 def _representative(columns: Sequence[_Column]) -> set[str]:
-    """Names of the probes whose effect on the matrix is worked out."""
+    """Names of the probes whose effect on the matrix is computed."""
     by_effect: dict[EffectKind, dict[str, float]] = {}
     for column in columns:
         by_effect.setdefault(column.probe.effect, {}).setdefault(column.probe.name, column.detected)
@@ -264,7 +264,7 @@ def _nearest(columns: Sequence[_Column]) -> dict[str, float]:
 
 
 def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
-    """A limit for every number that the set behind a fit states of itself."""
+    """A limit for every stated condition of the set behind a fit."""
     scored = condition_scores(design)
     tried = sum(item.score.testable for item in scored)
     if not tried:

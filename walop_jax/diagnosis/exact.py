@@ -1,4 +1,4 @@
-"""Exact fits of what a diagnosis tries, adds and drops.
+"""Exact fits of the candidates of a diagnosis: trials, additions and removals.
 
 Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det H_base) − Σ ln w, with O the objective (χ² of
                data and priors), H half its Hessian and w the prior widths of the added parameters; those of amplitudes
@@ -26,13 +26,13 @@ from walop_jax.model.specification import Model, model_without, with_effects
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """An addition to a model that was tried: its evidence (ln B), and what it leaves, χ² and whether that is noise.
+    """A trial addition to a model: its evidence (ln B), the remaining χ², and whether that agrees with noise.
 
     `item` is its linear step, `linear` the evidence of that (NaN where there was none). `fit` is None until it has been
     fitted. `alternatives` are other shapes of the effect that do as well, in words. `rivals` are effects of nearly its
     evidence, or of which a part would do, `nameless` sentences that are not improbable beside it. `predicts` is False
-    where its linear step does not predict what it has not seen, `compared` holds what two fits say of it
-    (`predictions.before_and_after`), `against` the KINDs of exposures that speak against it, `refused` the reason for
+    where its linear step does not predict held-out data, `compared` holds the comparison of two fits
+    (`predictions.before_and_after`), `against` the KINDs of exposures that contradict it, `refused` the reason for
     which it was not added, `said` the groups of sentences that were added one after the other.
     """
 
@@ -54,7 +54,7 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """Its name: of what has none the descriptions, of another description of the instrument the change."""
+        """Its name; without one its descriptions, or the change of the description of the instrument."""
         if self.item is not None:
             return self.item.name
         if self.effect is OtherDescription and self.fit is not None:
@@ -104,7 +104,7 @@ def _of_amplitudes(result: FitResult, at: Sequence[int], scales: Float[np.ndarra
     """ln B of some parameters against their prior means: density of posterior and prior there, both Gaussian.
 
     The Savage–Dickey ratio of nested models (Dickey 1971, Ann. Math. Stat. 42, 204), with the prior at all `scales`:
-    what the data alone say is the information of the posterior without that of the prior.
+    the information of the data alone is that of the posterior less that of the prior.
     """
     if not at:
         return 0.0
@@ -143,7 +143,7 @@ def try_model(
         noise_scale=base.noise_scale,
         worth=base.posterior.objective,
     )
-    bayes = -np.inf  # of a fit that has run to where nothing is finite
+    bayes = -np.inf  # of a diverged fit
     if np.isfinite(result.posterior.matrix).all():
         bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
     return Trial(effect, bayes, result.chi2, result.explains_data, fit=result)
@@ -188,7 +188,7 @@ def in_words(effect: Effect) -> str:
 
 
 def spoken_choices(effect: Effect) -> dict[str, Any]:
-    """Discrete choices that mean something to a reader: a camera, a crystal, a star."""
+    """Discrete choices with a meaning for a reader: a camera, a crystal, a star."""
     return {name: value for name, value in effect.choices().items() if isinstance(value, int | str)}
 
 
@@ -236,7 +236,7 @@ def evidence_of_presence(result: FitResult, name: str) -> float:
 
 
 def refit_without(result: FitResult, name: str) -> FitResult:
-    """Take an effect out of a fitted model and fit again, with errors scaled only if what is left needs it."""
+    """Take an effect out of a fitted model and fit again, with errors scaled only if the residuals require it."""
     model = model_without(result.model, name)
     start = dict(zip(result.model.names, result.values, strict=True))
     return fit(Likelihood.of(result.calset, model), start=np.array([start[n] for n in model.names]))

@@ -1,9 +1,9 @@
-"""Physics that a fit lacks, by linear algebra: the scores of all candidates, their order of evidence, their equals.
+"""Candidates for missing physics, by linear algebra: scores, ranking by evidence, equivalent candidates.
 
 Evidence      Of a candidate alone: ln B of the score test (`score.log_bayes`). Alternative shapes of an effect share
               its prior, sentences share that of one name.
 Separation    The change D of the residuals that a candidate makes at its amplitudes, projected off the other
-              parameters, is fitted by each rival; the length of what the rival cannot follow is the separation in
+              parameters, is fitted by each rival; the length of the remainder is the separation in
               standard deviations (Atkinson & Fedorov 1975, Biometrika 62, 57). Below `thresholds.SEPARATION` the data
               cannot tell the two apart, nor when their evidence differs by less than `thresholds.IMPROBABLE`.
 """
@@ -70,7 +70,7 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
 
 
 def leaders(ranked: Sequence[Ranked]) -> list[Ranked]:
-    """Candidates whose linear evidence is too close to the best to leave them out."""
+    """Candidates with a linear evidence close to the best."""
     if not ranked:
         return []
     best, reach = ranked[0].log_bayes, thresholds.WITHIN
@@ -112,7 +112,7 @@ def shortest(item: Ranked, most: int = thresholds.MOST_TOGETHER) -> Described:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Evidence:
-    """Part of one set of residuals that every candidate would explain, beyond what the base parameters do.
+    """The part of one set of residuals that each candidate explains beyond the base parameters.
 
     `space` is that of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
     `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are told as the
@@ -139,7 +139,7 @@ class Evidence:
 
     @cached_property
     def told(self) -> list[Ranked]:
-        """Sentences in order of evidence, each less what it pays for being one of so many."""
+        """Sentences in order of evidence, each less the logarithm of their number."""
         price = float(np.log(max(len(self.sentences), 1)))  # all of them share the prior of one name
         scored = [(probe, self.table[probe.name]) for probe in self.sentences]
         candidates = [
@@ -159,17 +159,17 @@ class Evidence:
 
     @property
     def alarm(self) -> bool:
-        """True if anything is missing at all."""
+        """True if the model is incomplete at the threshold `thresholds.ALARM`."""
         return self.table.p_global < thresholds.ALARM
 
     @property
     def poor(self) -> bool:
-        """True if so much is missing that what cannot be differentiated is worth trying."""
+        """True if the fit is poor enough to try changes that have no derivative."""
         return self.chi2 > thresholds.POOR_FIT * self.dof
 
     @property
     def floor(self) -> float:
-        """Scatter behind everything that was looked for, in standard deviations of the data as stated; 1 or more.
+        """Scatter behind all candidates, in standard deviations of the data as stated; 1 or more.
 
         Above `thresholds.FLOOR` no candidate explains the data to within N_ERR. Evidence and separations then count in
         this unit: in that of photons everything would be certain.
@@ -187,7 +187,7 @@ class Evidence:
 
     @property
     def best_pattern(self) -> float:
-        """Evidence of the most probable pattern, less what it pays for being one of several."""
+        """Evidence of the most probable pattern, less the logarithm of the number of patterns."""
         alive = [score.log_bayes for score in self._pattern_scores]
         return max(alive, default=-np.inf) - float(np.log(max(len(alive), 1)))
 
@@ -255,10 +255,10 @@ class Evidence:
         best = max((item.log_bayes for item in self.significant), default=-np.inf)
         return [item for item in self.significant_sentences if item.log_bayes > best]
 
-    # ------------------------------------------------------------------------------- what cannot be told apart
+    # ------------------------------------------------------------------------------- indistinguishable candidates
 
     def apart(self, item: Ranked) -> dict[str, float]:
-        """Distance (σ) of every candidate from what one does at its amplitudes, by linear steps."""
+        """Distance (σ) of every candidate from the change of one at its amplitudes, by linear steps."""
         at, amplitudes = self.space.places()[item.probe.name], item.score.amplitudes
         change = self.space.gram[:, at] @ amplitudes
         return separations(self.space, change, float(amplitudes @ change[at]))
@@ -272,7 +272,7 @@ class Evidence:
         return nearest
 
     def close(self, item: Ranked) -> tuple[str, ...]:
-        """Effects that could follow what a candidate would explain, by linear steps; the nearest first."""
+        """Effects indistinguishable from a candidate, by linear steps; the nearest first."""
         apart = self.nearest(self.apart(item))
         apart.pop(item.effect.name, None)
         close = {name: s for name, s in apart.items() if s < thresholds.SEPARATION * self.floor}
@@ -308,7 +308,7 @@ class Evidence:
         )
 
     def classes(self) -> Iterator[dict[str, Any]]:
-        """Rows of a file: effects that could follow what each significant one would explain, by linear steps."""
+        """Rows of a file: effects indistinguishable from each significant one, by linear steps."""
         for item in self.significant[: thresholds.MOST_CLASSES]:
             if close := self.close(item):
                 effect = item.effect
@@ -336,7 +336,7 @@ class Evidence:
 
 
 def explains(chi2: float, dof: float) -> bool:
-    """True if χ² is what noise alone would give, as `FitResult.explains_data` has it."""
+    """True if χ² agrees with noise alone, by the criterion of `FitResult.explains_data`."""
     return bool(dof > 0 and chi2 - dof < SUSPECT_SIGMA * np.sqrt(2.0 * dof))
 
 
@@ -364,7 +364,7 @@ class _Absorbed:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Examination(Evidence):
-    """The evidence of one fit, and where it comes from.
+    """The evidence of one fit, and its origin.
 
     `named` and `said` are the columns of effects and of sentences, `columns` those of all candidates, ahead of any
     projection; `bare` is their space ahead of the nuisance of single exposures with prior widths `common_mode`.
@@ -383,11 +383,11 @@ class Examination(Evidence):
 
     @property
     def noise_p(self) -> float:
-        """Chance that noise of the stated size alone leaves as much as this fit does."""
+        """Probability of a χ² as large as this from noise of the stated size alone."""
         return float(special.chdtrc(max(self.dof, 1), self.chi2))
 
     def untestable(self, catalogue: Sequence[EffectKind]) -> tuple[str, ...]:
-        """Effects that these data cannot show at any plausible size."""
+        """Effects not detectable in these data at any plausible size."""
         testable = {probe.effect.name for probe in self.probes if self.table[probe.name].testable}
         testable.update(self.result.model.effect_names)
         return tuple(
@@ -409,7 +409,7 @@ class Examination(Evidence):
         return self.design.products(self.columns, self.design.projector(rows))
 
     def is_like(self, design: Design) -> bool:
-        """True if another fit expects so nearly the same counts that its columns may serve again."""
+        """True if the expected counts of another fit are close enough to reuse its columns."""
         ours, theirs = self.design.measured.model, design.measured.model
         return bool(np.linalg.norm(ours - theirs) < thresholds.SAME_COUNTS * np.linalg.norm(ours))
 
@@ -500,9 +500,9 @@ def _common_mode(space: ScoreSpace, design: Design, rms: float) -> Vector:
 
 
 def most_points(calset: CalibrationSet, instrument: Instrument, amplitudes: int) -> int:
-    """Number of field points that are looked at: as many as rows, and numbers in all columns, may be.
+    """Number of examined field points, from the limits on rows and on numbers in all columns.
 
-    `amplitudes` are those of the effects that are examined.
+    `amplitudes` counts those of all candidates.
     """
     columns = amplitudes + number_of_columns(calset, instrument)
     exposures = len(calset.exposures)

@@ -139,8 +139,8 @@ def _summed_pixels(result: FitResult) -> Iterator[str]:
         return
     if compression.gain is None and not result.explains_data:
         yield (
-            f"χ² of the {compression.pixels} pixels that were summed lies {result.excess:.3g} standard deviations above "
-            "its expectation, and nobody looked for the cause: compress the frames again"
+            f"χ² of the {compression.pixels} summed pixels lies {result.excess:.3g} standard deviations above its "
+            "expectation, and the cause was not searched for: compress the frames again"
         )
     elif compression.gain or compression.response:
         yield (
