@@ -6,8 +6,8 @@ Additions    effects with a name, and groups of sentences. Of each the members o
 Kinds        An effect in exposures of one KIND is a difference between that KIND and all others; residuals do not
              show which of the two is wrong. "In all other kinds, with the other sign" is an equally probable member.
 Stars        A member changes the matrix by its own column, and through the shifts of the other parameters.
-             Equivalent members count once. The product is their mean, and its covariance has their spread: values and covariance
-             of a model that holds all of them, each amplitude 0 in the models of the others.
+             Equivalent members count once. The product is their mean, and its covariance has their spread: values and
+             covariance of a model that includes all of them, each amplitude 0 in the models of the others.
 Limits       To first order. Structural effects, other descriptions and patterns of a single place have no sentence and
              no part in it.
 """

@@ -344,7 +344,7 @@ class Design:
         return np.isin(self.fit.model.free, self.fit.model.positions(name))
 
     def without(self, name: str) -> tuple[Projector, Float[np.ndarray, "_ _"]]:
-        """Projector off all parameters but those of one effect, and an orthonormal basis of the columns of that effect."""
+        """Projector off all parameters but those of one effect, and an orthonormal basis of its projected columns."""
         of_effect = self._columns_of(name)
         projector = Projector(self.jacobian[:, ~of_effect], self.eliminated)
         projected = projector(self.jacobian[:, of_effect])

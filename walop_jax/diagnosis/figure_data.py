@@ -4,8 +4,8 @@ Its tables are those of `_TABLES` (docs: files). Columns of FIELD and CURVES wit
 standard deviations of one intensity as N_ERR gives them. Values of FIELD in a combination, BEFORE and AFTER, have
 standard deviation 1 (where the flux is free √(1 − 1/K) with K cameras, 0.87 of four) if there is noise alone.
 
-_Combination  r_pk = Σ_e w_e r_pek / (Σ_e w_e² over the used ones)^½ keeps unit noise. The weights w are those of what
-             can be said in words (a harmonic of the polariser angle at its best phase, the mean of a kind of
+_Combination  r_pk = Σ_e w_e r_pek / (Σ_e w_e² over the used ones)^½ keeps unit noise. The weights w are those of
+             the named combination (a harmonic of the polariser angle at its best phase, the mean of a kind of
              exposures, a trend with time) that holds most of the power of the disagreement; if all of them hold less
              than `WORDS_FROM` of what the best weights do (principal component over the exposures), the latter.
 Curve        c_ek = Σ_p v_pk r_pek / Σ_p v_pk², with v the field pattern of the difference in that camera, rms 1: a
@@ -48,7 +48,7 @@ _SIGMA = "(data - model) in standard deviations, a value for each camera"
 _CAMERAS = Column("float", width=None)
 _TABLES: Mapping[str, Mapping[str, tuple[Column, str]]] = {
     "LADDER": {
-        "MODEL": (Column("str"), "the starting model, or what was added to it"),
+        "MODEL": (Column("str"), "the starting model, or the addition to it"),
         "CHI2": (Column("float"), "chi squared of data and priors"),
         "DOF": (Column("int"), "degrees of freedom"),
     },
@@ -61,7 +61,7 @@ _TABLES: Mapping[str, Mapping[str, tuple[Column, str]]] = {
     },
     "COMPARISONS": {
         "COMPARISON": (Column("int"), "number, 0: starting model and final model"),
-        "EFFECT": (Column("str"), "what was added"),
+        "EFFECT": (Column("str"), "the addition"),
         "COMBINATION": (Column("str"), "combination of exposures of FIELD"),
         "HARMONIC": (Column("int"), "of the polariser angle; -1: none"),
     },
@@ -94,10 +94,10 @@ _TABLES: Mapping[str, Mapping[str, tuple[Column, str]]] = {
 
 @dataclasses.dataclass(frozen=True)
 class ResidualComparison:
-    """Residuals without and with something, as maps over the field and as curves over the exposures.
+    """Residuals without and with an effect, as maps over the field and as curves over the exposures.
 
     `effect` is empty where the starting model is compared with the final one. `combination` (plain ASCII) and
-    `harmonic` say which combination of the exposures the maps show; the module says what the columns are.
+    `harmonic` identify the combination of the exposures in the maps; the module docstring defines the columns.
     """
 
     effect: str
@@ -115,20 +115,20 @@ class ResidualComparison:
 
     @property
     def explained(self) -> PointMap:
-        """Effect on the maps, all other parameters having followed."""
+        """Effect on the maps, with all other parameters refitted."""
         return self.before - self.after
 
     @property
     def curve_explained(self) -> Curve:
-        """Effect on the curves, all other parameters having followed."""
+        """Effect on the curves, with all other parameters refitted."""
         return self.curve_before - self.curve_after
 
 
 @dataclasses.dataclass(frozen=True)
 class DiagnosisFigureData:
-    """Everything that `diagnosis.fits` holds; `comparisons[0]` is of the starting and the final model.
+    """Content of `diagnosis.fits`; `comparisons[0]` is that of the starting and the final model.
 
-    `ladder` and `shares` are the tables of these names, `exposures` the columns of CURVES that say which they are.
+    `ladder` and `shares` are the tables of these names, `exposures` the columns of CURVES that identify them.
     """
 
     points: Points
@@ -248,7 +248,7 @@ LEAST_COVERAGE = 0.5  # share of Σ w² that the exposures of a point must hold 
 
 @dataclasses.dataclass(frozen=True)
 class _Combination:
-    """Weights of the exposures (norm 1), what they are in words, and the harmonic of the polariser angle or −1."""
+    """Weights of the exposures (norm 1), their description, and the harmonic of the polariser angle or −1."""
 
     words: str
     weight: Weight
@@ -368,7 +368,7 @@ def _in_words(cube: Cube, used: Used, exposures: Exposures) -> Iterator[_Combina
 
 
 def _ladder(diagnosis: Diagnosis) -> Table:
-    """Starting model, every addition, and the final fit where it is another one than that of the last addition."""
+    """Starting model, every addition, and the final fit where it differs from that of the last addition."""
     final = diagnosis.after
     dof, rungs = diagnosis.before.dof, [("starting model", diagnosis.before.chi2, diagnosis.before.dof)]
     for step in diagnosis.steps:

@@ -1,4 +1,4 @@
-"""Findings of a diagnosis: values, words, where they sit, and the content of `diagnosis.json` (docs: files)."""
+"""Findings of a diagnosis: values, descriptions, locations, and the content of `diagnosis.json` (docs: files)."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from walop_jax.model.effects.change import Change
 
 HARMONICS = (0, 1, 2, 3, 4)
 FIELD_WORDS = ("uniform", "gradient", "quadratic", "cubic", "fourth order")
-DIFFERENT = 0.1  # of the whole: less is no difference
-FEWEST_FREE = 4  # exposures beyond what their settings explain, for a trend to be told
+DIFFERENT = 0.1  # of the total: smaller differences are ignored
+FEWEST_FREE = 4  # degrees of freedom of the exposures beyond their settings, for a trend to be determined
 SHARE = 0.2  # a group is mentioned when it carries this share of the largest
 
 
@@ -88,7 +88,7 @@ def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
 def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
     """Place of a change of the residuals (data rows of `design`), as `where` of diagnosis.json (docs: files).
 
-    None where its shares are those that the same change of every row would have: that is the plan, not the change.
+    None where its shares equal those of a uniform change of all rows: these reflect the plan, not the change.
     """
     cube = design.cube(rows)
     square = cube**2
@@ -129,8 +129,8 @@ def _differing(groups: dict[str, float], plan: dict[str, float]) -> str | None:
 def _trend(e: Exposures, settings: Int[np.ndarray, " e"], rms: Float[np.ndarray, " e"]) -> float:
     """Correlation of the rms of exposures with their order in time, among those that a plan has alike.
 
-    What kind, setting and angle of the polariser (first and second harmonic of 2θ) explain of either is taken out: a
-    plan goes through them in order, so that they are not told from time.
+    Both are projected off kind, setting and angle of the polariser (first and second harmonic of 2θ): a plan
+    goes through these in order, so that they are degenerate with time.
     """
     alike = [settings == number for number in np.unique(settings)]
     through = e.clp_in & np.isfinite(e.clp_angle)
@@ -148,7 +148,7 @@ def _trend(e: Exposures, settings: Int[np.ndarray, " e"], rms: Float[np.ndarray,
     return float(residuals[0] @ residuals[1]) / (size[0] * size[1])
 
 
-# -------------------------------------------------------------------------------------------------------- what is found
+# ------------------------------------------------------------------------------------------------------------- findings
 
 Outcome = Literal["consistent", "effect_found", "unexplained"]
 Cube = Float[np.ndarray, "p e k"]
@@ -160,15 +160,15 @@ def _no_cube() -> Cube:
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """One effect that was found, added and confirmed; `parameters` hold (value, sigma, unit).
+    """One identified, added and confirmed effect; `parameters` hold (value, sigma, unit).
 
     `score` and `p_value` (corrected for all that was tried) are of the linear test, `log_bayes` of the refit.
     `far` are amplitudes that lie beyond what their prior allows, in its widths: the data have refuted that prior.
     `change_of_qu` is the largest change that adding it makes to calibrated q or u of a star with p ≤ 5 % at any field
     point, `robust_ratio` the errors of its parameters when every exposure may have a disturbance of its own, over
     the errors stated. `choices` are discrete (which camera, which star), `alternatives` other shapes of the same
-    effect that explain the data as well. `equivalent` are the effects that this data set cannot tell from it,
-    `separation` how far (σ) each rival stays from it. `residual_before` and `residual_after` are the residuals
+    effect that explain the data as well. `equivalent` are the effects indistinguishable from it in this data set,
+    `separation` is the distance (σ) of each rival from it. `residual_before` and `residual_after` are the residuals
     (data − model, in standard deviations as given; point, exposure, camera) without and with the effect at the time it
     was added; where another name has been dropped since, they and χ² are of fits without that name. `told` are the
     sentences of an effect without a name (`described`) with amplitude and error, `nameless` those that are not
@@ -201,12 +201,12 @@ class Step:
 
     @property
     def confirmed(self) -> bool:
-        """True if data that took no part in the fit agree better with the effect than without."""
+        """True if held-out data agree better with the effect than without."""
         return self.heldout_after < self.heldout_before
 
     @property
     def negligible(self) -> bool:
-        """True if the effect hardly matters for calibrated q and u."""
+        """True if the effect is negligible for calibrated q and u."""
         return self.change_of_qu < thresholds.NEGLIGIBLE
 
 
@@ -231,10 +231,10 @@ class Unexplained:
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """A change of the description that was tried.
+    """A trial change of the description.
 
-    `left` is what it leaves of the squared residuals behind one linear step, over what the description given leaves,
-    and `better_by` the gain in χ², data and priors, when all is fitted (NaN where that was not done).
+    `left` is the ratio of squared residuals after one linear step, with the change and without it,
+    and `better_by` the gain in χ², data and priors, when all is fitted (NaN: not fitted).
     """
 
     change: str
@@ -247,7 +247,7 @@ class Diagnosis(Drawn):
     """Effects that a model lacks, according to one calibration set.
 
     `candidates` are (effect, score, corrected p) in the first examination; `before` is the fit of the model given,
-    `after` that of the extended one; `remaining_p` is the significance of what is left at the end. `choices` are other
+    `after` that of the extended one; `remaining_p` is the global p of the final residuals. `choices` are other
     descriptions of the instrument that were tried, the best first; none where nothing, or only a name, was missing.
     `noise_scale` is the scatter of what no candidate explains over what N_ERR says, `noise_p` the chance that noise of
     the stated size scatters as much. `classes` are significant effects of the first examination with those that
@@ -282,14 +282,14 @@ class Diagnosis(Drawn):
     descriptions: int = 0
 
     def why(self, name: str) -> str:
-        """Why an effect, a description or a change of the instrument was not named, with the numbers.
+        """Reasons for which an effect, a description or a change of the instrument was not named, with numbers.
 
         ValueError, with the nearest names, for what is none of them.
         """
         return why(document(self), name)
 
     def calibration(self) -> Calibration:
-        """The calibration of the extended model: its mean over what these data cannot tell apart, with its spread."""
+        """The calibration of the extended model: mean over indistinguishable models, with their spread."""
         return Calibration.from_fit(self.after)
 
     @property
@@ -326,7 +326,7 @@ class Diagnosis(Drawn):
         return "; ".join(cautions)
 
     def to_table(self) -> Any:
-        """The parameters of all effects that were found, as an astropy table."""
+        """The parameters of all identified effects, as an astropy table."""
         rows = [(s, name, *entry) for s in self.steps for name, entry in s.parameters.items()]
         return astropy_table(
             {
@@ -341,14 +341,14 @@ class Diagnosis(Drawn):
         )
 
     def _found(self) -> str:
-        """Names of what was added to the starting model, and whether something without a name is left."""
+        """Names of the additions to the starting model, with a note on an unidentified remainder."""
         names = [step.effect for step in self.steps] + ["something without a name"] * (
             self.unexplained is not None
         )
         return ", ".join(names) or "nothing beyond the starting model"
 
     def display(self) -> Display:
-        """The verdict, and what was found."""
+        """The verdict and the findings."""
         rows = []
         for step in self.steps:
             entries: dict[str, Any] = {name: (value, 0.0, "") for name, value in step.choices.items()}
@@ -410,7 +410,7 @@ def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
 
 # ------------------------------------------------------------------------------------------ as plain data
 
-_ALIKE, _CLASSES = 6, 3  # names that look alike, and groups of them, that are printed: the file has all
+_ALIKE, _CLASSES = 6, 3  # printed indistinguishable names, and groups of them: the file has all
 
 
 def _number(value: float) -> float | None:
@@ -446,8 +446,8 @@ def _members(addition: ClassOf) -> dict[str, Any]:
 
 
 def sentences(content: Mapping[str, Any]) -> Iterator[str]:
-    """Sentences beside the numbers of a diagnosis, from the content of diagnosis.json: `print`, the command and the
-    page say the same."""
+    """Sentences beside the numbers of a diagnosis, from the content of diagnosis.json: the same in `print`, the command
+    and the page."""
     for step in content["steps"]:
         yield from _of_step(step)
     remainder = content.get("unexplained")
@@ -477,7 +477,7 @@ def sentences(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
-    """The sentences about one effect that was found."""
+    """The sentences about one identified effect."""
     name = step["effect"]
     for sentence in step.get("sentences", ()):
         yield f"{sentence['words']}: {sentence['tested_by']}"

@@ -1,4 +1,4 @@
-"""Sentences on all that an instrument may lack: kind × place × dependence, from its own train and its exposures.
+"""Sentences on all possible omissions of an instrument model: kind × place × dependence, from train and exposures.
 
 A *group* of sentences is one candidate of the score test: a linear retarder has two axes, a harmonic a cosine and a
 sine, a gradient two directions.
@@ -8,10 +8,10 @@ sine, a gradient two directions.
                   the polariser, another moving element, a wave plate, a camera, an arm, a source
     dependence    those that `Kind.grows` names of a kind at a place: patterns over the field, each with every
                   dependence on wavelength, time, temperature, hour angle, angles, exposures and counts
-                  (`Combinations`), of those that the exposures can tell apart (`Dependences`)
+                  (`Combinations`), of those that the exposures can distinguish (`Dependences`)
 
-Each sentence pays the logarithm of their number; longer ones pay by their evidence. `beside_names` tells which
-groups an effect of the catalogue already is, or holds.
+The evidence of each sentence is reduced by the logarithm of their number. `beside_names` finds the groups that are
+equivalent to an effect of the catalogue, or part of one.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.slots import acts
 from walop_jax.model.specification import effect_context
 
-ROUNDED = 1e-4  # hours, of times that are written into a description
+ROUNDED = 1e-4  # hours, of times in descriptions
 
 
 def sentences(instrument: Instrument, exposures: Exposures, points: int) -> tuple[Probe, ...]:
@@ -61,11 +61,11 @@ def _probe(group: tuple[Sentence, ...]) -> Probe:
     return Probe("; ".join(sentence.text for sentence in group), Described, members)
 
 
-# ----------------------------------------------------------------------------------------- all that may be missing
+# --------------------------------------------------------------------------------------------- possible omissions
 
 
 class Hypotheses(NamedTuple):
-    """All that a model may lack: effects that fit the instrument, their probes, and sentences.
+    """All possible omissions of a model: effects that fit the instrument, their probes, and sentences.
 
     `sentences` are those that no effect holds, `parts` those that effects hold in part, with the holders, `every` are
     all of them, those that are an effect by another name as well.
@@ -86,7 +86,7 @@ class Hypotheses(NamedTuple):
 def hypotheses(
     catalogue: Sequence[EffectKind], instrument: Instrument, exposures: Exposures, points: int
 ) -> Hypotheses:
-    """The one list of what a diagnosis looks for, the verdict of a fit is held against, and limits are given beside."""
+    """The one list of candidates of a diagnosis, of the verdict on a fit, and of detection limits."""
     context, all_probes = effect_context(instrument, exposures), sentences(instrument, exposures, points)
     effects = applicable(catalogue, context, instrument)
     alone, partial = beside_names(all_probes, effects, context, instrument)
@@ -125,9 +125,9 @@ def beside_names(
 
 
 def retimed(sentence: Sentence, exposures: Exposures, end: int) -> list[Sentence]:
-    """The same with another start (`end` 0) or stop (1), at every time as near as others that are looked at first.
+    """The same with another start (`end` 0) or stop (1), at all times within the spacing of the first search.
 
-    None for what does not start or stop between two exposures.
+    Empty for a sentence without start and stop between two exposures.
     """
     times = starts_of_steps(exposures)
     if [factor.form for factor in sentence.grows_with] != ["hours"]:
@@ -149,7 +149,7 @@ Mask = Bool[np.ndarray, " e"]
 
 
 class Subject(NamedTuple):
-    """Changes that have the same dependences, by what is tried together (`Combinations.among`).
+    """Changes with the same dependences, by the groups of a joint trial (`Combinations.among`).
 
     They may grow with the angles of elements of some `prefixes`, and are seen in exposures that are `inside` (None: in
     all of them).
@@ -188,7 +188,7 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
 
 
 def _subjects(instrument: Instrument, exposures: Exposures, *, over_field: bool) -> Iterator[Subject]:
-    """All changes that an instrument has a place for, and exposures can show."""
+    """All changes that fit the instrument and are visible in the exposures."""
     polariser, sky = instrument.polariser, ~exposures.clp_in
     groups = [group for group in GROUPS if over_field or not group[0].endswith(("radial", "diagonal"))]
     for places in _places(instrument, exposures):
@@ -218,7 +218,7 @@ def _subjects(instrument: Instrument, exposures: Exposures, *, over_field: bool)
 
 
 def _places(instrument: Instrument, exposures: Exposures) -> Iterator[list[tuple[str, str]]]:
-    """Places that differ in what acts on polarisation: preposition and element; those of the same name in all arms."""
+    """Places between elements that act on polarisation: preposition and element; equal names in all arms together."""
     train, polariser, arms = list(instrument.train()), instrument.polariser, instrument.arms
     behind = train[len(instrument.telescope()) + (polariser is not None) :]
     if polariser is not None:

@@ -1,10 +1,10 @@
-"""Mistakes that the data behind a fit would not show: of the set, of the cameras, and effects that the model has not.
+"""Errors undetectable in the data behind a fit: of the set, of the cameras, and effects missing from the model.
 
 A number that is wrong by h moves the parameters by δθ = R⁻¹QᵀC h (J = QR), and is found where h² |PC|² reaches the
 noncentrality of its test (`stated_conditions`), with a probability of 99 %. It hides at that size, or at the largest
-plausible one, for an effect the width of its prior. What the data hold no information on at all hides at that as well:
-P C = 0, or no exposure that could show it. Stars are wrong by what it does to their own light less what δθ makes up for
-(`calibration.could_hide`); what does neither cannot matter, and is left out.
+plausible one, for an effect the width of its prior. So does a number without any information in the data:
+P C = 0, or no sensitive exposure. The error of stars is the effect on their own light less the compensation by δθ
+(`calibration.could_hide`); without either of these a mistake has no consequence and is left out.
 
 Symbols     C derivative of the residuals; P projection off the free parameters, Q, R of their Jacobian J
 Limits      One mistake at a time, one amplitude of an effect at a time, to first order. Effects of many places or
@@ -35,14 +35,14 @@ from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Effect
 from walop_jax.model.instrument import Instrument
 
-STAR_POINTS = 16  # field points at which stars are asked what a mistake does to them
-MOST_HIDDEN = 12  # mistakes that a product keeps: what a star needs for each is a product of two vectors
-_FAINT = 0.5  # of the worst mistake, below which an effect that the data measure is not kept
-_NOTHING = 1e-9  # change of the analysis vectors that is none
+STAR_POINTS = 16  # field points at which the errors of stars are computed
+MOST_HIDDEN = 12  # mistakes in a product: each costs a star one product of two vectors
+_FAINT = 0.5  # of the worst mistake, below which a measured effect is dropped
+_NOTHING = 1e-9  # smallest change of the analysis vectors
 
 
 class _Mistake(NamedTuple):
-    """One number at the size at which it could hide, and what the parameters take up of it.
+    """One number at its largest undetected size, and its projection on the parameters.
 
     `informed`: whether the data hold information on it. Of an effect, at its size, `change` is what it does to the
     instrument matrix at the field points, and it `acts` on starlight if it does anything.
@@ -61,7 +61,7 @@ class _Mistake(NamedTuple):
 
 
 def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
-    """Single mistakes as large as the data would just have shown at 99 % probability, and what they do.
+    """Single mistakes at the size detected with 99 % probability, and their consequences.
 
     Kept are those that move the parameters by more than their standard errors, and effects that act on starlight; first
     those that make q and u of stars most wrong, in the median over the field. An effect that data show below its usual
@@ -176,7 +176,7 @@ class _Starlight:
             if probe.name in self.added:
                 added = self.added[probe.name][..., number] * sizes[number]
                 change = of_matrix(self.vectors, added, pairs)
-            else:  # of a user's own: it has no slots
+            else:  # a user-defined effect has no slots
                 at = self.setting, fit.calset.filters, points.x, points.y
                 added = change = change_by_effect(self.instrument, effect, *at)
             size, unit = float(sizes[number]), declared[parameter].unit
@@ -220,7 +220,7 @@ def usual_exposure(calset: CalibrationSet, instrument: Instrument) -> int:
 def _errors_of_stars(
     design: Design, mistakes: Sequence[_Mistake], changes: Float[np.ndarray, "c n"], exposure: int
 ) -> Float[np.ndarray, " c"]:
-    """Median over some field points of what mistakes do to q and u; 0 where these are not measured."""
+    """Median error of q and u over some field points from each mistake; 0 where these are not measured."""
     fit, points = design.fit, design.fit.calset.points
     places = np.unique(np.linspace(0, len(points) - 1, STAR_POINTS).astype(int))
     instrument = fit.model.instrument(fit.values)

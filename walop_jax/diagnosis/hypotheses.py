@@ -1,7 +1,7 @@
-"""Effects that could be missing, group by group, and what each would do to the residuals.
+"""Possibly missing effects, group by group, and the derivatives of the residuals with respect to each.
 
-The columns of the score test come from the responses of the light path (`likelihood.columns`), but those of effects of
-a user's own, which are differentiated themselves. Structural effects have no amplitude: they can only be tried
+The columns of the score test come from the responses of the light path (`likelihood.columns`), but those of
+user-defined effects by direct differentiation. Structural effects have no amplitude and are fitted instead
 (`exact.try_effect`). Effects without a name are those of `grammar`.
 """
 
@@ -73,14 +73,14 @@ class Ranked:
 
     @property
     def name(self) -> str:
-        """Its name: of what has none, the descriptions."""
+        """Its name; without one, its descriptions."""
         return self.probe.name if self.effect is Described else self.effect.name
 
 
 def applicable(
     catalogue: Sequence[EffectKind], context: Context, instrument: Instrument
 ) -> tuple[EffectKind, ...]:
-    """The effects of a catalogue that have what they act on in an instrument; ValueError as `applies`."""
+    """The effects of a catalogue that apply to an instrument; ValueError as `applies`."""
     return tuple(kind for kind in catalogue if applies(kind.neutral(context), instrument))
 
 
@@ -97,7 +97,7 @@ def probes(catalogue: Sequence[EffectKind], context: Context) -> Iterator[Probe]
 
 
 def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) -> bool:
-    """True if a set has what an effect acts on: several field points, or the conditions that its elements ask for."""
+    """True if a set is sensitive to an effect: enough field points, and the conditions of its elements."""
     if effect.kind.over_field and len(calset.points) < FEWEST_POINTS:
         return False
     bare = dataclasses.replace(instrument, effects=())
@@ -107,7 +107,7 @@ def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) ->
 
 
 def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Probe]) -> list[Probe]:
-    """The probes of effects that a set can show; shapes of one effect need the same."""
+    """The probes of effects that a set is sensitive to; all shapes of one effect have the same requirements."""
     shown: dict[EffectKind, bool] = {}
     for probe in wanted:
         if probe.effect not in shown:

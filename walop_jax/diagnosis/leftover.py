@@ -1,4 +1,4 @@
-"""The end of a search: additions that the final model does not need, and what remains without a name."""
+"""The end of a search: removal of unneeded additions, and the unidentified remainder."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ Remainder = tuple[State, Unexplained | None]
 
 
 def concluded(first: State, state: State, judge: Refits) -> Remainder:
-    """The state without what it does not need, and what remains without a name (None: nothing).
+    """The state without unneeded additions, and its unidentified remainder (None: nothing).
 
-    What predicts exposures worse than the first model is not adopted. More descriptions than
+    A model that predicts exposures worse than the first one is not adopted. More descriptions than
     `thresholds.MOST_SENTENCES` can be one thing that none of them holds.
     """
     state, remainder = _leftover(first, prune(first, state, judge), judge)
@@ -48,7 +48,7 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
 
 
 def prune(first: State, state: State, judge: Refits) -> State:
-    """The state without additions that its model does not need, the least needed first."""
+    """The state without unneeded additions, removed in order of increasing evidence."""
     result = state.evidence.result
     reduced, steps = _needed(result, state.steps, judge)
     return state if reduced is result else _refitted(first, state, reduced, steps, judge)
@@ -78,13 +78,13 @@ def _without(first: State, state: State, names: Sequence[str], judge: Refits) ->
 
 
 def _refitted(first: State, state: State, result: FitResult, steps: Sequence[Trial], judge: Refits) -> State:
-    """The state with a smaller model, and its additions as they lead to that one after the other."""
+    """The state with a smaller model, and its additions compared again in their order."""
     state = judge.adopt(state, result, steps, first.evidence)
     in_order = refitted_in_order(steps, first.evidence.design, state.evidence.design)
     return dataclasses.replace(state, steps=tuple(in_order))
 
 
-# ---------------------------------------------------------------------------------------- what remains
+# ------------------------------------------------------------------------------------------- remainder
 
 
 def _leftover(first: State, state: State, judge: Refits) -> Remainder:
@@ -111,7 +111,7 @@ def _leftover(first: State, state: State, judge: Refits) -> Remainder:
         reduced, steps = _needed(with_term, state.steps, judge)
         if reduced is with_term:
             return judge.adopt(state, reduced, steps), remainder
-        # Those names only stood in for what has none: what is it without them?
+        # These names were stand-ins for an unidentified effect: its remainder without them.
         bare = without(reduced, FreeForm.name, [step.effect.name for step in steps])
         state = _refitted(first, state, bare, steps, judge)
 
@@ -170,7 +170,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
 
 
 def _unexplained(evidence: Examination, patterns: tuple[tuple[str, float], ...]) -> Unexplained:
-    """Remainder of an examination without a name: its patterns, and where the residuals sit."""
+    """Unidentified remainder of an examination: its patterns, and the location of the residuals."""
     if not evidence.alarm:
         ratio = evidence.chi2 / evidence.dof
         text = f"residuals scatter more than N_ERR says (χ²/dof = {ratio:.3g}) without a known pattern"
@@ -191,7 +191,7 @@ def _unexplained(evidence: Examination, patterns: tuple[tuple[str, float], ...])
     return Unexplained(evidence.table.p_global, text, patterns)
 
 
-# ------------------------------------------------------------------------------------- what is not adopted
+# ------------------------------------------------------------------------------------ models not adopted
 
 
 def _worse(first: Examination, last: Examination) -> str:
@@ -205,7 +205,7 @@ def _worse(first: Examination, last: Examination) -> str:
 
 
 def _not_adopted(first: State, state: State, worse: str) -> Remainder:
-    """The first model again: what was found is told as parts."""
+    """The first model again: the additions are reported as parts."""
     partial = tuple(
         f"{step.effect.name} (χ² {step.compared['chi2_before']:.4g} → {step.compared['chi2_after']:.4g})"
         for step in state.steps
@@ -224,7 +224,7 @@ def back_to(first: State, state: State) -> State:
 
 
 def _contradicted(state: State) -> dict[str, str]:
-    """Everything that exposures of another KIND speak against, in words."""
+    """All candidates contradicted by exposures of another KIND, in words."""
     return {
         reason.name: f"{reason.name} ({reason.reason})"
         for turn in state.rounds
@@ -234,7 +234,7 @@ def _contradicted(state: State) -> dict[str, str]:
 
 
 def _descriptions(state: State) -> tuple[str, ...]:
-    """Names of the groups of sentences that were added."""
+    """Names of the added groups of sentences."""
     return tuple(name for step in state.steps for name in step.said)
 
 

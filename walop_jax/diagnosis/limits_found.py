@@ -43,10 +43,10 @@ class DetectionLimit:
 
 @dataclasses.dataclass(frozen=True)
 class ConditionLimit:
-    """By how much a number that a set states may be wrong before its residuals show it.
+    """Detection limit for the error of a number that a set states.
 
     `detected` in `unit`, infinite where no residual shows it; `error_of_qu` as that of `DetectionLimit`, at `size`:
-    what is just detected, or the most that is plausible where nothing is.
+    the detection limit, or the largest plausible size where it is not detectable.
     """
 
     what: str
@@ -63,8 +63,8 @@ class DetectionLimits(Displayed):
     `separation` (row, column) is how far (σ) the effect of the column stays from that of the row when this is just
     detected. `protection` is, by field point (`x`, `y`, degrees), the largest error of q and u that a single effect
     can make without being detected, with a tenth on top for what is not of first order, `caused_by` the effect.
-    `untestable` effects leave no trace in these data. `conditions` are what the set states of itself: its field, its
-    filters, the colours of its light. `could_hide` are the mistakes that could hide, as every command says them.
+    `untestable` effects leave no trace in these data. `conditions` are those stated in the set: its field, its
+    filters, the colours of its light. `could_hide` are the undetectable mistakes, as in every command.
     """
 
     limits: tuple[DetectionLimit, ...]
@@ -122,7 +122,7 @@ class DetectionLimits(Displayed):
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> DetectionLimits:
-        """Inverse of `document`. Raises KeyError or TypeError for one that it has not made."""
+        """Inverse of `document`. Raises KeyError or TypeError for an invalid one."""
         protection = document["protection"]
         return cls(
             limits=_records(DetectionLimit, document["limits"], "named"),
@@ -142,9 +142,9 @@ class DetectionLimits(Displayed):
 
     @property
     def mistakes(self) -> tuple[CouldHide, ...]:
-        """All that is asked, by what it could do without being noticed: the largest error of q and u first.
+        """All mistakes in order of their undetected error of q and u, the largest first.
 
-        Of what is in `could_hide` the error stands there; of anything else that of its own limit.
+        Errors are those of `could_hide`, for all others those of their own limits.
         """
         names = {mistake.name for mistake in self.could_hide}
         effects = (
@@ -232,7 +232,7 @@ class DetectionLimits(Displayed):
 
     @property
     def worst(self) -> int | None:
-        """The field point where most can go unnoticed; None if one exposure nowhere gives q and u."""
+        """The field point with the largest undetected error; None if one exposure nowhere gives q and u."""
         return int(np.nanargmax(self.protection)) if np.isfinite(self.protection).any() else None
 
 
