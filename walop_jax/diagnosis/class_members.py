@@ -142,9 +142,7 @@ class _Laid:
             member for member in step.candidates(addition.evidence) if _texts(member.sums) != _texts(sums)
         )
         members = [addition, *rivals]
-        members += [
-            counterpart for member in members if (counterpart := step.in_other_kinds(member)) is not None
-        ]
+        members += [twin for member in members if (twin := step.in_other_kinds(member)) is not None]
         best = max(member.evidence for member in members)
         least = best - thresholds.IMPROBABLE
         members = [addition, *(member for member in members[1:] if member.evidence > least)]
@@ -171,16 +169,13 @@ class _Laid:
         within = self.slopes @ covariance_of_free(self.fit) @ np.swapaxes(self.slopes, 1, 2)
         if self.matrix.shape[1] == 6:
             good = measures_u(self.matrix.reshape(-1, 2, 3))
-            errors_by_point = [
-                p_errors(self.matrix[good], covariance[good], sample_stars())
-                for covariance in (between, within)
-            ]
+            maps = [p_errors(self.matrix[good], square[good], sample_stars()) for square in (between, within)]
         else:  # no single exposure gives q and u
-            errors_by_point = [
-                np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).max(axis=1, initial=0.0))
-                for covariance in (between, within)
+            maps = [
+                np.sqrt(np.diagonal(square, axis1=1, axis2=2).max(axis=1, initial=0.0))
+                for square in (between, within)
             ]
-        spread, stated = (float(np.median(errors)) if errors.size else 0.0 for errors in errors_by_point)
+        spread, stated = (float(np.median(errors)) if errors.size else 0.0 for errors in maps)
         return spread, stated, off
 
 
@@ -234,15 +229,11 @@ class _Step:
             if evidence <= least:
                 break
             sums = tuple(
-                tuple(amplitude)
-                for member in probe.group
-                for amplitude in member.first_order(self.laid.template)
+                tuple(total) for member in probe.group for total in member.first_order(self.laid.template)
             )
             if len(sums) == len(probe.widths) and self._can_be_said(sums):
                 chosen.append((probe, evidence, sums, square, along_residual))
-        self.laid.added(
-            [amplitude for _, _, sums, *_ in chosen for amplitude in sums]
-        )  # all of them in one go
+        self.laid.added([total for _, _, sums, *_ in chosen for total in sums])  # all of them in one go
         for probe, evidence, sums, square, along_residual in chosen:
             column = design.stacked([state.columns[number[probe.name]]])
             yield self._member(probe.name, evidence, sums, column, square, along_residual, probe.widths)

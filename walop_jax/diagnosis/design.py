@@ -84,10 +84,8 @@ class Measured:
         self.cameras = likelihood.cameras
         # Of the model, not of the counts: patterns correlated with the noise would match it in the residuals.
         unit = self.model / np.where(self.weight > 0, self.weight, 1.0)
-        exposure_counts = np.maximum(self.used.sum(axis=1), 1)[:, None]
-        self.level: Float[np.ndarray, "p k"] = (
-            np.where(self.used[..., None], unit, 0.0).sum(axis=1) / exposure_counts
-        )
+        count = np.maximum(self.used.sum(axis=1), 1)[:, None]
+        self.level: Float[np.ndarray, "p k"] = np.where(self.used[..., None], unit, 0.0).sum(axis=1) / count
 
     def column(self, pattern: Cube) -> Float[np.ndarray, " _"]:
         """Derivative of the residuals with respect to the amplitude of N_k → N_k + F · level_k · pattern."""
@@ -124,13 +122,13 @@ class Measured:
         """Change by every pattern in its camera in every used row, in standard errors, the flux held."""
         size = (self.flux[..., None] * self.level[:, None, :] * self.weight)[self.used]
         points, exposures = np.nonzero(self.used)
-        camera_patterns = [
+        pairs = [
             (k, pattern)
             for stratum in strata
             for k, pattern in zip(stratum.camera, stratum.patterns, strict=True)
         ]
-        changes = np.empty((len(size), len(camera_patterns)), order="F")
-        for a, (k, pattern) in enumerate(camera_patterns):
+        changes = np.empty((len(size), len(pairs)), order="F")
+        for a, (k, pattern) in enumerate(pairs):
             values = np.broadcast_to(pattern, self.used.shape)[points, exposures]
             np.multiply(size[:, k], values, out=changes[:, a])
         return changes

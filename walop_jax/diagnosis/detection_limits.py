@@ -77,13 +77,11 @@ def detection_limits(
     tell = progress or (lambda text: None)
     template, calset = result.model.template, result.calset
     catalogue = result.model.catalogue if catalogue is None else catalogue
-    candidates = hypotheses(catalogue, template, calset.exposures, len(calset.points))
-    result = sampled(on_field_points(result), most_points(calset, template, candidates.amplitudes))
+    listed = hypotheses(catalogue, template, calset.exposures, len(calset.points))
+    result = sampled(on_field_points(result), most_points(calset, template, listed.amplitudes))
     tell(Stage("differentiating every effect", "differentiating"))
     rng = np.random.default_rng(seed)
-    examination = examine(
-        result, candidates.names, rng, sentences=candidates.sentences, parts=candidates.parts
-    )
+    examination = examine(result, listed.names, rng, sentences=listed.sentences, parts=listed.parts)
     p = examination.table.local(thresholds.ALARM)
     tell(Stage("comparing the effects", "comparing"))
     rivals = examination.bare.subset([probe.name for probe in examination.probes])
@@ -95,9 +93,9 @@ def detection_limits(
         hidden = hidden_mistakes(design, Singles.of(design))
     examined = result if result.verdict is not None else result.judged()
     calibration = Calibration.from_fit(dataclasses.replace(examined, hidden=hidden))
-    amplitude_limits = _collected(examination, columns, errors, candidates.effects, calibration)
+    limits = _collected(examination, columns, errors, listed.effects, calibration)
     return dataclasses.replace(
-        amplitude_limits, conditions=condition_limits(design), could_hide=could_hide(calibration)
+        limits, conditions=condition_limits(design), could_hide=could_hide(calibration)
     )
 
 
@@ -155,12 +153,10 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     template = result.model.template
     # Fringes need more wavelength nodes than all others: they have a program of their own.
     for fringes in (False, True):
-        chosen_probes = [
-            p for p in examination.probes if p.name in chosen and _has_fringes(p, template) == fringes
-        ]
-        members = tuple(member for probe in chosen_probes for member in probe.group)
+        subset = [p for p in examination.probes if p.name in chosen and _has_fringes(p, template) == fringes]
+        members = tuple(member for probe in subset for member in probe.group)
         changes.append(effect_slopes(instrument, setting, calset.filters, x, y, members))
-        probes += chosen_probes
+        probes += subset
     change = np.concatenate(changes, axis=-1)
     starts = np.cumsum([0, *(len(probe.widths) for probe in probes)])
     place = {probe.name: int(start) for probe, start in zip(probes, starts, strict=False)}

@@ -238,12 +238,12 @@ def _places(instrument: Instrument, exposures: Exposures) -> Iterator[list[tuple
 
 
 def _of_plates(instrument: Instrument, exposures: Exposures) -> Iterator[Subject]:
-    wave_plates = {place: instrument.element(place) for place in instrument.places(WavePlate)}
+    every_plate = {place: instrument.element(place) for place in instrument.places(WavePlate)}
     inside = {
-        place: exposures.position(plate.moves).inside for place, plate in wave_plates.items() if plate.moves
+        place: exposures.position(plate.moves).inside for place, plate in every_plate.items() if plate.moves
     }
     plates = {
-        place: plate for place, plate in wave_plates.items() if place not in inside or inside[place].any()
+        place: plate for place, plate in every_plate.items() if place not in inside or inside[place].any()
     }
     if fixed := [place for place in plates if place not in inside]:
         yield Subject.of(*(_base(("axis",), "of", place) for place in fixed))

@@ -71,23 +71,19 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     usual = usual_exposure(fit.calset, fit.model.template)
     instrument = fit.model.instrument(fit.values)
     mistakes = list(_mistakes(design, singles, usual))
-    along = np.array([mistake.along for mistake in mistakes]).reshape(len(mistakes), -1).T
+    along = np.array([m.along for m in mistakes]).reshape(len(mistakes), -1).T
     changes = (fit.model.selection() @ design.taken_up(along)).T
-    turns = np.array(
-        [0.0 if mistake.effect is None else abs(turn_of(instrument, mistake.effect)) for mistake in mistakes]
-    )
+    turns = np.array([0.0 if m.effect is None else abs(turn_of(instrument, m.effect)) for m in mistakes])
     errors = _errors_of_stars(design, mistakes, changes, usual) + 2.0 * LARGEST_P * turns
     least, strong = _FAINT * errors.max(initial=0.0), np.linalg.norm(along, axis=0) > 1.0
     best: dict[str, tuple[int, bool, bool]] = {}
     for i in np.argsort(-errors, kind="stable").tolist():
-        mistake = mistakes[i]
-        acts = mistake.acts or bool(turns[i] > 0.0)
+        m = mistakes[i]
+        acts = m.acts or bool(turns[i] > 0.0)
         # In the usual setting it is out of the beam; stars that are seen through it have it.
-        elsewhere = not (acts or mistake.informed or mistake.effect is None) and bool(
-            moves_with(mistake.effect, instrument)
-        )
-        if (errors[i] > least or not mistake.informed) if acts else (strong[i] or elsewhere):
-            best.setdefault(mistake.name, (i, acts, elsewhere))
+        elsewhere = not (acts or m.informed or m.effect is None) and bool(moves_with(m.effect, instrument))
+        if (errors[i] > least or not m.informed) if acts else (strong[i] or elsewhere):
+            best.setdefault(m.name, (i, acts, elsewhere))
     unseen = {i for i, acts, _ in best.values() if acts and not mistakes[i].informed}
     always = unseen | {i for i, _, elsewhere in best.values() if elsewhere}
     further = [i for i, *_ in best.values() if i not in always][:MOST_HIDDEN]
@@ -95,15 +91,15 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     acting = {i for i, acts, elsewhere in best.values() if acts or elsewhere}
     selected = [mistakes[i] for i in order]
     return Hidden(
-        names=tuple(mistake.name for mistake in selected),
-        sizes=tuple(mistake.size for mistake in selected),
-        units=tuple(mistake.unit for mistake in selected),
+        names=tuple(m.name for m in selected),
+        sizes=tuple(m.size for m in selected),
+        units=tuple(m.unit for m in selected),
         changes=changes[order],
-        kinds=tuple(mistake.kind for mistake in selected),
-        remedies=tuple(mistake.shown_by for mistake in selected),
+        kinds=tuple(m.kind for m in selected),
+        remedies=tuple(m.shown_by for m in selected),
         acts=tuple(
-            as_text(mistake.effect) if mistake.effect is not None and i in acting else ""
-            for i, mistake in zip(order, selected, strict=True)
+            as_text(m.effect) if m.effect is not None and i in acting else ""
+            for i, m in zip(order, selected, strict=True)
         ),
         measured=tuple(i not in unseen for i in order),
     )
@@ -151,16 +147,12 @@ class _Starlight:
         changes = {
             p.name: [change for m in p.group for change in m.first_order(template)] for p in self.asked
         }
-        differentiable = [name for name, terms in changes.items() if terms and all(map(columns.has, terms))]
+        linear = [name for name, terms in changes.items() if terms and all(map(columns.has, terms))]
         self.vectors, added = added_to_starlight(
-            columns, [change for name in differentiable for change in changes[name]], exposure
+            columns, [change for name in linear for change in changes[name]], exposure
         )
-        ends = np.cumsum([len(changes[name]) for name in differentiable])
-        self.added = (
-            dict(zip(differentiable, np.split(added, ends[:-1], axis=-1), strict=True))
-            if differentiable
-            else {}
-        )
+        ends = np.cumsum([len(changes[name]) for name in linear])
+        self.added = dict(zip(linear, np.split(added, ends[:-1], axis=-1), strict=True)) if linear else {}
 
     def effects(
         self,
@@ -186,17 +178,13 @@ class _Starlight:
 
 
 def of_matrix(
-    vectors: Float[np.ndarray, "p k 3"],
-    added: Float[np.ndarray, "p k 3"],
-    pairs: Sequence[tuple[int, int]],
+    vectors: Float[np.ndarray, "p k 3"], added: Float[np.ndarray, "p k 3"], pairs: Sequence[tuple[int, int]]
 ) -> Float[np.ndarray, "p a 3"]:
     """Change of the instrument matrix, to first order, where the analysis vectors change."""
-    first, second = ([pair[i] for pair in pairs] for i in (0, 1))
-    light = vectors[:, first, :1] + vectors[:, second, :1]
-    matrix = (vectors[:, first] - vectors[:, second]) / light
-    return (
-        added[:, first] - added[:, second] - matrix * (added[:, first, :1] + added[:, second, :1])
-    ) / light
+    i, j = ([pair[i] for pair in pairs] for i in (0, 1))
+    light = vectors[:, i, :1] + vectors[:, j, :1]
+    matrix = (vectors[:, i] - vectors[:, j]) / light
+    return (added[:, i] - added[:, j] - matrix * (added[:, i, :1] + added[:, j, :1])) / light
 
 
 def _at_sizes(probe: Probe, sizes: Float[np.ndarray, " a"]) -> Iterator[tuple[str, Effect]]:

@@ -127,37 +127,25 @@ def all_candidates(
     shown = showable(likelihood.calset, template, effects)
     changes: dict[int, list[Change]] = {}
     for number, probe in enumerate([*shown, *sentences]):
-        member_changes = [member.first_order(template) for member in probe.group]
-        if all(
-            changes_of_member and all(columns.has(change) for change in changes_of_member)
-            for changes_of_member in member_changes
-        ):
-            changes[number] = [change for changes_of_member in member_changes for change in changes_of_member]
-    gaps = [
-        sentence.gap
-        for probe_changes in changes.values()
-        for change in probe_changes
-        for sentence in fringes_of(change)
-    ]
+        members = [member.first_order(template) for member in probe.group]
+        if all(terms and all(columns.has(change) for change in terms) for terms in members):
+            changes[number] = [change for terms in members for change in terms]
+    gaps = [sentence.gap for sums in changes.values() for change in sums for sentence in fringes_of(change)]
     survives = columns.survives(gaps)
     blurred = {
         number
-        for number, probe_changes in changes.items()
-        if not all(survives[sentence.gap] for change in probe_changes for sentence in fringes_of(change))
+        for number, sums in changes.items()
+        if not all(survives[sentence.gap] for change in sums for sentence in fringes_of(change))
     }
-    differentiable = {
-        number: probe_changes for number, probe_changes in changes.items() if number not in blurred
-    }
-    exact = sum(len(probe_changes) for number, probe_changes in differentiable.items() if number < len(shown))
-    computed = columns.rounded(
-        [change for probe_changes in differentiable.values() for change in probe_changes], exact
-    )
+    linear = {number: sums for number, sums in changes.items() if number not in blurred}
+    exact = sum(len(sums) for number, sums in linear.items() if number < len(shown))
+    computed = columns.rounded([change for sums in linear.values() for change in sums], exact)
     named: dict[str, Candidate] = {}
     described: dict[str, Candidate] = {}
     first = [0, 0]
     for number, probe in enumerate([*shown, *sentences]):
         of_sentence = number >= len(shown)
-        if number in differentiable:
+        if number in linear:
             block = computed[of_sentence][:, first[of_sentence] : first[of_sentence] + len(probe.widths)]
             first[of_sentence] += len(probe.widths)
         elif number in blurred:

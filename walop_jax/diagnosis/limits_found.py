@@ -146,7 +146,7 @@ class DetectionLimits(Displayed):
 
         Errors are those of `could_hide`, for all others those of their own limits.
         """
-        names = {mistake.name for mistake in self.could_hide}
+        names = {m.name for m in self.could_hide}
         effects = (
             CouldHide(
                 f"{e.effect}.{e.parameter}", EFFECT, e.detected[1], e.unit, "", True, False, e.error_of_qu
@@ -157,14 +157,8 @@ class DetectionLimits(Displayed):
         data = (
             CouldHide(e.what, DATA, e.size, e.unit, "", True, False, e.error_of_qu) for e in self.conditions
         )
-        further = [
-            mistake
-            for mistake in (*effects, *data)
-            if mistake.name not in names and np.isfinite(mistake.error[0])
-        ]
-        return tuple(
-            sorted((*self.could_hide, *further), key=lambda mistake: (-mistake.error[0], -mistake.error[1]))
-        )
+        further = [m for m in (*effects, *data) if m.name not in names and np.isfinite(m.error[0])]
+        return tuple(sorted((*self.could_hide, *further), key=lambda m: (-m.error[0], -m.error[1])))
 
     def display(self) -> Display:
         """The worst that could hide in a sentence; a row for each effect and parameter, and each number of the set."""
@@ -172,18 +166,15 @@ class DetectionLimits(Displayed):
         conditions = {entry.what: entry for entry in self.conditions}
         rows: list[tuple[str, ...]] = []
         for kind, title in ((EFFECT, "EFFECTS"), (DATA, "ERRORS IN THE DATA")):
-            mistakes = [mistake for mistake in self.mistakes if mistake.kind == kind]
-            names = {mistake.name: mistake for mistake in mistakes} | dict.fromkeys(
+            mistakes = [m for m in self.mistakes if m.kind == kind]
+            names = {m.name: m for m in mistakes} | dict.fromkeys(
                 name
                 for name in (effects if kind == EFFECT else conditions)
-                if name not in {mistake.name for mistake in mistakes}
+                if name not in {m.name for m in mistakes}
             )
             if names:
                 rows.append((title, *("",) * (len(HEAD) - 1)))
-            rows += [
-                self._row(name, mistake, effects.get(name), conditions.get(name))
-                for name, mistake in names.items()
-            ]
+            rows += [self._row(name, m, effects.get(name), conditions.get(name)) for name, m in names.items()]
         notes = (
             (f"cannot be detected in these data: {', '.join(self.untestable)}",) if self.untestable else ()
         )
@@ -198,15 +189,13 @@ class DetectionLimits(Displayed):
     def _row(
         self,
         name: str,
-        mistake: CouldHide | None,
+        hidden: CouldHide | None,
         limit: DetectionLimit | None,
         condition: ConditionLimit | None,
     ) -> tuple[str, ...]:
-        error = "" if mistake is None else two_digits_range(*(100.0 * value for value in mistake.error))
+        error = "" if hidden is None else two_digits_range(*(100.0 * value for value in hidden.error))
         remark = (
-            ""
-            if mistake is None or mistake.measured
-            else f"error at {two_digits(mistake.size)}, the usual size"
+            "" if hidden is None or hidden.measured else f"error at {two_digits(hidden.size)}, the usual size"
         )
         if limit is not None:
             named = two_digits(limit.named) if np.isfinite(limit.named) else "never"
@@ -214,8 +203,8 @@ class DetectionLimits(Displayed):
             return name, two_digits_range(*limit.detected), named, limit.unit, error, taken_for
         if condition is not None and not np.isfinite(condition.detected):
             remark = f"error at {two_digits(condition.size)} {condition.unit}".rstrip()
-        detected = np.inf if remark else mistake.size if mistake is not None else np.nan
-        unit = condition.unit if condition is not None else mistake.unit if mistake is not None else ""
+        detected = np.inf if remark else hidden.size if hidden is not None else np.nan
+        unit = condition.unit if condition is not None else hidden.unit if hidden is not None else ""
         return name, two_digits(detected) if np.isfinite(detected) else "never", "", unit, error, remark
 
     def protection_in_words(self) -> str:

@@ -111,41 +111,34 @@ def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternati
         return ()
     of_all = (_readings(few, model), _instruments(few)) if coarse and left >= FAR_OFF else ()
     for readings in (_of_some_exposures(likelihood, _worst_exposures(likelihood, values)), *of_all):
-        tried = [_judged(alternative, few, model, left, _STEPS[0]) for alternative in readings]
-        best = [
-            _judged(alternative, few, model, alternative.explained, _STEPS[1])
-            for alternative in _sorted(tried)[:_BEST]
-        ]
+        tried = [_judged(item, few, model, left, _STEPS[0]) for item in readings]
+        best = [_judged(item, few, model, item.explained, _STEPS[1]) for item in _sorted(tried)[:_BEST]]
         enough = min(1.0 + (left - 1.0) / thresholds.READING_GAIN, FAR_OFF)
-        good = [alternative for alternative in _sorted(best) if alternative.explained < enough]
+        good = [item for item in _sorted(best) if item.explained < enough]
         if good:
             return tuple(
-                alternative
-                for alternative in good
-                if alternative.explained < thresholds.READING_ALIKE * good[0].explained
+                item for item in good if item.explained < thresholds.READING_ALIKE * good[0].explained
             )
     return ()
 
 
 def _sorted(alternatives: list[Alternative]) -> list[Alternative]:
-    return sorted(alternatives, key=lambda alternative: alternative.explained)
+    return sorted(alternatives, key=lambda item: item.explained)
 
 
 def _judged(
-    alternative: Alternative, calset: CalibrationSet, model: Model, misfit: float, steps: int
+    item: Alternative, calset: CalibrationSet, model: Model, misfit: float, steps: int
 ) -> Alternative:
     """An alternative with χ²/dof after some Gauss–Newton steps from the model as designed; ∞ where none can be made."""
     try:
-        rewritten = alternative.change(calset)
+        rewritten = item.change(calset)
         if rewritten.instrument != calset.instrument:
             model = base_model(rewritten)
         elif rewritten.sources is not calset.sources:  # what is known of them beforehand
             model = model_like(rewritten, model)
-        return dataclasses.replace(
-            alternative, explained=_misfit(Likelihood.of(rewritten, model), misfit, steps)[0]
-        )
+        return dataclasses.replace(item, explained=_misfit(Likelihood.of(rewritten, model), misfit, steps)[0])
     except (ValueError, np.linalg.LinAlgError):
-        return alternative
+        return item
 
 
 def _misfit(likelihood: Likelihood, before: float, steps: int) -> tuple[float, Vector]:
@@ -155,22 +148,18 @@ def _misfit(likelihood: Likelihood, before: float, steps: int) -> tuple[float, V
     """
     model, least = likelihood.model, before
     x = model.start[model.free]
-    expansion, smallest, best = None, np.inf, model.start
+    step, smallest, best = None, np.inf, model.start
     for number in range(steps + 1):
         values = model.full(x)
-        expansion = likelihood.expand(values, np.sqrt(max(least, 1.0)), expansion)
-        if expansion.dof <= 0 or not np.isfinite(expansion.chi2):
+        step = likelihood.expand(values, np.sqrt(max(least, 1.0)), step)
+        if step.dof <= 0 or not np.isfinite(step.chi2):
             break
-        least = expansion.chi2 / expansion.dof
+        least = step.chi2 / step.dof
         if least < smallest:
             smallest, best = least, values
         if number < steps:
-            width = np.sqrt(np.diag(expansion.matrix))
-            x = (
-                x
-                - np.linalg.solve(expansion.matrix / np.outer(width, width), expansion.gradient / width)
-                / width
-            )
+            width = np.sqrt(np.diag(step.matrix))
+            x = x - np.linalg.solve(step.matrix / np.outer(width, width), step.gradient / width) / width
     return smallest, best
 
 

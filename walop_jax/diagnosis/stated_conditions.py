@@ -38,14 +38,7 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import log_evidence_ratio
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates, applicable, probes, showable
 from walop_jax.diagnosis.readings import with_exposures, with_places
-from walop_jax.diagnosis.score import (
-    Candidate,
-    Score,
-    ScoreSpace,
-    ScoreTable,
-    corrected_p,
-    local_p,
-)
+from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, ScoreTable, corrected_p, local_p
 from walop_jax.fit.refit import NEARLY, FitResult, fit
 from walop_jax.io.text import with_error
 from walop_jax.likelihood.flux import project_flux
