@@ -107,17 +107,15 @@ def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Cont
     of_free = calibration.covariance[np.ix_(free, free)]
     values, covariance = start.copy(), fitted.copy()
     amplitude_columns = _amplitudes_of(model, classes)
-    for addition in classes:
-        conditional = into @ known_apart_from(of_free, addition.at) @ into.T
+    for group in classes:
+        conditional = into @ known_apart_from(of_free, group.at) @ into.T
         means, errors = [start], [fitted]
-        for member in addition.members[1:]:
+        for member in group.members[1:]:
             amplitudes = next(amplitude_columns)
             slopes = into @ member.slopes + amplitudes
             means.append(start + into @ member.values + amplitudes @ member.amplitudes)
             errors.append(conditional + slopes @ member.covariance @ slopes.T)
-        average = mixture(
-            np.array([member.probability for member in addition.members]), np.stack(means), errors
-        )
+        average = mixture(np.array([member.probability for member in group.members]), np.stack(means), errors)
         values += average.mean - start
         covariance += average.covariance - fitted
     hidden = calibration.hidden
@@ -208,10 +206,8 @@ def only_a_class(classes: Sequence[ClassOf]) -> Iterator[str]:
         )
 
 
-def _deciding(addition: ClassOf) -> str:
+def _deciding(group: ClassOf) -> str:
     """Observations that would distinguish the members."""
-    tests = [
-        s.tested_by for member in addition.members for amplitude in member.sums for _, s in amplitude[:1]
-    ]
+    tests = [s.tested_by for member in group.members for total in member.sums for _, s in total[:1]]
     observations = some(list(dict.fromkeys(tests)), 2) if tests else "other exposures"
     return f"what would decide: {observations}; walop-jax plan --criterion apart finds the exposures"

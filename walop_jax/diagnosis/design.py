@@ -135,19 +135,17 @@ class Measured:
 
     def candidate(self, stratum: _Stratum) -> Candidate:
         """The columns of a stratum, intensity by intensity."""
-        camera, identity = np.asarray(stratum.camera), np.eye(self.cameras)
+        camera, unit = np.asarray(stratum.camera), np.eye(self.cameras)
         if self.shared.single:
             changes, m = self.changes([stratum]), self.unit_model
             columns = np.empty((len(m), self.cameras, len(camera)))
             for c in range(self.cameras):
-                projection = identity[c, camera] - self.together[c, camera] * m[:, c, None] * m[:, camera]
+                projection = unit[c, camera] - self.together[c, camera] * m[:, c, None] * m[:, camera]
                 np.multiply(-changes, projection, out=columns[:, c])
             columns = columns.reshape(-1, len(camera))
         else:
             patterns = zip(camera, stratum.patterns, strict=True)
-            columns = np.column_stack(
-                [self.column(pattern[..., None] * identity[k]) for k, pattern in patterns]
-            )
+            columns = np.column_stack([self.column(pattern[..., None] * unit[k]) for k, pattern in patterns])
         return Candidate(stratum.name, columns, stratum.widths, stratum.block)
 
 
@@ -470,15 +468,15 @@ def _from_rows(design: Design, all_strata: list[_Stratum]) -> tuple[ScoreSpace, 
 
     products = -together[np.ix_(camera, camera)] * gram(change * along[:, camera])
     for k in range(measured.cameras):
-        of_camera = np.flatnonzero(camera == k)
-        products[np.ix_(of_camera, of_camera)] += gram(change[:, of_camera])
+        at = np.flatnonzero(camera == k)
+        products[np.ix_(at, at)] += gram(change[:, at])
     residual = design.projector(design.residual)
     rows = np.column_stack([design.projector.basis, residual])[: design.rows]
     rows = project_flux(rows.T.reshape(-1, *along.shape), along, shared=measured.shared)
     projections = np.empty((len(rows), len(camera)))
     for k in range(measured.cameras):
-        of_camera = np.flatnonzero(camera == k)
-        projections[:, of_camera] = -rows[..., k] @ change[:, of_camera]
+        at = np.flatnonzero(camera == k)
+        projections[:, at] = -rows[..., k] @ change[:, at]
     base, scores = projections[:-1], projections[-1]
     space = ScoreSpace(
         names=tuple(stratum.name for stratum in all_strata),

@@ -170,9 +170,9 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     along = design.products(raw, design.projector.basis).T
     for i, taken_up in zip(looked_at, design.taken_up(along).T, strict=True):
         column = columns[i]
-        derivative = change[..., place[column.probe.name] + column.number]
+        slope = change[..., place[column.probe.name] + column.number]
         size = min(column.detected, float(column.probe.widths[column.number]))
-        errors[i] = change_of_qu(matrix, matrix + size * (derivative - slopes @ taken_up))
+        errors[i] = change_of_qu(matrix, matrix + size * (slope - slopes @ taken_up))
     return errors
 
 

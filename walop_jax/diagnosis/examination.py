@@ -200,12 +200,10 @@ class Evidence:
         space, scores, square = self.space, self.scores, self.square
         names, table, needed = list(self.patterns), self.table, []
         while len(needed) < thresholds.MOST_PATTERNS:
-            significant = [
-                s for s in map(table.__getitem__, names) if s.testable and self._p(s) < thresholds.ALARM
-            ]
-            if not significant:
+            clear = [s for s in map(table.__getitem__, names) if s.testable and self._p(s) < thresholds.ALARM]
+            if not clear:
                 break
-            best = max(significant, key=lambda s: s.log_bayes)
+            best = max(clear, key=lambda s: s.log_bayes)
             needed.append((best.name, self._p(best)))
             names.remove(best.name)
             space, reduce = space.with_base([best.name])
@@ -286,11 +284,9 @@ class Evidence:
         least, apart = max(0.0, item.log_bayes - thresholds.IMPROBABLE), self.apart(item)
         length, limit = len(item.score.amplitudes), thresholds.SEPARATION * self.floor
         alike = {p.name for p in self.sentences if len(p.widths) <= length and apart[p.name] < limit}
-        candidates = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
-        candidates = [
-            r for r in candidates if r.probe is not item.probe and not set(own) & set(said_by(r.probe))
-        ]
-        return tuple(r.probe.name for r in candidates[: thresholds.MOST_CLASSES])
+        rivals = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
+        rivals = [r for r in rivals if r.probe is not item.probe and not set(own) & set(said_by(r.probe))]
+        return tuple(r.probe.name for r in rivals[: thresholds.MOST_CLASSES])
 
     def held_in_part(self, item: Ranked) -> tuple[str, ...]:
         """Effects of which a part, by itself, is not improbable beside a candidate; parts share the prior of theirs."""
@@ -428,18 +424,18 @@ def examine(
     """
     active, design = result.model.effect_names, Design.of(result)
     inactive = [probe for probe in wanted if probe.effect.name not in active]
-    all_sentences = [*sentences, *(probe for probe, _ in parts)]
-    named, described = (
+    listed = [*sentences, *(probe for probe, _ in parts)]
+    named, said = (
         (earlier.named, earlier.said)
         if earlier is not None and earlier.is_like(design)
-        else all_candidates(design.columns, inactive, all_sentences)
+        else all_candidates(design.columns, inactive, listed)
     )
     probes = [probe for probe in inactive if probe.name in named]
-    sentences = tuple(probe for probe in sentences if probe.name in described)
-    listed_parts = [
+    sentences = tuple(probe for probe in sentences if probe.name in said)
+    held = [
         (probe, {effect for effect in effects if effect.name not in active})
         for probe, effects in parts
-        if probe.name in described
+        if probe.name in said
     ]
     patterns = [
         dataclasses.replace(item, columns=item.columns.astype(np.float32))
@@ -447,8 +443,8 @@ def examine(
     ]
     candidates = [
         *(named[probe.name] for probe in probes),
-        *(described[probe.name] for probe in sentences),
-        *(described[probe.name] for probe, _ in listed_parts),
+        *(said[probe.name] for probe in sentences),
+        *(said[probe.name] for probe, _ in held),
         *patterns,
     ]
     blocks = {candidate.name: candidate.block for candidate in candidates}
@@ -474,7 +470,7 @@ def examine(
         table=space.table(scores, square, space.smallest_p(rng)),
         probes=probes,
         sentences=sentences,
-        parts=listed_parts,
+        parts=held,
         patterns=[pattern.name for pattern in patterns],
         chi2=result.chi2,
         dof=result.dof,
@@ -482,7 +478,7 @@ def examine(
         result=result,
         design=design,
         named=named,
-        said=described,
+        said=said,
         blocks=blocks,
         bare=bare,
         columns=columns,

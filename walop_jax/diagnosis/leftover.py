@@ -31,15 +31,15 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
     state, remainder = _leftover(first, prune(first, state, judge), judge)
     if state.steps and (worse := _worse(first.evidence, state.evidence)):
         return _not_adopted(first, state, worse)
-    descriptions = _descriptions(state)
+    said = _descriptions(state)
     if remainder is not None:
-        contradicted = tuple(text for name, text in _contradicted(state).items() if name not in descriptions)
-        return state, dataclasses.replace(remainder, parts=(*remainder.parts, *contradicted))
-    if len(descriptions) <= thresholds.MOST_SENTENCES:
+        against = tuple(text for name, text in _contradicted(state).items() if name not in said)
+        return state, dataclasses.replace(remainder, parts=(*remainder.parts, *against))
+    if len(said) <= thresholds.MOST_SENTENCES:
         return state, None
-    text = f"{len(descriptions)} descriptions were needed: they say where it sits, no single one of them what it is"
-    remainder = Unexplained(state.evidence.table.p_global, f"{text} ({' | '.join(descriptions)})", ())
-    columns = [first.evidence.said[name] for name in descriptions]
+    text = f"{len(said)} descriptions were needed: they say where it sits, no single one of them what it is"
+    remainder = Unexplained(state.evidence.table.p_global, f"{text} ({' | '.join(said)})", ())
+    columns = [first.evidence.said[name] for name in said]
     if predicts_unseen(first.evidence.design, columns, thresholds.USEFUL):
         return state, remainder
     state = _without(first, state, [Described.name], judge)
@@ -149,12 +149,9 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     if FreeForm.name in result.model.effect_names or not blocks or judge.over(state.fits):
         return remainder, None
     # A block has all patterns of its kind: those that are not needed cost errors as well.
-    candidates = {
-        block: [measured.candidate(stratum) for stratum in strata(measured) if stratum.block == block]
-        for block in blocks
-    }
+    terms = {block: [measured.candidate(s) for s in strata(measured) if s.block == block] for block in blocks}
     useful = tuple(
-        block for block in blocks if predicts_unseen(evidence.design, candidates[block], thresholds.USEFUL)
+        block for block in blocks if predicts_unseen(evidence.design, terms[block], thresholds.USEFUL)
     )
     if not useful:
         return _and(remainder, _LEFT_OUT), None
@@ -225,12 +222,7 @@ def back_to(first: State, state: State) -> State:
 
 def _contradicted(state: State) -> dict[str, str]:
     """All candidates contradicted by exposures of another KIND, in words."""
-    return {
-        reason.name: f"{reason.name} ({reason.reason})"
-        for turn in state.rounds
-        for reason in turn.asked
-        if reason.against
-    }
+    return {r.name: f"{r.name} ({r.reason})" for turn in state.rounds for r in turn.asked if r.against}
 
 
 def _descriptions(state: State) -> tuple[str, ...]:

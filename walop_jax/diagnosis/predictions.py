@@ -104,10 +104,7 @@ def gains_of_units(unit: np.ndarray, before: LaidOut, after: LaidOut) -> Float[n
 
 
 def _predictions(
-    rows: Float[np.ndarray, "r n"],
-    residual: Float[np.ndarray, " r"],
-    unit: np.ndarray,
-    free: int,
+    rows: Float[np.ndarray, "r n"], residual: Float[np.ndarray, " r"], unit: np.ndarray, free: int
 ) -> Float[np.ndarray, "u 2"]:
     """ln p of the data rows of each unit as all the others predict them, and the square of how far they are off.
 

@@ -14,19 +14,15 @@ from walop_jax.model.parameters import unknown_name
 Document = Mapping[str, Any]
 
 
-def why(document: Document, name: str) -> str:
+def why(doc: Document, name: str) -> str:
     """Sentences on why a diagnosis has, or has not, named an effect, a description or a change of the instrument.
 
     ValueError, with the nearest names, for what is none of them.
     """
-    sentences = [
-        *_of_the_result(document, name),
-        *_of_the_first_look(document, name),
-        *_of_the_rounds(document, name),
-    ]
-    if not any(_asked(turn, name) for turn in document.get("rounds", ())) and not sentences:
-        sentences = [*_of_a_description(document, name)]
-    sentences += _beside(document, name)
+    sentences = [*_of_the_result(doc, name), *_of_the_first_look(doc, name), *_of_the_rounds(doc, name)]
+    if not any(_asked(turn, name) for turn in doc.get("rounds", ())) and not sentences:
+        sentences = [*_of_a_description(doc, name)]
+    sentences += _beside(doc, name)
     return "\n".join(f"{name}: {sentence}" for sentence in sentences)
 
 

@@ -87,20 +87,18 @@ class Refits:
             refitted = try_shapes(evidence.result, item, self.context, shapes)
         return dataclasses.replace(refitted, item=item, linear=trial.linear)
 
-    def _with_best_times(self, evidence: Examination, description: Described) -> Described:
+    def _with_best_times(self, evidence: Examination, said: Described) -> Described:
         """A description that starts or stops in time, where it explains most by linear steps; any other as it is."""
-        ((change, amplitude), *further) = description.terms()
+        ((change, amplitude), *further) = said.terms()
         result = evidence.result
         for end in (0, 1) if not further else ():
             if times := grammar.retimed(change, result.calset.exposures, end):
-                time_columns = columns(
-                    result.likelihood, result.values, [[(1.0, sentence)] for sentence in times]
-                )
-                time_columns = evidence.design.projector(evidence.design.stacked([time_columns]))
-                along, square = time_columns.T @ evidence.design.residual, np.sum(time_columns**2, axis=0)
+                c = columns(result.likelihood, result.values, [[(1.0, sentence)] for sentence in times])
+                c = evidence.design.projector(evidence.design.stacked([c]))
+                along, square = c.T @ evidence.design.residual, np.sum(c**2, axis=0)
                 best = int(np.argmax(along**2 / np.where(square > 0, square, np.inf)))
                 change, amplitude = times[best], -along[best] / square[best]
-        return description if further else Described.saying([change.text], [float(amplitude)])
+        return said if further else Described.saying([change.text], [float(amplitude)])
 
     def _hopeful(self, evidence: Examination, item: Ranked) -> bool:
         """True if a sentence predicts what it has not seen, by its linear step: nobody has a name for it to believe."""
@@ -154,7 +152,7 @@ class Refits:
             )
             for trial, again in zip(even, exact, strict=True)
         ]
-        remaining = [trial for trial in trials if all(trial is not contender for contender in even)]
+        remaining = [trial for trial in trials if all(trial is not t for t in even)]
         return [*sorted(clearly, key=names_first), *remaining]
 
     def adopted(self, state: State, trial: Trial) -> State:

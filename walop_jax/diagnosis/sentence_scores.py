@@ -42,20 +42,14 @@ def sentence_scores(design: Design, seed: int = 0) -> ScoreTable:
     normal -= (design.projector.basis @ (design.projector.basis.T @ normal)).astype(np.float32)
     for batch in _batches(probes, len(design.residual)):
         for probe, columns in _columns(design, batch):
-            whitened = columns.astype(float) / fit.noise_scale
-            along = design.projector.basis[: len(whitened)].T @ whitened
-            square = whitened.T @ whitened
+            c = columns.astype(float) / fit.noise_scale
+            along = design.projector.basis[: len(c)].T @ c
+            square = c.T @ c
             names.append(probe.name)
-            sizes.append(whitened.shape[1])
-            drawn = whitened.T.astype(np.float32) @ normal[: len(whitened)]
+            sizes.append(c.shape[1])
+            drawn = c.T.astype(np.float32) @ normal[: len(c)]
             blocks.append(
-                (
-                    probe.widths,
-                    np.diag(square),
-                    whitened.T @ residual[: len(whitened)],
-                    drawn,
-                    square - along.T @ along,
-                )
+                (probe.widths, np.diag(square), c.T @ residual[: len(c)], drawn, square - along.T @ along)
             )
     if not names:
         return ScoreTable((), noise, 1.0, 1.0)

@@ -145,15 +145,15 @@ class Singles:
 
 def scored(design: Design, rivals: tuple[_Single, ...]) -> Singles:
     """Single numbers with their scores in the residuals of a design."""
-    names = [rival.candidate.name for rival in rivals]
-    widths = [rival.candidate.widths for rival in rivals]
+    names = [r.candidate.name for r in rivals]
+    widths = [r.candidate.widths for r in rivals]
     columns = np.concatenate(
-        [np.zeros((len(design.residual), 0)), *(rival.candidate.columns for rival in rivals)], axis=1
+        [np.zeros((len(design.residual), 0)), *(r.candidate.columns for r in rivals)], axis=1
     )
     along = design.projector.basis.T @ columns
     if not rivals:
         return Singles((), ScoreTable((), 1.0, 1.0, 1.0), along, np.zeros(0), np.zeros(0, bool))
-    matrices = [rival.candidate.columns for rival in rivals]
+    matrices = [r.candidate.columns for r in rivals]
     space = ScoreSpace.projected(design.projector, names, widths, matrices)
     residual = design.projector(design.residual)
     table = space.table(columns.T @ residual, float(residual @ residual))
@@ -167,20 +167,18 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     """
     singles = singles or Singles.of(design)
     rivals, table, scores = singles.rivals, singles.table, singles.testable
-    significant = [score for score in scores if corrected_p(score.log_p, len(scores)) < thresholds.ALARM]
-    if not significant:
+    clear = [score for score in scores if corrected_p(score.log_p, len(scores)) < thresholds.ALARM]
+    if not clear:
         return
-    significant.sort(key=lambda score: score.log_p)
-    best, result = significant[0], design.fit
+    clear.sort(key=lambda score: score.log_p)
+    best, result = clear[0], design.fit
     square = float(np.sum(design.projector(design.residual) ** 2))
-    remaining = square - best.statistic * table.noise_scale**2
-    if not result.explains_data and remaining * result.noise_scale**2 > NEARLY * design.projector.free:
+    rest = square - best.statistic * table.noise_scale**2
+    if not result.explains_data and rest * result.noise_scale**2 > NEARLY * design.projector.free:
         return
-    likely = [
-        item for item in significant if item.statistic - item.rank > best.statistic - best.rank - _ALIKE
-    ]
+    likely = [item for item in clear if item.statistic - item.rank > best.statistic - best.rank - _ALIKE]
     # Of an element and one of its numbers alone, the shorter statement if it explains as much.
-    likely = [item for item in likely if not any(_holds(item, contender) for contender in likely)]
+    likely = [item for item in likely if not any(_holds(item, rival) for rival in likely)]
     likely.sort(key=lambda item: (item.rank, item.log_p))  # a mistake of one number before sixteen
     wordings = {item.candidate.name: item.said for item in rivals}
     causes = "; or for ".join(wordings[score.name](score) for score in likely[:_SHOWN])
@@ -218,25 +216,21 @@ def instead_of_names(before: FitResult, after: FitResult) -> str:
     Compared are the evidence of the names, ln B of `after` against `before`, and that of the number, fitted exactly,
     with its width as prior: ½ (χ² − χ²_c) − ½ ln(1 + w² C̃ᵀC̃). One number may so come before sixteen.
     """
-    conditions = [condition for condition in condition_scores(Design.of(before)) if condition.score.testable]
-    conditions = [
-        condition
-        for condition in conditions
-        if corrected_p(condition.score.log_p, len(conditions)) < thresholds.ALARM
-    ]
+    listed = [c for c in condition_scores(Design.of(before)) if c.score.testable]
+    listed = [c for c in listed if corrected_p(c.score.log_p, len(listed)) < thresholds.ALARM]
     if after.noise_scale != before.noise_scale:  # one scale of the errors, or χ² of both are not comparable
         after = fit(after.likelihood, start=after.values, noise_scale=before.noise_scale)
     added = after is not before
     least, likely = log_evidence_ratio(before, after) if added else 0.0, list[tuple[float, str]]()
-    for condition in sorted(conditions, key=lambda condition: condition.score.log_p)[:_FITTED]:
-        stated, size, result, current = condition.stated, 0.0, before, condition
+    for c in sorted(listed, key=lambda c: c.score.log_p)[:_FITTED]:
+        stated, size, result, current = c.stated, 0.0, before, c
         for _ in range(_ROUNDS):  # Gauss and Newton: hours are no small step
             size += float(current.score.amplitudes[0])
             if abs(size) >= stated.width:  # a latitude beyond the pole, a negative temperature
                 break
             likelihood = Likelihood.of(stated.changed(size), before.model)
             result = fit(likelihood, start=result.values, noise_scale=before.noise_scale)
-            rescored = {condition.stated.what: condition for condition in condition_scores(Design.of(result))}
+            rescored = {c.stated.what: c for c in condition_scores(Design.of(result))}
             if not result.converged or stated.what not in rescored:
                 break
             current = rescored[stated.what]
@@ -268,19 +262,19 @@ def _conditions(design: Design) -> Iterator[_Single]:
     """The numbers that the set states and that are used."""
     statements = list(_stated(design.fit.calset))
     columns = [design.stacked([column[:, None]]) for column in _columns(design, statements)]
-    for statement, column in zip(statements, columns, strict=True):
+    for item, column in zip(statements, columns, strict=True):
         if not column.any():  # a number may be stated and not used
             continue
-        candidate = Candidate(statement.what, column, np.array([statement.width]))
+        candidate = Candidate(item.what, column, np.array([item.width]))
         # What stars see as well is no mistake of the matrix alone.
-        plausible = 0.0 if statement.seen_by_stars else statement.width
+        plausible = 0.0 if item.seen_by_stars else item.width
         yield _Single(
             candidate,
-            lambda score, statement=statement: _in_words(statement, score),
+            lambda score, item=item: _in_words(item, score),
             plausible,
-            statement.unit,
-            statement.shown_by,
-            statement,
+            item.unit,
+            item.shown_by,
+            item,
         )
 
 
@@ -403,25 +397,20 @@ def condition_scores(design: Design) -> list[_Scored]:
     """The numbers that a set states, each with the score of changing it."""
     singles = scored(design, tuple(_conditions(design)))
     return [
-        _Scored(
-            rival.stated,
-            singles.table[rival.candidate.name],
-            rival.candidate.columns[:, 0],
-            float(information),
-        )
-        for rival, information in zip(singles.rivals, singles.left, strict=True)
-        if rival.stated is not None
+        _Scored(r.stated, singles.table[r.candidate.name], r.candidate.columns[:, 0], float(info))
+        for r, info in zip(singles.rivals, singles.left, strict=True)
+        if r.stated is not None
     ]
 
 
 def _columns(design: Design, statements: Sequence[_Stated]) -> Iterator[Float[np.ndarray, " _"]]:
-    of_field = [statement for statement in statements if statement.along is not None]
-    by_place = [_column(design, statement) for statement in of_field[:2]]  # X and Y come first
-    for statement in statements:
-        if statement.along is None:
-            yield _column(design, statement)
+    of_field = [item for item in statements if item.along is not None]
+    by_place = [_column(design, item) for item in of_field[:2]]  # X and Y come first
+    for item in statements:
+        if item.along is None:
+            yield _column(design, item)
         else:
-            (in_x, in_y), (by_x, by_y) = statement.along, by_place
+            (in_x, in_y), (by_x, by_y) = item.along, by_place
             yield in_x[design.point] * by_x + in_y[design.point] * by_y
 
 
