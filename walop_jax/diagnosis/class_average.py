@@ -1,4 +1,4 @@
-"""Averages over models that data cannot tell apart: mean, covariance with their spread, and what does the same.
+"""Averages over models that the data do not distinguish: mean, covariance with their spread, equivalent members.
 
 Equation     m̄ = Σ w_k m_k,   C = Σ w_k [C_k + (m_k − m̄)(m_k − m̄)ᵀ],   w_k = B_k / Σ B
 Symbols      m_k values in model k, of numbers that may be 0 in some of them; C_k their covariance; B_k evidence
@@ -6,7 +6,7 @@ Source       Leamer 1978, Specification Searches, ch. 4; Hoeting et al. 1999, St
 One step     A model without some amplitudes a leaves r + D of the residuals r, D = −J_a a. Other columns K take their
              place with b = −(KᵀPK)⁺ KᵀP(r + D), and all other parameters move by −J_o⁺ (D + K b), where P projects off
              the other columns J_o. Exact where everything is linear.
-Limits       Members that do the same to what is asked are one answer, and count once: the most probable of them.
+Limits       Members with the same effect on the result count once, as the most probable of them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Matrix = Float[np.ndarray, "_ _"]
 
 
 class Mixture(NamedTuple):
-    """The mean of some models, its covariance, and the part of that which is spread `between` them."""
+    """Mean of some models, its covariance, and the contribution of the spread `between` them."""
 
     mean: Vector
     covariance: Matrix
@@ -32,7 +32,7 @@ class Mixture(NamedTuple):
 
 
 def probabilities(evidence: Sequence[float] | Vector) -> Vector:
-    """Probabilities of models that are as probable beforehand, from ln B."""
+    """Posterior probabilities, from ln B, of models with equal prior probabilities."""
     odds = np.exp(np.asarray(evidence, float) - np.max(evidence))
     return odds / odds.sum()
 
@@ -49,29 +49,29 @@ def mixture(weights: Vector, values: Float[np.ndarray, "k n"], covariances: Sequ
 
 
 def known_apart_from(covariance: Matrix, at: Int[np.ndarray, " k"]) -> Matrix:
-    """Covariance of all others once the parameters `at` are known: C − C_a C_aa⁺ C_aᵀ, 0 in their own rows."""
+    """Conditional covariance of all others given the parameters `at`: C − C_a C_aa⁺ C_aᵀ, 0 in the rows of these."""
     across = covariance[:, at]
-    left = covariance - across @ pseudo_inverse(covariance[np.ix_(at, at)], 1e-12) @ across.T
-    left[at], left[:, at] = 0.0, 0.0
-    return 0.5 * (left + left.T)
+    conditional = covariance - across @ pseudo_inverse(covariance[np.ix_(at, at)], 1e-12) @ across.T
+    conditional[at], conditional[:, at] = 0.0, 0.0
+    return 0.5 * (conditional + conditional.T)
 
 
 def moved(others: Matrix, basis: Matrix, rows: Float[np.ndarray, "r ..."]) -> Float[np.ndarray, "f ..."]:
-    """Change −J⁺ d of the parameters with columns J that makes up for a change d of the residuals.
+    """Change −J⁺ d of the parameters with columns J that compensates a change d of the residuals.
 
-    `basis` is an orthonormal one of the columns.
+    `basis` is an orthonormal basis of the columns.
     """
     unit, norm = unit_columns(others)
-    found = np.linalg.lstsq(basis.T @ unit, -(basis.T @ rows), rcond=None)[0]
-    return found / norm.reshape(-1, *[1] * (rows.ndim - 1))
+    scaled = np.linalg.lstsq(basis.T @ unit, -(basis.T @ rows), rcond=None)[0]
+    return scaled / norm.reshape(-1, *[1] * (rows.ndim - 1))
 
 
 def distinct(
     evidence: Vector, changes: Float[np.ndarray, "k p m"], errors: Float[np.ndarray, "p m"], alike: float
 ) -> list[int]:
-    """The models that differ in what they do, the most probable of each kind, best first.
+    """Models with different changes, the most probable of each group of equivalent ones, best first.
 
-    Two are one where their changes differ by less than `alike` of the errors, rms over places, in every element.
+    Two are equivalent where their changes differ by less than `alike` of the errors, rms over places, in every element.
     """
     scale = np.where(errors > 0, errors, np.inf)
     chosen: list[int] = []

@@ -1,13 +1,13 @@
-"""The class of what a diagnosis has added: all that these data cannot tell from it, with what each does to stars.
+"""Equivalence class of each addition of a diagnosis: candidates indistinguishable from it, and their effect on stars.
 
 Additions    effects with a name, and groups of sentences. Of each the members of its class are all candidates that, in
-             its place, are not improbable (`thresholds.IMPROBABLE`), by one linear step (`class_average`). They are as
-             probable beforehand: that somebody has thought of a name for one does not make it true.
-Kinds        What is found in exposures of one KIND is a difference between that KIND and all others: which of the two
-             is wrong no residual can say. "In all other kinds, with the other sign" is a member, as probable.
-Stars        A member changes the matrix by its own column, and by what it moves the other parameters. Members that do
-             the same count once. The product is their mean, and its covariance has their spread: values and covariance
-             of a model that holds all of them, each amplitude 0 in the models of the others.
+             its place, are not improbable (`thresholds.IMPROBABLE`), by one linear step (`class_average`). Their
+             prior probabilities are equal: a name does not make a candidate more probable.
+Kinds        An effect in exposures of one KIND is a difference between that KIND and all others; residuals do not
+             show which of the two is wrong. "In all other kinds, with the other sign" is an equally probable member.
+Stars        A member changes the matrix by its own column, and through the shifts of the other parameters.
+             Equivalent members count once. The product is their mean, and its covariance has their spread: values and
+             covariance of a model that includes all of them, each amplitude 0 in the models of the others.
 Limits       To first order. Structural effects, other descriptions and patterns of a single place have no sentence and
              no part in it.
 """
@@ -40,10 +40,10 @@ from walop_jax.model.effects.change import Change as Sentence
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
-ALIKE = 0.5  # of the errors of the matrix: members that differ by less are one
-MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members that differ in what they do to stars
-LINEAR = 0.01  # of the evidence, which a linear step may miss
-LEAST_PROBABLE, PLAUSIBLE = 1e-3, 0.02  # of members that are kept, and of those that must not be far off
+ALIKE = 0.5  # of the errors of the matrix: members that differ by less count as one
+MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
+LINEAR = 0.01  # relative error of the evidence of a linear step
+LEAST_PROBABLE, PLAUSIBLE = 1e-3, 0.02  # of members in the average, and in the check of the farthest
 
 
 def classes_of(
@@ -55,14 +55,14 @@ def classes_of(
 ) -> tuple[ClassOf, ...]:
     """The classes of the effects of a model that have some names; without those of which the class is that alone.
 
-    `said` are the names of the groups of sentences that were added, `alike` those of effects and groups that were told
-    as not to be distinguished: of far larger residuals, where one linear step says little, they count as probable.
+    `said` are the names of the added groups of sentences, `alike` the effects and groups reported as indistinguishable:
+    with large residuals, where one linear step is inaccurate, they count as probable.
     """
     additions = list(_additions(state.result, context, names, said))
     if not additions or not state.result.model.template.cameras.pairs:
         return ()
     laid = _Laid(state, alike)
-    return tuple(one for one in itertools.starmap(laid.class_of, additions) if one.names)
+    return tuple(addition for addition in itertools.starmap(laid.class_of, additions) if addition.names)
 
 
 def _additions(
@@ -92,14 +92,14 @@ def _additions(
 
 
 def _groups(effect: Described, said: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """The sentences of a model as they were added, group by group; what no group holds stands by itself."""
-    left = list(effect.sentences)
+    """Sentences of a model in the groups of their addition; each ungrouped sentence is a group of its own."""
+    ungrouped = list(effect.sentences)
     for name in said:
-        group = tuple(text for text in left if text in name.split("; "))
-        left = [text for text in left if text not in group]
+        group = tuple(text for text in ungrouped if text in name.split("; "))
+        ungrouped = [text for text in ungrouped if text not in group]
         if group:
             yield group
-    yield from ((text,) for text in left)
+    yield from ((text,) for text in ungrouped)
 
 
 class _Laid:
@@ -125,25 +125,27 @@ class _Laid:
         )
 
     def added(self, sums: Sequence[Sum]) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
-        """Analysis vectors of a star at the field points, and what one unit of each amplitude adds to them."""
-        missing = [each for each in dict.fromkeys(sums) if each not in self._added]
+        """Analysis vectors of a star at the field points, and their derivatives with respect to each amplitude."""
+        missing = [amplitude for amplitude in dict.fromkeys(sums) if amplitude not in self._added]
         if missing or self._vectors is None:
             self._vectors, new = added_to_starlight(self.columns, missing, self.usual)
             self._added |= dict(zip(missing, np.moveaxis(new, -1, 0), strict=True))
-        each = [self._added[one] for one in sums]
-        return self._vectors, np.stack(each, axis=-1) if each else np.zeros((*self._vectors.shape, 0))
+        changes = [self._added[amplitude] for amplitude in sums]
+        return self._vectors, np.stack(changes, axis=-1) if changes else np.zeros((*self._vectors.shape, 0))
 
     def class_of(self, name: str, at: Int[np.ndarray, " a"], lost: Vector, sums: tuple[Sum, ...]) -> ClassOf:
-        """The class of what has the amplitudes `at`, without which the residuals change by `lost`."""
+        """Class of the addition with the amplitudes `at`; without it the residuals change by `lost`."""
         step = _Step(self, at, lost)
-        told = step.told(name, sums)
-        # What was added is a candidate as well: it is itself, not one more of the class.
-        others = (one for one in step.candidates(told.evidence) if _texts(one.sums) != _texts(sums))
-        members = [told, *others]
-        members += [other for one in members if (other := step.in_other_kinds(one)) is not None]
+        addition = step.told(name, sums)
+        # The addition is among the candidates: it is no further member.
+        rivals = (
+            member for member in step.candidates(addition.evidence) if _texts(member.sums) != _texts(sums)
+        )
+        members = [addition, *rivals]
+        members += [twin for member in members if (twin := step.in_other_kinds(member)) is not None]
         best = max(member.evidence for member in members)
         least = best - thresholds.IMPROBABLE
-        members = [told, *(member for member in members[1:] if member.evidence > least)]
+        members = [addition, *(member for member in members[1:] if member.evidence > least)]
         changes = np.stack([member.change for member in members])
         evidence = np.array([np.inf, *(member.evidence for member in members[1:])])
         members = [members[i] for i in distinct(evidence, changes, self.errors, ALIKE)][:MOST_MEMBERS]
@@ -151,12 +153,12 @@ class _Laid:
         members = [
             member._replace(probability=float(weight))
             for member, weight in zip(members, weights, strict=True)
-            if weight > LEAST_PROBABLE or member is told
+            if weight > LEAST_PROBABLE or member is addition
         ]
         return ClassOf(name, at, tuple(members), *self._spread(members))
 
     def _spread(self, members: Sequence[Likeness]) -> tuple[float, float, float]:
-        """Error of p of stars between members, that of the fit, and how far the farthest lies off (`ClassOf`)."""
+        """Error of p of stars between members, error of the fit, and largest deviation of a member (`ClassOf`)."""
         weights = np.array([member.probability for member in members])
         away = np.stack([member.change for member in members])
         away = away - np.tensordot(weights, away, 1)
@@ -167,13 +169,13 @@ class _Laid:
         within = self.slopes @ covariance_of_free(self.fit) @ np.swapaxes(self.slopes, 1, 2)
         if self.matrix.shape[1] == 6:
             good = measures_u(self.matrix.reshape(-1, 2, 3))
-            each = [p_errors(self.matrix[good], part[good], sample_stars()) for part in (between, within)]
+            maps = [p_errors(self.matrix[good], square[good], sample_stars()) for square in (between, within)]
         else:  # no single exposure gives q and u
-            each = [
-                np.sqrt(np.diagonal(part, axis1=1, axis2=2).max(axis=1, initial=0.0))
-                for part in (between, within)
+            maps = [
+                np.sqrt(np.diagonal(square, axis1=1, axis2=2).max(axis=1, initial=0.0))
+                for square in (between, within)
             ]
-        spread, stated = (float(np.median(errors)) if errors.size else 0.0 for errors in each)
+        spread, stated = (float(np.median(errors)) if errors.size else 0.0 for errors in maps)
         return spread, stated, off
 
 
@@ -190,15 +192,15 @@ class _Step:
         self.left = self.projector(design.residual + self.lost)
 
     def told(self, name: str, sums: tuple[Sum, ...]) -> Likeness:
-        """The member that was added, as the fit has it."""
+        """The addition itself as a member, with its fitted values."""
         fit, design, floor = self.laid.fit, self.laid.design, self.laid.state.floor
         positions = fit.model.free[self.at]
         column = design.jacobian[:, self.at]
-        column[design.rows :] = 0.0  # without its own prior, which comes in with the widths
-        own = self.projector(column)
+        column[design.rows :] = 0.0  # without its prior, which enters through the widths
+        projected = self.projector(column)
         parameters = [fit.model.parameters[i] for i in positions.tolist()]
         widths = np.array([p.scale if p.prior is None else p.prior[1] for p in parameters])
-        evidence = log_bayes(own.T @ own, own.T @ self.left, widths) / floor**2
+        evidence = log_bayes(projected.T @ projected, projected.T @ self.left, widths) / floor**2
         nothing = np.zeros(len(fit.model.free))
         return Likeness(
             name, evidence, sums, np.zeros(0), np.zeros((0, 0)), nothing, np.zeros((len(nothing), 0)),
@@ -206,56 +208,60 @@ class _Step:
         )  # fmt: skip
 
     def candidates(self, told: float) -> Iterator[Likeness]:
-        """Candidates that are not improbable beside what was added, the most probable first."""
+        """Candidates not improbable relative to the addition, the most probable first."""
         state, design = self.laid.state, self.laid.design
-        own = self.projector(design.jacobian[:, self.at])
-        basis = own @ whitening(own.T @ own)
+        projected = self.projector(design.jacobian[:, self.at])
+        basis = projected @ whitening(projected.T @ projected)
         along = design.products(state.columns, basis)
         gram, scores = state.bare.gram + along @ along.T, design.products(state.columns, self.left)
-        places, found = state.bare.places(), []
+        places, scored = state.bare.places(), []
         number = {name: i for i, name in enumerate(state.bare.names)}
         for probe in (*state.probes, *state.sentences, *(probe for probe, _ in state.parts)):
             at = places[probe.name]
             evidence = log_bayes(gram[at, at], scores[at], probe.widths) / state.floor**2
             if {probe.name, probe.effect.name} & set(self.laid.alike):
                 evidence = max(evidence, told)
-            found.append((evidence, probe, gram[at, at], scores[at]))
-        found.sort(key=lambda one: -one[0])
-        least = max(told, found[0][0] if found else told) - thresholds.IMPROBABLE
+            scored.append((evidence, probe, gram[at, at], scores[at]))
+        scored.sort(key=lambda item: -item[0])
+        least = max(told, scored[0][0] if scored else told) - thresholds.IMPROBABLE
         chosen = []
-        for evidence, probe, square, along_residual in found[:MOST_ASKED]:
+        for evidence, probe, square, along_residual in scored[:MOST_ASKED]:
             if evidence <= least:
                 break
-            sums = tuple(tuple(each) for one in probe.group for each in one.first_order(self.laid.template))
+            sums = tuple(
+                tuple(total) for member in probe.group for total in member.first_order(self.laid.template)
+            )
             if len(sums) == len(probe.widths) and self._can_be_said(sums):
                 chosen.append((probe, evidence, sums, square, along_residual))
-        self.laid.added([each for _, _, sums, *_ in chosen for each in sums])  # all of them in one go
+        self.laid.added([total for _, _, sums, *_ in chosen for total in sums])  # all of them in one go
         for probe, evidence, sums, square, along_residual in chosen:
             column = design.stacked([state.columns[number[probe.name]]])
             yield self._member(probe.name, evidence, sums, column, square, along_residual, probe.widths)
 
     def in_other_kinds(self, member: Likeness) -> Likeness | None:
         """A member that is about exposures of one KIND, in all others instead; None for any other."""
-        each = [_kinds_of(sentence) for one in member.sums for _, sentence in one]
+        kinds_by_sentence = [_kinds_of(sentence) for amplitude in member.sums for _, sentence in amplitude]
         exposures, design = self.laid.fit.calset.exposures, self.laid.design
-        kinds = set(itertools.chain(*each))
-        others = [str(name) for name in np.unique(exposures.kind) if str(name) not in kinds]
-        if len(kinds) != 1 or not all(each) or not others:
+        kinds = set(itertools.chain(*kinds_by_sentence))
+        other_kinds = [str(name) for name in np.unique(exposures.kind) if str(name) not in kinds]
+        if len(kinds) != 1 or not all(kinds_by_sentence) or not other_kinds:
             return None
         (kind,) = kinds
         sums = tuple(
-            tuple((-size, _in_kind(sentence, kind, other)) for size, sentence in each for other in others)
-            for each in member.sums
+            tuple(
+                (-size, _in_kind(sentence, kind, new)) for size, sentence in amplitude for new in other_kinds
+            )
+            for amplitude in member.sums
         )
         column = design.stacked([self.laid.columns.of(sums)])
         projected = self.projector(column)
         square, along = projected.T @ projected, projected.T @ self.left
-        widths = np.array([_width(each) for each in sums])
+        widths = np.array([_width(amplitude) for amplitude in sums])
         evidence = log_bayes(square, along, widths) / self.laid.state.floor**2
         # The same difference, seen from the other side: as probable, however its throughputs are known.
         alike = max(thresholds.EVEN_ODDS, LINEAR * abs(member.evidence))
         evidence = member.evidence if abs(evidence - member.evidence) < alike else evidence
-        name = "; ".join(sentence.text for each in sums for _, sentence in each)
+        name = "; ".join(sentence.text for amplitude in sums for _, sentence in amplitude)
         return self._member(name, evidence, sums, column, square, along, widths)
 
     def _member(
@@ -283,21 +289,22 @@ class _Step:
         return Likeness(name, evidence, sums, amplitudes, covariance, values, slopes, change)
 
     def _can_be_said(self, sums: Sequence[Sum]) -> bool:
-        """True if a model can hold all sentences."""
-        sentences = [sentence for each in sums for _, sentence in each]
+        """True if a model can include all sentences."""
+        sentences = [sentence for amplitude in sums for _, sentence in amplitude]
         if not all(map(self.laid.columns.has, sums)):
             return False
         if any(
-            one.kind not in KINDS or not all(isinstance(f, str) for f in one.factors) for one in sentences
+            sentence.kind not in KINDS or not all(isinstance(f, str) for f in sentence.factors)
+            for sentence in sentences
         ):
             return False
         stated = {text for effect in self.laid.fit.model.effects for text in effect.stated}
-        if stated.intersection(one.text for one in sentences):
+        if stated.intersection(sentence.text for sentence in sentences):
             return False
         try:
             patched(
                 dataclasses.replace(self.laid.template, effects=()),
-                [(one, jnp.zeros(())) for one in sentences],
+                [(sentence, jnp.zeros(())) for sentence in sentences],
             )
         except ValueError:
             return False
@@ -317,11 +324,11 @@ def _in_kind(sentence: Sentence, kind: str, other: str) -> Sentence:
 
 def _texts(sums: Sequence[Sum]) -> set[str]:
     """The sentences of some amplitudes."""
-    return {sentence.text for each in sums for _, sentence in each}
+    return {sentence.text for amplitude in sums for _, sentence in amplitude}
 
 
-def _width(each: Sum) -> float:
-    return AMPLITUDES[each[0][1].parameter].width
+def _width(amplitude: Sum) -> float:
+    return AMPLITUDES[amplitude[0][1].parameter].width
 
 
 def covariance_of_free(fit: FitResult) -> Matrix:

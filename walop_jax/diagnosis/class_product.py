@@ -1,11 +1,11 @@
-"""The product of a diagnosis: the mean over the classes of what was added, with their spread in its covariance.
+"""The product of a diagnosis: mean over the classes of its additions, with their spread in the covariance.
 
 Model        that of the fit with the sentences of all members of all classes. An amplitude is 0 in the models of the
-             others, so that values and covariance of the mixture (`class_average`) are all there is to it: the matrix,
+             others, so that values and covariance of the mixture (`class_average`) are sufficient: the matrix,
              errors of stars and maps follow as for any other calibration.
-Trust        Where members differ in what they do to stars by more than the goal, or by more than the errors of the fit,
-             only a class was named, and nothing of it is trusted: most of the error is then what is open.
-Limits       to first order; what was added to one and the other is taken as independent.
+Trust        Where the effects of members on stars differ by more than the goal, or by more than the errors of the fit,
+             only a class was identified and the product is not trusted: the ambiguity dominates the error.
+Limits       to first order; different additions are taken as independent.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Sum = tuple[tuple[float, Sentence], ...]
 
 FAR = 3.0  # errors of the product that no plausible member may lie from an element of it, in the median
 _SAME = 1e-9  # of a row of coefficients, which earlier rows must hold for it to be a combination of them
-_SHOWN = 4  # members that are told in a sentence
+_SHOWN = 4  # members listed in a sentence
 
 
 class Likeness(NamedTuple):
@@ -73,12 +73,12 @@ class ClassOf(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Members beside what was added."""
+        """Members other than the addition itself."""
         return tuple(member.name for member in self.members[1:])
 
 
 def with_average(result: FitResult, classes: Sequence[ClassOf]) -> FitResult:
-    """The fit whose calibration is the mean over the classes of what was added to its model."""
+    """The fit whose calibration is the mean over the classes of its additions."""
     if not classes:
         return result
     context = effect_context(result.model.template, result.calset.exposures)
@@ -87,9 +87,9 @@ def with_average(result: FitResult, classes: Sequence[ClassOf]) -> FitResult:
 
 
 def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Context) -> Calibration:
-    """The calibration of a fit as the mean over the classes of what was added, with their spread in its covariance.
+    """The calibration of a fit as the mean over the classes of its additions, with their spread in the covariance.
 
-    Its model holds all members, in sentences; what was added to one and the other is taken as independent.
+    Its model includes all members, as sentences; different additions are taken as independent.
     """
     if not classes:
         return calibration
@@ -98,26 +98,26 @@ def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Cont
     model = _with_ties(model, new, np.concatenate(list(_amplitudes_of(model, classes)), axis=1))
     place = np.array([model.index(name) for name in old.names])
     count, free = len(model.parameters), old.free
-    start, told = np.zeros(count), np.zeros((count, count))
+    start, fitted = np.zeros(count), np.zeros((count, count))
     start[place] = calibration.values
-    told[np.ix_(place, place)] = calibration.covariance
+    fitted[np.ix_(place, place)] = calibration.covariance
     into = np.zeros((count, len(old.names)))
     into[place, np.arange(len(old.names))] = 1.0
     into = into @ old.selection()
     of_free = calibration.covariance[np.ix_(free, free)]
-    values, covariance = start.copy(), told.copy()
-    own = _amplitudes_of(model, classes)
-    for one in classes:
-        rest = into @ known_apart_from(of_free, one.at) @ into.T
-        each, errors = [start], [told]
-        for member in one.members[1:]:
-            amplitudes = next(own)
+    values, covariance = start.copy(), fitted.copy()
+    amplitude_columns = _amplitudes_of(model, classes)
+    for group in classes:
+        conditional = into @ known_apart_from(of_free, group.at) @ into.T
+        means, errors = [start], [fitted]
+        for member in group.members[1:]:
+            amplitudes = next(amplitude_columns)
             slopes = into @ member.slopes + amplitudes
-            each.append(start + into @ member.values + amplitudes @ member.amplitudes)
-            errors.append(rest + slopes @ member.covariance @ slopes.T)
-        found = mixture(np.array([member.probability for member in one.members]), np.stack(each), errors)
-        values += found.mean - start
-        covariance += found.covariance - told
+            means.append(start + into @ member.values + amplitudes @ member.amplitudes)
+            errors.append(conditional + slopes @ member.covariance @ slopes.T)
+        average = mixture(np.array([member.probability for member in group.members]), np.stack(means), errors)
+        values += average.mean - start
+        covariance += average.covariance - fitted
     hidden = calibration.hidden
     if hidden is not None:
         changes = np.zeros((len(hidden), count))
@@ -132,30 +132,32 @@ def _holding(calibration: Calibration, classes: Sequence[ClassOf], context: Cont
     """The model with the sentences of all members."""
     texts = dict.fromkeys(
         sentence.text
-        for one in classes
-        for member in one.members[1:]
-        for each in member.sums
-        for _, sentence in each
+        for addition in classes
+        for member in addition.members[1:]
+        for amplitude in member.sums
+        for _, sentence in amplitude
     )
     model = calibration.model
-    said = Described.saying(list(texts), np.zeros(len(texts)))
+    description = Described.saying(list(texts), np.zeros(len(texts)))
     if Described.name in model.effect_names:
         earlier = model.instrument(calibration.values).effect(Described.name)
         assert isinstance(earlier, Described)
-        known = {p.name: p for p in model.parameters}
-        wider = with_effects(model_without(model, Described.name), [earlier.joined(said)], context)
-        return dataclasses.replace(wider, parameters=tuple(known.get(p.name, p) for p in wider.parameters))
-    return with_effects(model, [said], context)
+        parameters = {p.name: p for p in model.parameters}
+        wider = with_effects(model_without(model, Described.name), [earlier.joined(description)], context)
+        return dataclasses.replace(
+            wider, parameters=tuple(parameters.get(p.name, p) for p in wider.parameters)
+        )
+    return with_effects(model, [description], context)
 
 
 def _amplitudes_of(model: Model, classes: Sequence[ClassOf]) -> Iterator[Float[np.ndarray, "n a"]]:
     """Derivative of all parameters by the amplitudes of every member but the first of each class, in order."""
-    for member in (member for one in classes for member in one.members[1:]):
-        found = np.zeros((len(model.parameters), len(member.sums)))
-        for j, parts in enumerate(member.sums):
-            for size, sentence in parts:
-                found[model.index(f"{Described.name}.{sentence.label}"), j] += size
-        yield found
+    for member in (member for addition in classes for member in addition.members[1:]):
+        derivatives = np.zeros((len(model.parameters), len(member.sums)))
+        for j, combination in enumerate(member.sums):
+            for size, sentence in combination:
+                derivatives[model.index(f"{Described.name}.{sentence.label}"), j] += size
+        yield derivatives
 
 
 def _with_ties(model: Model, new: Sequence[int], amplitudes: Float[np.ndarray, "n a"]) -> Model:
@@ -168,10 +170,10 @@ def _with_ties(model: Model, new: Sequence[int], amplitudes: Float[np.ndarray, "
     for i in new:
         row, earlier = amplitudes[i], amplitudes[free]
         same = next((k for k in free if np.allclose(amplitudes[k], row, rtol=_SAME, atol=0.0)), None)
-        left = row - np.linalg.lstsq(earlier.T, row, rcond=None)[0] @ earlier if free else row
+        remainder = row - np.linalg.lstsq(earlier.T, row, rcond=None)[0] @ earlier if free else row
         if same is not None:
             parameters[i] = dataclasses.replace(parameters[i], tie=parameters[same].name)
-        elif np.abs(left).max() <= _SAME * np.abs(row).max():
+        elif np.abs(remainder).max() <= _SAME * np.abs(row).max():
             parameters[i] = dataclasses.replace(parameters[i], free=False)
         else:
             free.append(i)
@@ -185,27 +187,27 @@ def _positive(matrix: Matrix) -> Matrix:
     value, vector = np.linalg.eigh(0.5 * (matrix + matrix.T) / np.outer(unit, unit))
     if value.min(initial=0.0) >= 0.0:
         return 0.5 * (matrix + matrix.T)
-    found = (vector * np.clip(value, 0.0, None)) @ vector.T * np.outer(unit, unit)
-    return np.where(np.outer(scale > 0, scale > 0), 0.5 * (found + found.T), 0.0)
+    clipped = (vector * np.clip(value, 0.0, None)) @ vector.T * np.outer(unit, unit)
+    return np.where(np.outer(scale > 0, scale > 0), 0.5 * (clipped + clipped.T), 0.0)
 
 
 def only_a_class(classes: Sequence[ClassOf]) -> Iterator[str]:
     """A sentence on each class whose members differ by so much that nothing of it may be trusted."""
-    for one in classes:
-        apart = one.spread > min(GOAL, max(one.stated, thresholds.NEGLIGIBLE))
-        if not (apart or one.off > FAR):
+    for group in classes:
+        apart = group.spread > min(GOAL, max(group.stated, thresholds.NEGLIGIBLE))
+        if not (apart or group.off > FAR):
             continue
-        names = some([f"{m.name} ({100 * m.probability:.0f} %)" for m in one.members[1:]], _SHOWN)
+        names = some([f"{m.name} ({100 * m.probability:.0f} %)" for m in group.members[1:]], _SHOWN)
         yield (
-            f"only a class of causes was named: {one.added} ({100 * one.members[0].probability:.0f} %) or {names}, and "
-            f"they differ in what they do to stars (p by {two_digits(100 * one.spread)} %, median, where the errors of "
-            f"the fit are {two_digits(100 * one.stated)} %; elements of the matrix by up to "
-            f"{two_digits(one.off)} errors): {_deciding(one)}"
+            f"only a class of causes was named: {group.added} ({100 * group.members[0].probability:.0f} %) or {names}, "
+            f"with different effects on stars (p by {two_digits(100 * group.spread)} %, median, where the "
+            f"errors of the fit are {two_digits(100 * group.stated)} %; elements of the matrix by up to "
+            f"{two_digits(group.off)} errors): {_deciding(group)}"
         )
 
 
-def _deciding(one: ClassOf) -> str:
-    """Observations that would tell the members apart."""
-    tests = [s.tested_by for member in one.members for each in member.sums for _, s in each[:1]]
-    told = some(list(dict.fromkeys(tests)), 2) if tests else "other exposures"
-    return f"what would decide: {told}; walop-jax plan --criterion apart finds the exposures"
+def _deciding(group: ClassOf) -> str:
+    """Observations that would distinguish the members."""
+    tests = [s.tested_by for member in group.members for total in member.sums for _, s in total[:1]]
+    observations = some(list(dict.fromkeys(tests)), 2) if tests else "other exposures"
+    return f"what would decide: {observations}; walop-jax plan --criterion apart finds the exposures"

@@ -1,4 +1,4 @@
-"""Factors with which a description may grow: those that the exposures of a set can tell apart."""
+"""Dependences of descriptions that the exposures of a set can distinguish."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from walop_jax.model.planning import hours_of
 from walop_jax.sky.nights import first_of_nights
 
 FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median
-STEPS, FEW = 16, 18  # times of a step that are looked at first; times of which all spells are
+STEPS, FEW = 16, 18  # times of a step in the first search; most times for which all spells are tried
 AFTER = 0.5  # hours behind the last exposure that a step ends
 NEARLY_TIME = 0.999  # correlation of the order of exposures with time
 
@@ -59,8 +59,8 @@ PATTERNS: Mapping[str, tuple[str, ...]] = {
 class Dependences:
     """Factors that exposures can tell apart: groups by form (`Combinations.along`), each factor with an amplitude.
 
-    `over_field` says that points are enough for a pattern; factors may ask for the angles of elements of some
-    `prefixes`, and are those of exposures that are `inside`.
+    `over_field` is True with enough points for a pattern; factors may depend on the angles of the elements
+    `prefixes`, and are limited to the exposures `inside`.
     """
 
     exposures: Exposures
@@ -70,8 +70,8 @@ class Dependences:
 
     def of(self, form: str) -> Iterator[tuple[str, ...]]:
         """The groups of one form."""
-        name, _, most = form.partition(" to ")
-        yield from getattr(self, f"_{name.replace(' ', '_').lower()}")(*map(int, most.split()))
+        name, _, limit = form.partition(" to ")
+        yield from getattr(self, f"_{name.replace(' ', '_').lower()}")(*map(int, limit.split()))
 
     def _steady(self) -> Iterator[tuple[str, ...]]:
         yield ("",)
@@ -101,7 +101,7 @@ class Dependences:
                     yield f"cos {order} {prefix}", f"sin {order} {prefix}"
 
     def _hour_angle(self) -> Iterator[tuple[str, ...]]:
-        """The hour angle, where it is not the time."""
+        """The hour angle, where it is not degenerate with time."""
         angle, time = self.exposures.ha, self.exposures.mjd
         remainder = angle - angle.mean()
         if varies(self.exposures.mjd):
@@ -116,7 +116,7 @@ class Dependences:
             yield ("per EXPTIME",)
 
     def _order(self) -> Iterator[tuple[str, ...]]:
-        """The order of the exposures, where it is not the time."""
+        """The order of the exposures, where it is not degenerate with time."""
         hours, order = hours_of(self.exposures), np.arange(len(self.exposures), dtype=float)
         if (
             varies(self.exposures.mjd)
@@ -148,9 +148,9 @@ class Dependences:
     def _spell(self) -> Iterator[tuple[str, ...]]:
         """From a time until another: all of them, or of many exposures an eighth, a quarter or half of them."""
         times = self._moments()
-        some, lengths = evenly(times), (STEPS // 8, STEPS // 4, STEPS // 2)
-        each = itertools.chain(*(zip(some, some[length:], strict=False) for length in lengths))
-        for spell in itertools.combinations(times, 2) if len(times) <= FEW else each:
+        starts, lengths = evenly(times), (STEPS // 8, STEPS // 4, STEPS // 2)
+        spells = itertools.chain(*(zip(starts, starts[length:], strict=False) for length in lengths))
+        for spell in itertools.combinations(times, 2) if len(times) <= FEW else spells:
             yield (between(*spell),)
 
     def _night(self) -> Iterator[tuple[str, ...]]:
@@ -170,17 +170,17 @@ class Dependences:
         yield from ((f"kind {name}",) for name in names[np.argsort(-counts, kind="stable")][1:])
 
     def _exposure(self) -> Iterator[tuple[str, ...]]:
-        """Every single exposure, where a field of points shows what it is."""
+        """Every single exposure, where there are enough field points."""
         if self.over_field and len(self.exposures) <= limits.FREE_EXPOSURES:
             yield from ((f"exposure {number}",) for number in np.flatnonzero(self.inside))
 
     def _patch(self) -> Iterator[tuple[str, ...]]:
         """Every patch of the Moon sky, which is an exposure, and all of them."""
-        each = [f"exposure {number}" for number in np.flatnonzero(self.exposures.direct("moon"))]
-        if 0 < len(each) <= limits.FREE_EXPOSURES:
-            yield from zip(each)
-            if len(each) > 1:
-                yield tuple(each)
+        patches = [f"exposure {number}" for number in np.flatnonzero(self.exposures.direct("moon"))]
+        if 0 < len(patches) <= limits.FREE_EXPOSURES:
+            yield from zip(patches)
+            if len(patches) > 1:
+                yield tuple(patches)
 
 
 def varies(values: np.ndarray) -> bool:

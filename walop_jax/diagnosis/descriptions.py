@@ -32,11 +32,11 @@ from walop_jax.model.specification import Model, model_without, with_effects
 CHOICE_ROWS = 6000
 """(Exposure, point) pairs on which other descriptions of an instrument are compared before any of them is fitted."""
 
-NO_DIFFERENCE = 1e-6  # change of the residuals, in standard deviations, that is none
+NO_DIFFERENCE = 1e-6  # smallest change of the residuals, in standard deviations
 
 
 def described_otherwise(model: Model, sentence: str, context: Context) -> Model:
-    """The model of the instrument changed as a sentence says, on top of what has been changed before."""
+    """The model with the change of a sentence applied to its instrument, after all earlier changes."""
     name = OtherDescription.name
     if name in model.effect_names:
         before = model.template.effect(name)
@@ -61,20 +61,20 @@ def other_descriptions(
     # What is turned, exchanged or left out changes the light by per cents: nothing of that kind is a small misfit.
     sentences = tuple(alternatives(template)) if all_of_them else curves
     tell(f"comparing {len(sentences)} other descriptions")
-    asked = itertools.takewhile(lambda _: fits(), sentences)
-    found = sorted(_screened(result, asked, context), key=lambda one: one[0].left)
-    compared, trials = {choice.change: choice for choice, _, _ in found}, []
-    promising = [one for one in found if one[1] > thresholds.LEAST_GAIN][: thresholds.DESCRIPTIONS_FITTED]
-    chosen = {choice.change for choice, _, _ in promising}
-    rest = [one for one in found if one[0].change in curves and one[0].change not in chosen]
-    for choice, _, start in (*promising, *rest):
+    candidates = itertools.takewhile(lambda _: fits(), sentences)
+    screened = sorted(_screened(result, candidates, context), key=lambda item: item[0].left)
+    compared, trials = {choice.change: choice for choice, _, _ in screened}, []
+    best = [item for item in screened if item[1] > thresholds.LEAST_GAIN][: thresholds.DESCRIPTIONS_FITTED]
+    chosen = {choice.change for choice, _, _ in best}
+    others = [item for item in screened if item[0].change in curves and item[0].change not in chosen]
+    for choice, _, start in (*best, *others):
         if not fits():
             break
         tell(f"trying another description: {choice.change}")
         model = described_otherwise(result.model, choice.change, context)
         try:
             trial = try_model(result, OtherDescription, model, start, len(sentences))
-        except ValueError:  # a free parameter of what was left out has no prior: nothing holds it
+        except ValueError:  # a free parameter of a removed element has no prior and is undetermined
             continue
         assert trial.fit is not None
         gain = (result.posterior.objective - trial.fit.posterior.objective) * result.noise_scale**2
@@ -86,9 +86,9 @@ def other_descriptions(
 def _screened(
     result: FitResult, sentences: Iterable[str], context: Context
 ) -> Iterator[tuple[Choice, float, Vector]]:
-    """Each change that is one, with what it leaves, its gain in χ² and its place: the better of two places."""
-    every = max(1, CHOICE_ROWS // max(len(result.calset.exposures), 1))
-    calset = thinned(result.calset, every, neighbours=1)
+    """Every effective change with its residual fraction, gain in χ² and starting values: the better of two."""
+    point_limit = max(1, CHOICE_ROWS // max(len(result.calset.exposures), 1))
+    calset = thinned(result.calset, point_limit, neighbours=1)
     start = result.model.start.copy()  # but effects as they have been fitted
     for name in result.model.effect_names:
         start[result.model.positions(name)] = result.values[result.model.positions(name)]
@@ -97,20 +97,20 @@ def _screened(
         Design.of(dataclasses.replace(result, likelihood=likelihood, values=values))
         for values in (result.values, start)
     ]
-    given = float(np.sum(places[0].projector(places[0].residual) ** 2))
+    reference = float(np.sum(places[0].projector(places[0].residual) ** 2))
     for sentence in sentences:
         try:
             model = described_otherwise(result.model, sentence, context)
-        except NoSuchPlaceError:  # it leaves out what an effect of the model acts on
+        except NoSuchPlaceError:  # it removes an element that an effect of the model acts on
             continue
-        changed, left = Likelihood.of(calset, model), []
+        changed, ratios = Likelihood.of(calset, model), []
         for design in places:
             rows = design.residual.copy()
             residual = changed.residuals(design.fit.values)[1][design.measured.used].reshape(-1)
             rows[: design.rows] = residual / design.fit.noise_scale
             if np.abs(rows - design.residual).max() < NO_DIFFERENCE:
                 break
-            left.append(float(np.sum(design.projector(rows) ** 2)) / given)
-        if len(left) == len(places) and np.isfinite(left).any():
-            best = int(np.nanargmin(np.where(np.isfinite(left), left, np.nan)))
-            yield Choice(sentence, left[best]), (1.0 - left[best]) * given, places[best].fit.values
+            ratios.append(float(np.sum(design.projector(rows) ** 2)) / reference)
+        if len(ratios) == len(places) and np.isfinite(ratios).any():
+            best = int(np.nanargmin(np.where(np.isfinite(ratios), ratios, np.nan)))
+            yield Choice(sentence, ratios[best]), (1.0 - ratios[best]) * reference, places[best].fit.values

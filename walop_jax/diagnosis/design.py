@@ -1,6 +1,6 @@
 """One fit laid out for linear algebra: residuals, Jacobian, priors as rows, and where every row comes from.
 
-Patterns without a name say what a disagreement could look like in any instrument of this kind. Each stratum perturbs
+Patterns without a name describe possible disagreements of any instrument of this kind. Each stratum perturbs
 the counts of the cameras, N_k → N_k + F · pattern, and is one candidate of the score test:
 
 vector          one element (q or u) of the analysis vector of one camera × field polynomials up to degree 4:
@@ -82,10 +82,10 @@ class Measured:
         self.model: Cube = (self.counts * self.weight - residual) / flux
         self.known = likelihood.flux_known
         self.cameras = likelihood.cameras
-        # Of the model, not of the counts: patterns that know the noise would find it in the residuals.
+        # Of the model, not of the counts: patterns correlated with the noise would match it in the residuals.
         unit = self.model / np.where(self.weight > 0, self.weight, 1.0)
-        seen = np.maximum(self.used.sum(axis=1), 1)[:, None]
-        self.level: Float[np.ndarray, "p k"] = np.where(self.used[..., None], unit, 0.0).sum(axis=1) / seen
+        count = np.maximum(self.used.sum(axis=1), 1)[:, None]
+        self.level: Float[np.ndarray, "p k"] = np.where(self.used[..., None], unit, 0.0).sum(axis=1) / count
 
     def column(self, pattern: Cube) -> Float[np.ndarray, " _"]:
         """Derivative of the residuals with respect to the amplitude of N_k → N_k + F · level_k · pattern."""
@@ -94,7 +94,7 @@ class Measured:
 
     @property
     def has_gains(self) -> bool:
-        """True if exposures are seen at so many field points that gains of single ones are not all there is."""
+        """True if exposures have so many field points that gains of single exposures leave degrees of freedom."""
         return bool(self.used.sum() >= MANY_POINTS * self.used.any(axis=0).sum())
 
     @property
@@ -112,7 +112,7 @@ class Measured:
     def unit_model(self) -> Float[np.ndarray, "r k"]:
         """Weighted model of every used row, of unit length over the cameras with a flux in common; 0 if that is known.
 
-        Where exposures have no flux in common, a row without the part along it is what elimination of the flux leaves.
+        Where exposures have no flux in common, elimination of the flux removes the component of a row along it.
         """
         power = self.shared.summed(self.model**2)
         unit = self.model / np.sqrt(np.where(power > 0, power, 1.0))
@@ -122,26 +122,30 @@ class Measured:
         """Change by every pattern in its camera in every used row, in standard errors, the flux held."""
         size = (self.flux[..., None] * self.level[:, None, :] * self.weight)[self.used]
         points, exposures = np.nonzero(self.used)
-        each = [(k, pattern) for one in strata for k, pattern in zip(one.camera, one.patterns, strict=True)]
-        changes = np.empty((len(size), len(each)), order="F")
-        for a, (k, pattern) in enumerate(each):
-            there = np.broadcast_to(pattern, self.used.shape)[points, exposures]
-            np.multiply(size[:, k], there, out=changes[:, a])
+        pairs = [
+            (k, pattern)
+            for stratum in strata
+            for k, pattern in zip(stratum.camera, stratum.patterns, strict=True)
+        ]
+        changes = np.empty((len(size), len(pairs)), order="F")
+        for a, (k, pattern) in enumerate(pairs):
+            values = np.broadcast_to(pattern, self.used.shape)[points, exposures]
+            np.multiply(size[:, k], values, out=changes[:, a])
         return changes
 
     def candidate(self, stratum: _Stratum) -> Candidate:
         """The columns of a stratum, intensity by intensity."""
-        camera, one = np.asarray(stratum.camera), np.eye(self.cameras)
+        camera, unit = np.asarray(stratum.camera), np.eye(self.cameras)
         if self.shared.single:
             changes, m = self.changes([stratum]), self.unit_model
             columns = np.empty((len(m), self.cameras, len(camera)))
             for c in range(self.cameras):
-                left = one[c, camera] - self.together[c, camera] * m[:, c, None] * m[:, camera]
-                np.multiply(-changes, left, out=columns[:, c])
+                projection = unit[c, camera] - self.together[c, camera] * m[:, c, None] * m[:, camera]
+                np.multiply(-changes, projection, out=columns[:, c])
             columns = columns.reshape(-1, len(camera))
         else:
             patterns = zip(camera, stratum.patterns, strict=True)
-            columns = np.column_stack([self.column(pattern[..., None] * one[k]) for k, pattern in patterns])
+            columns = np.column_stack([self.column(pattern[..., None] * unit[k]) for k, pattern in patterns])
         return Candidate(stratum.name, columns, stratum.widths, stratum.block)
 
 
@@ -198,7 +202,7 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
     """All strata that the exposures of the set allow."""
     e, points = measured.likelihood.calset.exposures, measured.likelihood.calset.points
     names = measured.likelihood.model.template.cameras.names
-    every = range(len(names))
+    all_cameras = range(len(names))
     # Calibration plates that are put in at one or two angles are compared as groups, below.
     further = [(f" {prefix}", prefix) for prefix in measured.likelihood.plan.moving if prefix in e.further]
     turning = [("θ", POLARISER), *further]
@@ -233,13 +237,13 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
         ("temperature", e.temp[None, :], "exposures"),
         ("flux", measured.flux, None),
     ):
-        known = quantity[measured.used] if quantity.shape == measured.used.shape else quantity
-        if not np.isfinite(known).any():
+        measured_values = quantity[measured.used] if quantity.shape == measured.used.shape else quantity
+        if not np.isfinite(measured_values).any():
             continue
-        quantity = quantity - np.nanmean(known)
+        quantity = quantity - np.nanmean(measured_values)
         spread = np.nanstd(quantity)
         if np.isfinite(spread) and spread > 1e-9 * max(1.0, float(np.nanmax(np.abs(quantity)))):
-            yield _Stratum.of_all(every, name, [np.nan_to_num(quantity / spread)], block)
+            yield _Stratum.of_all(all_cameras, name, [np.nan_to_num(quantity / spread)], block)
     positions = [(prefix.lower(), positions_of(e, prefix)) for prefix in measured.likelihood.plan.moving]
     for name, label, block in (
         ("kind", e.kind, "exposures"),
@@ -250,14 +254,14 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
             np.where(label == group, stokes[..., i], 0.0) for group in np.unique(label)[1:] for i in range(3)
         ]
         if patterns:
-            yield _Stratum.of_all(every, name, patterns, block)
+            yield _Stratum.of_all(all_cameras, name, patterns, block)
     sky_gradients = [
         np.where(e.kind == group, term[:, None], 0.0)
         for group in np.unique(e.kind)[1:]
         for term in smooth.T[1:3]
     ]
     if sky_gradients:
-        yield _Stratum.of_all(every, "kind, over the field", sky_gradients)
+        yield _Stratum.of_all(all_cameras, "kind, over the field", sky_gradients)
     if measured.has_gains:
         alone = list(np.eye(len(e))[:, None])
         yield _Stratum.of_all(measured.gained, SINGLE_EXPOSURES, alone, "exposures")
@@ -300,7 +304,7 @@ class Design:
 
     @cached_property
     def columns(self) -> Columns:
-        """Columns of whatever the model has not."""
+        """Columns of changes that the model does not include."""
         return Columns(self.fit.likelihood, self.fit.values)
 
     @property
@@ -320,38 +324,38 @@ class Design:
 
     @cached_property
     def projector(self) -> Projector:
-        """Removes from columns what the free parameters could absorb."""
+        """Projection of columns off the space of the free parameters."""
         return Projector(self.jacobian, self.eliminated)
 
     @property
     def eliminated(self) -> int:
-        """Rows that carry no noise: one for every flux that was solved for, for every weak pull that does nothing."""
+        """Rows without noise: one for each fitted flux and for each ineffective weak constraint."""
         likelihood = self.fit.likelihood
         fluxes = round(float(self.measured.used.sum(axis=0) @ (likelihood.cameras - likelihood.data_per_row)))
         fitted = determined(self.jacobian.T @ self.jacobian, likelihood.weak)
         return fluxes + int((~likelihood.priors.known).sum()) - (len(likelihood.weak) - round(fitted))
 
     def _columns_of(self, name: str) -> Bool[np.ndarray, " f"]:
-        """True for the columns of the Jacobian that are those of an effect."""
+        """True for the columns of the Jacobian that belong to an effect."""
         return np.isin(self.fit.model.free, self.fit.model.positions(name))
 
     def without(self, name: str) -> tuple[Projector, Float[np.ndarray, "_ _"]]:
-        """Projector off all parameters but those of one effect, and an orthonormal basis of what these add to it."""
+        """Projector off all parameters but those of one effect, and an orthonormal basis of its projected columns."""
         of_effect = self._columns_of(name)
-        rest = Projector(self.jacobian[:, ~of_effect], self.eliminated)
-        own = rest(self.jacobian[:, of_effect])
-        return rest, own @ whitening(own.T @ own)
+        projector = Projector(self.jacobian[:, ~of_effect], self.eliminated)
+        projected = projector(self.jacobian[:, of_effect])
+        return projector, projected @ whitening(projected.T @ projected)
 
     def stacked(self, columns: Sequence[Float[np.ndarray, "_ _"]]) -> Float[np.ndarray, "_ _"]:
         """Columns of data rows side by side, in units of the noise, with zeros for the priors."""
-        whole = np.concatenate(columns, axis=1, dtype=float) / self.fit.noise_scale
-        return np.pad(whole, ((0, len(self.residual) - self.rows), (0, 0)))
+        matrix = np.concatenate(columns, axis=1, dtype=float) / self.fit.noise_scale
+        return np.pad(matrix, ((0, len(self.residual) - self.rows), (0, 0)))
 
     def products(
         self, columns: Sequence[Float[np.ndarray, "_ _"]], rows: Float[np.ndarray, "_ ..."]
     ) -> Float[np.ndarray, "_ ..."]:
         """Cᵀ times rows, of the columns C that `stacked` puts side by side."""
-        return np.concatenate([own.T @ rows[: self.rows] for own in columns]) / self.fit.noise_scale
+        return np.concatenate([block.T @ rows[: self.rows] for block in columns]) / self.fit.noise_scale
 
     def cube(self, rows: Vector) -> Float[np.ndarray, "p e k"]:
         """Data rows put back into (point, exposure, camera); 0 where unused."""
@@ -440,44 +444,44 @@ def held_out(design: Design, scheme: str) -> float:
 
 def pattern_scores(design: Design, seed: int = 0) -> ScoreTable:
     """The scores of all patterns that the exposures allow, against a fit."""
-    found = list(strata(design.measured))
+    all_strata = list(strata(design.measured))
     single = design.measured.shared.single
-    space, scores, square = (_from_rows if single else _from_columns)(design, found)
+    space, scores, square = (_from_rows if single else _from_columns)(design, all_strata)
     return space.table(scores, square, space.smallest_p(np.random.default_rng(seed)))
 
 
-def _from_columns(design: Design, found: list[_Stratum]) -> tuple[ScoreSpace, Vector, float]:
+def _from_columns(design: Design, all_strata: list[_Stratum]) -> tuple[ScoreSpace, Vector, float]:
     """Space, C̃ᵀr and r·r from columns of all intensities."""
-    columns = [design.measured.candidate(stratum).columns for stratum in found]
-    names, widths = [stratum.name for stratum in found], [stratum.widths for stratum in found]
+    columns = [design.measured.candidate(stratum).columns for stratum in all_strata]
+    names, widths = [stratum.name for stratum in all_strata], [stratum.widths for stratum in all_strata]
     space = ScoreSpace.projected(design.projector, names, widths, columns, scale=design.fit.noise_scale)
     residual = design.projector(design.residual)
     return space, design.products(columns, residual), float(residual @ residual)
 
 
-def _from_rows(design: Design, found: list[_Stratum]) -> tuple[ScoreSpace, Vector, float]:
+def _from_rows(design: Design, all_strata: list[_Stratum]) -> tuple[ScoreSpace, Vector, float]:
     """The same from the rows of exposures and points."""
     measured, scale = design.measured, design.fit.noise_scale
-    camera = np.concatenate([stratum.camera for stratum in found])
+    camera = np.concatenate([stratum.camera for stratum in all_strata])
     together, along = measured.together, measured.unit_model
-    change = measured.changes(found) / scale
+    change = measured.changes(all_strata) / scale
 
     products = -together[np.ix_(camera, camera)] * gram(change * along[:, camera])
     for k in range(measured.cameras):
-        own = np.flatnonzero(camera == k)
-        products[np.ix_(own, own)] += gram(change[:, own])
+        at = np.flatnonzero(camera == k)
+        products[np.ix_(at, at)] += gram(change[:, at])
     residual = design.projector(design.residual)
     rows = np.column_stack([design.projector.basis, residual])[: design.rows]
     rows = project_flux(rows.T.reshape(-1, *along.shape), along, shared=measured.shared)
-    both = np.empty((len(rows), len(camera)))
+    projections = np.empty((len(rows), len(camera)))
     for k in range(measured.cameras):
-        own = np.flatnonzero(camera == k)
-        both[:, own] = -rows[..., k] @ change[:, own]
-    base, scores = both[:-1], both[-1]
+        at = np.flatnonzero(camera == k)
+        projections[:, at] = -rows[..., k] @ change[:, at]
+    base, scores = projections[:-1], projections[-1]
     space = ScoreSpace(
-        names=tuple(stratum.name for stratum in found),
-        sizes=tuple(len(stratum.camera) for stratum in found),
-        widths=np.concatenate([stratum.widths for stratum in found]),
+        names=tuple(stratum.name for stratum in all_strata),
+        sizes=tuple(len(stratum.camera) for stratum in all_strata),
+        widths=np.concatenate([stratum.widths for stratum in all_strata]),
         before=np.diag(products).copy(),
         gram=products - base.T @ base,
         free=design.projector.free,

@@ -1,4 +1,4 @@
-"""Power of a calibration set before anything is found in it: the sizes at which effects are detected and named.
+"""Power of a calibration set, ahead of any diagnosis: sizes at which effects are detected and identified.
 
 Everything is linear algebra on the columns of the score test (`score`), at a fit or at a plan without noise.
 
@@ -69,7 +69,7 @@ def detection_limits(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> DetectionLimits:
-    """Amplitudes at which the data behind a fit show each effect of `catalogue`, and what they cannot show.
+    """Detection limits of the data behind a fit for each effect of `catalogue`, and undetectable effects.
 
     The residuals of the fit are not used: a fit to noiseless counts of a plan serves as well. `seed` is that of the
     Monte Carlo threshold. Of a large set points spread over the field are looked at, as in `diagnose`.
@@ -77,11 +77,11 @@ def detection_limits(
     tell = progress or (lambda text: None)
     template, calset = result.model.template, result.calset
     catalogue = result.model.catalogue if catalogue is None else catalogue
-    asked = hypotheses(catalogue, template, calset.exposures, len(calset.points))
-    result = sampled(on_field_points(result), most_points(calset, template, asked.amplitudes))
+    listed = hypotheses(catalogue, template, calset.exposures, len(calset.points))
+    result = sampled(on_field_points(result), most_points(calset, template, listed.amplitudes))
     tell(Stage("differentiating every effect", "differentiating"))
     rng = np.random.default_rng(seed)
-    examination = examine(result, asked.names, rng, sentences=asked.sentences, parts=asked.parts)
+    examination = examine(result, listed.names, rng, sentences=listed.sentences, parts=listed.parts)
     p = examination.table.local(thresholds.ALARM)
     tell(Stage("comparing the effects", "comparing"))
     rivals = examination.bare.subset([probe.name for probe in examination.probes])
@@ -93,13 +93,15 @@ def detection_limits(
         hidden = hidden_mistakes(design, Singles.of(design))
     examined = result if result.verdict is not None else result.judged()
     calibration = Calibration.from_fit(dataclasses.replace(examined, hidden=hidden))
-    found = _collected(examination, columns, errors, asked.effects, calibration)
-    return dataclasses.replace(found, conditions=condition_limits(design), could_hide=could_hide(calibration))
+    limits = _collected(examination, columns, errors, listed.effects, calibration)
+    return dataclasses.replace(
+        limits, conditions=condition_limits(design), could_hide=could_hide(calibration)
+    )
 
 
 @dataclasses.dataclass(frozen=True)
 class _Column:
-    """One amplitude of one probe: where it is detected and named, and who stays how far from it then."""
+    """One amplitude of one probe: its detection and identification limits, and the distances of its rivals there."""
 
     probe: Probe
     number: int
@@ -110,17 +112,17 @@ class _Column:
 
 
 def _columns(examination: Examination, rivals: ScoreSpace, probe: Probe, p: float) -> list[_Column]:
-    """The amplitudes of a probe; `rivals` is the space of all effects, without what single exposures may have."""
+    """Amplitudes of a probe; `rivals` is the space of all effects, without the nuisance of single exposures."""
     space = examination.space
     at, alive, rank = space.places()[probe.name], space.alive, space.whitened[probe.name].shape[1]
-    first, found = rivals.places()[probe.name].start, []
+    first, limits = rivals.places()[probe.name].start, []
     for number, place in enumerate(range(at.start, at.stop)):
         if not alive[place]:
             continue
         detected = float(np.sqrt(noncentrality(p, rank, thresholds.PROBABILITY) / space.gram[place, place]))
-        own = rivals.gram[:, first + number]
-        square = float(own[first + number])
-        apart = examination.nearest(separations(rivals, own, square))
+        products = rivals.gram[:, first + number]
+        square = float(products[first + number])
+        apart = examination.nearest(separations(rivals, products, square))
         del apart[probe.effect.name]
         nearest = min(apart.values(), default=np.inf)
         named = detected
@@ -129,15 +131,15 @@ def _columns(examination: Examination, rivals: ScoreSpace, probe: Probe, p: floa
         elif np.isfinite(nearest):
             surely = special.ndtri(thresholds.PROBABILITY) / np.sqrt(square)
             named = max(detected, thresholds.SEPARATION / nearest + surely)
-        others = {name: value * detected for name, value in apart.items()}
-        found.append(_Column(probe, number, probe.parameters[number], detected, float(named), others))
-    return found
+        distances = {name: value * detected for name, value in apart.items()}
+        limits.append(_Column(probe, number, probe.parameters[number], detected, float(named), distances))
+    return limits
 
 
 def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.ndarray, "c p"]:
     """Error of q and u at every field point from each column, at the amplitude that is just detected.
 
-    That is the width of its prior at most: what is plausible where the data would show only more.
+    It is at most the width of its prior: the plausible size where the detection limit is larger.
     Of an effect with many shapes that of the median amplitude stands for all; the others are NaN.
     """
     design, result = examination.design, examination.result
@@ -151,27 +153,27 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     template = result.model.template
     # Fringes need more wavelength nodes than all others: they have a program of their own.
     for fringes in (False, True):
-        some = [p for p in examination.probes if p.name in chosen and _has_fringes(p, template) == fringes]
-        members = tuple(member for probe in some for member in probe.group)
+        subset = [p for p in examination.probes if p.name in chosen and _has_fringes(p, template) == fringes]
+        members = tuple(member for probe in subset for member in probe.group)
         changes.append(effect_slopes(instrument, setting, calset.filters, x, y, members))
-        probes += some
+        probes += subset
     change = np.concatenate(changes, axis=-1)
     starts = np.cumsum([0, *(len(probe.widths) for probe in probes)])
     place = {probe.name: int(start) for probe, start in zip(probes, starts, strict=False)}
-    found = np.full((len(columns), len(x)), np.nan)
+    errors = np.full((len(columns), len(x)), np.nan)
     looked_at = [i for i, column in enumerate(columns) if column.probe.name in chosen]
     if not looked_at:
-        return found
+        return errors
     raw = [
         examination.named[c.probe.name].columns[:, c.number, None] for c in (columns[i] for i in looked_at)
     ]
     along = design.products(raw, design.projector.basis).T
     for i, taken_up in zip(looked_at, design.taken_up(along).T, strict=True):
         column = columns[i]
-        own = change[..., place[column.probe.name] + column.number]
+        slope = change[..., place[column.probe.name] + column.number]
         size = min(column.detected, float(column.probe.widths[column.number]))
-        found[i] = change_of_qu(matrix, matrix + size * (own - slopes @ taken_up))
-    return found
+        errors[i] = change_of_qu(matrix, matrix + size * (slope - slopes @ taken_up))
+    return errors
 
 
 def _has_fringes(probe: Probe, template: Instrument) -> bool:
@@ -180,7 +182,7 @@ def _has_fringes(probe: Probe, template: Instrument) -> bool:
 
 
 def _representative(columns: Sequence[_Column]) -> set[str]:
-    """Names of the probes whose effect on the matrix is worked out."""
+    """Names of the probes whose effect on the matrix is computed."""
     by_effect: dict[EffectKind, dict[str, float]] = {}
     for column in columns:
         by_effect.setdefault(column.probe.effect, {}).setdefault(column.probe.name, column.detected)
@@ -222,56 +224,56 @@ def _collected(
     separation = np.full((len(names), len(names)), np.nan)
     for row, name in enumerate(names):
         near = _nearest([c for c in columns if c.probe.effect.name == name])
-        separation[row] = [near.get(other, np.nan) for other in names]
+        separation[row] = [near.get(rival, np.nan) for rival in names]
     points, result = examination.result.calset.points, examination.result
     setting = first_setting(result.calset, result.model.instrument(result.values))
     hidden = hidden_errors(calibration, points.x, points.y, setting)
     assert calibration.hidden is not None
-    every = np.vstack([SECOND_ORDER * errors, hidden, np.full((1, len(points)), np.nan)])
+    all_errors = np.vstack([SECOND_ORDER * errors, hidden, np.full((1, len(points)), np.nan)])
     names_of = (*(c.probe.effect.name for c in columns), *calibration.hidden.names, "")
-    worst = np.where(np.isfinite(every), every, -1.0)
+    worst = np.where(np.isfinite(all_errors), all_errors, -1.0)
     largest = worst.argmax(axis=0)
     protection = worst[largest, np.arange(len(points))]
-    known = protection >= 0
+    measurable = protection >= 0
     return DetectionLimits(
         limits=tuple(sorted(entries, key=lambda e: -np.nan_to_num(e.error_of_qu[1], nan=-1.0))),
         effects=names,
         separation=separation,
         x=points.x,
         y=points.y,
-        protection=np.where(known, protection, np.nan),
-        caused_by=tuple(names_of[i] if k else "" for i, k in zip(largest, known, strict=True)),
+        protection=np.where(measurable, protection, np.nan),
+        caused_by=tuple(names_of[i] if k else "" for i, k in zip(largest, measurable, strict=True)),
         untestable=examination.untestable(catalogue),
     )
 
 
 def _nearest(columns: Sequence[_Column]) -> dict[str, float]:
     """Distance of each rival from the amplitude and shape that it follows best."""
-    found: dict[str, float] = {}
+    nearest: dict[str, float] = {}
     for column in columns:
         for name, value in column.rivals.items():
-            found[name] = min(value, found.get(name, np.inf))
-    return found
+            nearest[name] = min(value, nearest.get(name, np.inf))
+    return nearest
 
 
 # --------------------------------------------------------------------------------------------------- stated conditions
 
 
 def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
-    """A limit for every number that the set behind a fit states of itself."""
+    """A limit for every stated condition of the set behind a fit."""
     scored = condition_scores(design)
-    tried = sum(one.score.testable for one in scored)
+    tried = sum(item.score.testable for item in scored)
     if not tried:
         return ()
     result = design.fit
     instrument, calset = result.model.instrument(result.values), result.calset
     setting, x, y = first_setting(calset, instrument), calset.points.x, calset.points.y
     matrix, slopes = matrix_slopes(instrument, setting, calset.filters, x, y)
-    columns = np.column_stack([one.column for one in scored])
+    columns = np.column_stack([item.column for item in scored])
     taken_up = design.taken_up(design.projector.basis.T @ columns)
     off = slopes @ (result.model.selection() @ taken_up)
     least = noncentrality(local_p(thresholds.ALARM, tried), 1, thresholds.PROBABILITY)
-    found = []
+    limits = []
     for number, (stated, score, _, square) in enumerate(scored):
         slope = off[..., number]
         if stated.seen_by_stars:
@@ -284,5 +286,5 @@ def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
         detected = float(np.sqrt(least / square)) if score.testable else np.inf
         size = min(detected, stated.width)
         error = over_field(change_of_qu(matrix, matrix + size * slope)[None])
-        found.append(ConditionLimit(stated.what, stated.unit, detected, size, error))
-    return tuple(found)
+        limits.append(ConditionLimit(stated.what, stated.unit, detected, size, error))
+    return tuple(limits)

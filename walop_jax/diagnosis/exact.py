@@ -1,4 +1,4 @@
-"""Exact fits of what a diagnosis tries, adds and drops.
+"""Exact fits of the candidates of a diagnosis: trials, additions and removals.
 
 Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det H_base) − Σ ln w, with O the objective (χ² of
                data and priors), H half its Hessian and w the prior widths of the added parameters; those of amplitudes
@@ -26,13 +26,13 @@ from walop_jax.model.specification import Model, model_without, with_effects
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """An addition to a model that was tried: its evidence (ln B), and what it leaves, χ² and whether that is noise.
+    """A trial addition to a model: its evidence (ln B), the remaining χ², and whether that agrees with noise.
 
     `item` is its linear step, `linear` the evidence of that (NaN where there was none). `fit` is None until it has been
     fitted. `alternatives` are other shapes of the effect that do as well, in words. `rivals` are effects of nearly its
     evidence, or of which a part would do, `nameless` sentences that are not improbable beside it. `predicts` is False
-    where its linear step does not predict what it has not seen, `compared` holds what two fits say of it
-    (`predictions.before_and_after`), `against` the KINDs of exposures that speak against it, `refused` the reason for
+    where its linear step does not predict held-out data, `compared` holds the comparison of two fits
+    (`predictions.before_and_after`), `against` the KINDs of exposures that contradict it, `refused` the reason for
     which it was not added, `said` the groups of sentences that were added one after the other.
     """
 
@@ -54,7 +54,7 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """Its name: of what has none the descriptions, of another description of the instrument the change."""
+        """Its name; without one its descriptions, or the change of the description of the instrument."""
         if self.item is not None:
             return self.item.name
         if self.effect is OtherDescription and self.fit is not None:
@@ -86,14 +86,14 @@ def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
 
     Priors of amplitudes are those of the fit at all `SCALES`.
     """
-    known, model = set(base.model.names), extended.model
+    base_names, model = set(base.model.names), extended.model
     widths = [
         p.prior[1] if p.prior is not None else (p.loose or p.scale)
         for p in model.parameters
-        if p.name not in known and p.free and p.tie is None
+        if p.name not in base_names and p.free and p.tie is None
     ]
     amplitudes = [i for effect in model.effect_names for i in amplitude_positions(model, effect)]
-    at = [i for i in amplitudes if model.names[i] not in known]
+    at = [i for i in amplitudes if model.names[i] not in base_names]
     gain = 0.5 * (base.posterior.objective - extended.posterior.objective)
     occam = 0.5 * (_log_determinant(extended) - _log_determinant(base))
     at_all_scales = _of_amplitudes(extended, at) - _of_amplitudes(extended, at, np.ones(1))
@@ -104,7 +104,7 @@ def _of_amplitudes(result: FitResult, at: Sequence[int], scales: Float[np.ndarra
     """ln B of some parameters against their prior means: density of posterior and prior there, both Gaussian.
 
     The Savage–Dickey ratio of nested models (Dickey 1971, Ann. Math. Stat. 42, 204), with the prior at all `scales`:
-    what the data alone say is the information of the posterior without that of the prior.
+    the information of the data alone is that of the posterior less that of the prior.
     """
     if not at:
         return 0.0
@@ -121,14 +121,14 @@ def try_effect(base: FitResult, instance: Effect, context: Context, prior_shapes
     )
 
 
-def try_sentences(base: FitResult, said: Described, context: Context, count: int) -> Trial:
+def try_sentences(base: FitResult, description: Described, context: Context, count: int) -> Trial:
     """Add sentences to the fitted model, beside those that it has, and fit again; they are among `count` of them."""
     model = base.model
     if Described.name in model.effect_names:
         earlier = model.instrument(base.values).effect(Described.name)
         assert isinstance(earlier, Described)
-        said, model = earlier.joined(said), model_without(model, Described.name)
-    return try_model(base, Described, with_effects(model, [said], context), base.values, count)
+        description, model = earlier.joined(description), model_without(model, Described.name)
+    return try_model(base, Described, with_effects(model, [description], context), base.values, count)
 
 
 def try_model(
@@ -143,7 +143,7 @@ def try_model(
         noise_scale=base.noise_scale,
         worth=base.posterior.objective,
     )
-    bayes = -np.inf  # of a fit that has run to where nothing is finite
+    bayes = -np.inf  # of a diverged fit
     if np.isfinite(result.posterior.matrix).all():
         bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
     return Trial(effect, bayes, result.chi2, result.explains_data, fit=result)
@@ -158,22 +158,24 @@ def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int) -> 
     ]
     best = max(trials, key=lambda t: t.evidence if _converged(t) else -np.inf)
     alike = [t for t in trials if _converged(t) and t.evidence > best.evidence - thresholds.EVEN_ODDS]
-    told = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best, thresholds.SEPARATION))
-    return dataclasses.replace(best, alternatives=tuple(told))
+    alternatives = dict.fromkeys(
+        in_words(t.instance) for t in alike if _differ(t, best, thresholds.SEPARATION)
+    )
+    return dataclasses.replace(best, alternatives=tuple(alternatives))
 
 
 def _converged(trial: Trial) -> bool:
     return trial.fit is not None and trial.fit.converged
 
 
-def _differ(one: Trial, other: Trial, separation: float) -> bool:
-    assert one.fit is not None
-    assert other.fit is not None
-    if one.instance.choices() != other.instance.choices():
+def _differ(first: Trial, second: Trial, separation: float) -> bool:
+    assert first.fit is not None
+    assert second.fit is not None
+    if first.instance.choices() != second.instance.choices():
         return True
-    at = one.fit.model.positions(one.effect.name)
-    sigma = np.maximum(one.fit.sigma[at], other.fit.sigma[at])
-    away = np.asarray(values_of(one.instance)) - np.asarray(values_of(other.instance))
+    at = first.fit.model.positions(first.effect.name)
+    sigma = np.maximum(first.fit.sigma[at], second.fit.sigma[at])
+    away = np.asarray(values_of(first.instance)) - np.asarray(values_of(second.instance))
     return bool(np.any(np.abs(away) > separation * np.where(sigma > 0, sigma, np.inf)))
 
 
@@ -186,7 +188,7 @@ def in_words(effect: Effect) -> str:
 
 
 def spoken_choices(effect: Effect) -> dict[str, Any]:
-    """Discrete choices that mean something to a reader: a camera, a crystal, a star."""
+    """Discrete choices with a meaning for a reader: a camera, a crystal, a star."""
     return {name: value for name, value in effect.choices().items() if isinstance(value, int | str)}
 
 
@@ -215,13 +217,13 @@ def beyond_prior(result: FitResult, name: str) -> dict[str, float]:
     """Amplitudes of an effect that lie beyond the prior of their declaration, widened or not, in its widths."""
     effect = result.model.template.effect(name)
     declared = {f"{name}.{leaf.name}": leaf.width for leaf in leaves(effect)}
-    found = {}
+    far = {}
     for i in amplitude_positions(result.model, name):
         p = result.model.parameters[i]
         widths = abs(float(result.values[i]) - p.prior[0]) / (declared[p.name] or np.inf)  # type: ignore[index]
         if widths > PRIOR_EDGE:
-            found[p.name.removeprefix(f"{name}.")] = widths
-    return found
+            far[p.name.removeprefix(f"{name}.")] = widths
+    return far
 
 
 def evidence_of_presence(result: FitResult, name: str) -> float:
@@ -234,7 +236,7 @@ def evidence_of_presence(result: FitResult, name: str) -> float:
 
 
 def refit_without(result: FitResult, name: str) -> FitResult:
-    """Take an effect out of a fitted model and fit again, with errors scaled only if what is left needs it."""
+    """Take an effect out of a fitted model and fit again, with errors scaled only if the residuals require it."""
     model = model_without(result.model, name)
     start = dict(zip(result.model.names, result.values, strict=True))
     return fit(Likelihood.of(result.calset, model), start=np.array([start[n] for n in model.names]))
@@ -245,8 +247,8 @@ def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarra
     effect = result.model.template.effect(name)
     if effect.kind.is_structural():
         model = model_without(result.model, name)
-        kept = [result.model.index(n) for n in model.names]
-        bare = Likelihood.of(result.calset, model).residuals(result.values[kept])[1]
+        indices = [result.model.index(n) for n in model.names]
+        bare = Likelihood.of(result.calset, model).residuals(result.values[indices])[1]
     else:
         values = result.values.copy()
         values[result.model.positions(name)] = np.asarray(values_of(effect.at_neutral(context)))

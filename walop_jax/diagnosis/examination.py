@@ -1,9 +1,9 @@
-"""Physics that a fit lacks, by linear algebra: the scores of all candidates, their order of evidence, their equals.
+"""Candidates for missing physics, by linear algebra: scores, ranking by evidence, equivalent candidates.
 
 Evidence      Of a candidate alone: ln B of the score test (`score.log_bayes`). Alternative shapes of an effect share
               its prior, sentences share that of one name.
 Separation    The change D of the residuals that a candidate makes at its amplitudes, projected off the other
-              parameters, is fitted by each rival; the length of what the rival cannot follow is the separation in
+              parameters, is fitted by each rival; the length of the remainder is the separation in
               standard deviations (Atkinson & Fedorov 1975, Biometrika 62, 57). Below `thresholds.SEPARATION` the data
               cannot tell the two apart, nor when their evidence differs by less than `thresholds.IMPROBABLE`.
 """
@@ -60,17 +60,17 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
         alive.sort(key=lambda item: -item[1].log_bayes)
         (probe, score), best = alive[0], alive[0][1].log_bayes
         mean = float(np.logaddexp.reduce([s.log_bayes for _, s in alive]) - np.log(len(shapes)))
-        others = [
+        alternatives = [
             item
             for item in alive[1 : thresholds.MOST_SHAPES]
             if item[1].log_bayes > best - max(thresholds.WITHIN, 0.2 * best)
         ]
-        ranked.append(Ranked(effect, probe, score, mean, tuple(others)))
+        ranked.append(Ranked(effect, probe, score, mean, tuple(alternatives)))
     return sorted(ranked, key=lambda item: -item.log_bayes)
 
 
 def leaders(ranked: Sequence[Ranked]) -> list[Ranked]:
-    """Candidates whose linear evidence is too close to the best to leave them out."""
+    """Candidates with a linear evidence close to the best."""
     if not ranked:
         return []
     best, reach = ranked[0].log_bayes, thresholds.WITHIN
@@ -94,14 +94,14 @@ def shortest(item: Ranked, most: int = thresholds.MOST_TOGETHER) -> Described:
     information = np.linalg.pinv(item.score.covariance, hermitian=True)
     scores, widths = information @ item.score.amplitudes, item.probe.widths
 
-    def worth(some: Sequence[int]) -> float:
-        return log_bayes(information[np.ix_(some, some)], scores[some], widths[some])
+    def worth(indices: Sequence[int]) -> float:
+        return log_bayes(information[np.ix_(indices, indices)], scores[indices], widths[indices])
 
     subset = list(range(len(widths)))
-    subsets = [list(some) for n in subset for some in itertools.combinations(subset, n + 1) if n < most]
+    subsets = [list(indices) for n in subset for indices in itertools.combinations(subset, n + 1) if n < most]
     while len(subset) > most:
         subsets.append(subset)
-        subset = max(([i for i in subset if i != one] for one in subset), key=worth)
+        subset = max(([i for i in subset if i != index] for index in subset), key=worth)
     best = max(subsets, key=worth)
     amplitudes = np.linalg.lstsq(information[np.ix_(best, best)], scores[best], rcond=None)[0]
     return Described.combine([item.probe.group[i] for i in best], amplitudes)
@@ -112,7 +112,7 @@ def shortest(item: Ranked, most: int = thresholds.MOST_TOGETHER) -> Described:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Evidence:
-    """Part of one set of residuals that every candidate would explain, beyond what the base parameters do.
+    """The part of one set of residuals that each candidate explains beyond the base parameters.
 
     `space` is that of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
     `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are told as the
@@ -139,13 +139,13 @@ class Evidence:
 
     @cached_property
     def told(self) -> list[Ranked]:
-        """Sentences in order of evidence, each less what it pays for being one of so many."""
+        """Sentences in order of evidence, each less the logarithm of their number."""
         price = float(np.log(max(len(self.sentences), 1)))  # all of them share the prior of one name
         scored = [(probe, self.table[probe.name]) for probe in self.sentences]
-        found = [
+        candidates = [
             Ranked(Described, p, score, score.log_bayes - price) for p, score in scored if score.testable
         ]
-        return sorted(found, key=lambda item: -item.log_bayes)
+        return sorted(candidates, key=lambda item: -item.log_bayes)
 
     @cached_property
     def significant(self) -> list[Ranked]:
@@ -159,17 +159,17 @@ class Evidence:
 
     @property
     def alarm(self) -> bool:
-        """True if anything is missing at all."""
+        """True if the model is incomplete at the threshold `thresholds.ALARM`."""
         return self.table.p_global < thresholds.ALARM
 
     @property
     def poor(self) -> bool:
-        """True if so much is missing that what cannot be differentiated is worth trying."""
+        """True if the fit is poor enough to try changes that have no derivative."""
         return self.chi2 > thresholds.POOR_FIT * self.dof
 
     @property
     def floor(self) -> float:
-        """Scatter behind everything that was looked for, in standard deviations of the data as stated; 1 or more.
+        """Scatter behind all candidates, in standard deviations of the data as stated; 1 or more.
 
         Above `thresholds.FLOOR` no candidate explains the data to within N_ERR. Evidence and separations then count in
         this unit: in that of photons everything would be certain.
@@ -187,7 +187,7 @@ class Evidence:
 
     @property
     def best_pattern(self) -> float:
-        """Evidence of the most probable pattern, less what it pays for being one of several."""
+        """Evidence of the most probable pattern, less the logarithm of the number of patterns."""
         alive = [score.log_bayes for score in self._pattern_scores]
         return max(alive, default=-np.inf) - float(np.log(max(len(alive), 1)))
 
@@ -200,10 +200,10 @@ class Evidence:
         space, scores, square = self.space, self.scores, self.square
         names, table, needed = list(self.patterns), self.table, []
         while len(needed) < thresholds.MOST_PATTERNS:
-            left = [s for s in map(table.__getitem__, names) if s.testable and self._p(s) < thresholds.ALARM]
-            if not left:
+            clear = [s for s in map(table.__getitem__, names) if s.testable and self._p(s) < thresholds.ALARM]
+            if not clear:
                 break
-            best = max(left, key=lambda s: s.log_bayes)
+            best = max(clear, key=lambda s: s.log_bayes)
             needed.append((best.name, self._p(best)))
             names.remove(best.name)
             space, reduce = space.with_base([best.name])
@@ -241,7 +241,9 @@ class Evidence:
             table=space.table_after(self.table, scores),
             probes=[p for p in self.probes if p.effect is not effect or effect is Described],
             sentences=[probe for probe in self.sentences if probe is not item.probe],
-            parts=[(probe, {one for one in effects if one is not effect}) for probe, effects in self.parts],
+            parts=[
+                (probe, {kind for kind in effects if kind is not effect}) for probe, effects in self.parts
+            ],
             chi2=self.chi2 - item.score.statistic * (self.table.noise_scale * self.scale) ** 2,
             dof=self.dof - item.score.rank,
         )
@@ -251,24 +253,24 @@ class Evidence:
         best = max((item.log_bayes for item in self.significant), default=-np.inf)
         return [item for item in self.significant_sentences if item.log_bayes > best]
 
-    # ------------------------------------------------------------------------------- what cannot be told apart
+    # ------------------------------------------------------------------------------- indistinguishable candidates
 
     def apart(self, item: Ranked) -> dict[str, float]:
-        """Distance (σ) of every candidate from what one does at its amplitudes, by linear steps."""
+        """Distance (σ) of every candidate from the change of one at its amplitudes, by linear steps."""
         at, amplitudes = self.space.places()[item.probe.name], item.score.amplitudes
         change = self.space.gram[:, at] @ amplitudes
         return separations(self.space, change, float(amplitudes @ change[at]))
 
     def nearest(self, by_candidate: Mapping[str, float]) -> dict[str, float]:
         """The smallest number of each effect among those of its probes."""
-        found: dict[str, float] = {}
+        nearest: dict[str, float] = {}
         for probe in self.probes:
             effect = probe.effect.name
-            found[effect] = min(by_candidate[probe.name], found.get(effect, np.inf))
-        return found
+            nearest[effect] = min(by_candidate[probe.name], nearest.get(effect, np.inf))
+        return nearest
 
     def close(self, item: Ranked) -> tuple[str, ...]:
-        """Effects that could follow what a candidate would explain, by linear steps; the nearest first."""
+        """Effects indistinguishable from a candidate, by linear steps; the nearest first."""
         apart = self.nearest(self.apart(item))
         apart.pop(item.effect.name, None)
         close = {name: s for name, s in apart.items() if s < thresholds.SEPARATION * self.floor}
@@ -282,9 +284,9 @@ class Evidence:
         least, apart = max(0.0, item.log_bayes - thresholds.IMPROBABLE), self.apart(item)
         length, limit = len(item.score.amplitudes), thresholds.SEPARATION * self.floor
         alike = {p.name for p in self.sentences if len(p.widths) <= length and apart[p.name] < limit}
-        others = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
-        others = [r for r in others if r.probe is not item.probe and not set(own) & set(said_by(r.probe))]
-        return tuple(r.probe.name for r in others[: thresholds.MOST_CLASSES])
+        rivals = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
+        rivals = [r for r in rivals if r.probe is not item.probe and not set(own) & set(said_by(r.probe))]
+        return tuple(r.probe.name for r in rivals[: thresholds.MOST_CLASSES])
 
     def held_in_part(self, item: Ranked) -> tuple[str, ...]:
         """Effects of which a part, by itself, is not improbable beside a candidate; parts share the prior of theirs."""
@@ -302,7 +304,7 @@ class Evidence:
         )
 
     def classes(self) -> Iterator[dict[str, Any]]:
-        """Rows of a file: effects that could follow what each significant one would explain, by linear steps."""
+        """Rows of a file: effects indistinguishable from each significant one, by linear steps."""
         for item in self.significant[: thresholds.MOST_CLASSES]:
             if close := self.close(item):
                 effect = item.effect
@@ -330,7 +332,7 @@ class Evidence:
 
 
 def explains(chi2: float, dof: float) -> bool:
-    """True if χ² is what noise alone would give, as `FitResult.explains_data` has it."""
+    """True if χ² agrees with noise alone, by the criterion of `FitResult.explains_data`."""
     return bool(dof > 0 and chi2 - dof < SUSPECT_SIGMA * np.sqrt(2.0 * dof))
 
 
@@ -358,7 +360,7 @@ class _Absorbed:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Examination(Evidence):
-    """The evidence of one fit, and where it comes from.
+    """The evidence of one fit, and its origin.
 
     `named` and `said` are the columns of effects and of sentences, `columns` those of all candidates, ahead of any
     projection; `bare` is their space ahead of the nuisance of single exposures with prior widths `common_mode`.
@@ -377,33 +379,33 @@ class Examination(Evidence):
 
     @property
     def noise_p(self) -> float:
-        """Chance that noise of the stated size alone leaves as much as this fit does."""
+        """Probability of a χ² as large as this from noise of the stated size alone."""
         return float(special.chdtrc(max(self.dof, 1), self.chi2))
 
     def untestable(self, catalogue: Sequence[EffectKind]) -> tuple[str, ...]:
-        """Effects that these data cannot show at any plausible size."""
-        seen = {probe.effect.name for probe in self.probes if self.table[probe.name].testable}
-        seen.update(self.result.model.effect_names)
+        """Effects not detectable in these data at any plausible size."""
+        testable = {probe.effect.name for probe in self.probes if self.table[probe.name].testable}
+        testable.update(self.result.model.effect_names)
         return tuple(
-            effect.name for effect in catalogue if effect.name not in seen and not effect.is_structural()
+            effect.name for effect in catalogue if effect.name not in testable and not effect.is_structural()
         )
 
     def separation(self, name: str, change: Vector) -> dict[str, float]:
         """Distance (σ) of each rival from an active effect that changes the residuals (data rows) by `change`."""
-        own = self.absorbed[name]
-        whole = np.pad(change, (0, len(self.design.residual) - len(change)))
-        projected = own.rest(whole)
-        space = dataclasses.replace(self.bare, gram=self.bare.gram + own.columns.T @ own.columns)
-        scores = self.products(projected) + own.columns.T @ (own.basis.T @ projected)
-        found = self.nearest(separations(space, scores, float(projected @ projected)))
-        return {rival: apart / self.floor for rival, apart in found.items()}
+        absorbed = self.absorbed[name]
+        padded = np.pad(change, (0, len(self.design.residual) - len(change)))
+        projected = absorbed.rest(padded)
+        space = dataclasses.replace(self.bare, gram=self.bare.gram + absorbed.columns.T @ absorbed.columns)
+        scores = self.products(projected) + absorbed.columns.T @ (absorbed.basis.T @ projected)
+        distances = self.nearest(separations(space, scores, float(projected @ projected)))
+        return {rival: apart / self.floor for rival, apart in distances.items()}
 
     def products(self, rows: Vector) -> Vector:
         """Products of the projected columns of all candidates with rows."""
         return self.design.products(self.columns, self.design.projector(rows))
 
     def is_like(self, design: Design) -> bool:
-        """True if another fit expects so nearly the same counts that its columns may serve again."""
+        """True if the expected counts of another fit are close enough to reuse its columns."""
         ours, theirs = self.design.measured.model, design.measured.model
         return bool(np.linalg.norm(ours - theirs) < thresholds.SAME_COUNTS * np.linalg.norm(ours))
 
@@ -422,27 +424,27 @@ def examine(
     """
     active, design = result.model.effect_names, Design.of(result)
     inactive = [probe for probe in wanted if probe.effect.name not in active]
-    every = [*sentences, *(probe for probe, _ in parts)]
+    listed = [*sentences, *(probe for probe, _ in parts)]
     named, said = (
         (earlier.named, earlier.said)
         if earlier is not None and earlier.is_like(design)
-        else all_candidates(design.columns, inactive, every)
+        else all_candidates(design.columns, inactive, listed)
     )
     probes = [probe for probe in inactive if probe.name in named]
     sentences = tuple(probe for probe in sentences if probe.name in said)
-    known = [
+    held = [
         (probe, {effect for effect in effects if effect.name not in active})
         for probe, effects in parts
         if probe.name in said
     ]
     patterns = [
-        dataclasses.replace(one, columns=one.columns.astype(np.float32))
-        for one in map(design.measured.candidate, strata(design.measured))
+        dataclasses.replace(item, columns=item.columns.astype(np.float32))
+        for item in map(design.measured.candidate, strata(design.measured))
     ]
     candidates = [
         *(named[probe.name] for probe in probes),
         *(said[probe.name] for probe in sentences),
-        *(said[probe.name] for probe, _ in known),
+        *(said[probe.name] for probe, _ in held),
         *patterns,
     ]
     blocks = {candidate.name: candidate.block for candidate in candidates}
@@ -450,8 +452,8 @@ def examine(
     columns = [candidate.columns for candidate in candidates]
     absorbed = {}
     for name in active:
-        rest, basis = design.without(name)
-        absorbed[name] = _Absorbed(rest, basis, design.products(columns, basis).T)
+        projector, basis = design.without(name)
+        absorbed[name] = _Absorbed(projector, basis, design.products(columns, basis).T)
     exact = sum(len(probe.widths) for probe in probes)  # rivals may be the same to the last digit
     scale = result.noise_scale
     bare = ScoreSpace.projected(design.projector, names, widths, columns, scale=scale, exact=exact)
@@ -468,7 +470,7 @@ def examine(
         table=space.table(scores, square, space.smallest_p(rng)),
         probes=probes,
         sentences=sentences,
-        parts=known,
+        parts=held,
         patterns=[pattern.name for pattern in patterns],
         chi2=result.chi2,
         dof=result.dof,
@@ -494,9 +496,9 @@ def _common_mode(space: ScoreSpace, design: Design, rms: float) -> Vector:
 
 
 def most_points(calset: CalibrationSet, instrument: Instrument, amplitudes: int) -> int:
-    """Number of field points that are looked at: as many as rows, and numbers in all columns, may be.
+    """Number of examined field points, from the limits on rows and on numbers in all columns.
 
-    `amplitudes` are those of the effects that are examined.
+    `amplitudes` counts those of all candidates.
     """
     columns = amplitudes + number_of_columns(calset, instrument)
     exposures = len(calset.exposures)

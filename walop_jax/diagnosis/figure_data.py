@@ -4,8 +4,8 @@ Its tables are those of `_TABLES` (docs: files). Columns of FIELD and CURVES wit
 standard deviations of one intensity as N_ERR gives them. Values of FIELD in a combination, BEFORE and AFTER, have
 standard deviation 1 (where the flux is free √(1 − 1/K) with K cameras, 0.87 of four) if there is noise alone.
 
-_Combination  r_pk = Σ_e w_e r_pek / (Σ_e w_e² over the used ones)^½ keeps unit noise. The weights w are those of what
-             can be said in words (a harmonic of the polariser angle at its best phase, the mean of a kind of
+_Combination  r_pk = Σ_e w_e r_pek / (Σ_e w_e² over the used ones)^½ keeps unit noise. The weights w are those of
+             the named combination (a harmonic of the polariser angle at its best phase, the mean of a kind of
              exposures, a trend with time) that holds most of the power of the disagreement; if all of them hold less
              than `WORDS_FROM` of what the best weights do (principal component over the exposures), the latter.
 Curve        c_ek = Σ_p v_pk r_pek / Σ_p v_pk², with v the field pattern of the difference in that camera, rms 1: a
@@ -48,7 +48,7 @@ _SIGMA = "(data - model) in standard deviations, a value for each camera"
 _CAMERAS = Column("float", width=None)
 _TABLES: Mapping[str, Mapping[str, tuple[Column, str]]] = {
     "LADDER": {
-        "MODEL": (Column("str"), "the starting model, or what was added to it"),
+        "MODEL": (Column("str"), "the starting model, or the addition to it"),
         "CHI2": (Column("float"), "chi squared of data and priors"),
         "DOF": (Column("int"), "degrees of freedom"),
     },
@@ -61,7 +61,7 @@ _TABLES: Mapping[str, Mapping[str, tuple[Column, str]]] = {
     },
     "COMPARISONS": {
         "COMPARISON": (Column("int"), "number, 0: starting model and final model"),
-        "EFFECT": (Column("str"), "what was added"),
+        "EFFECT": (Column("str"), "the addition"),
         "COMBINATION": (Column("str"), "combination of exposures of FIELD"),
         "HARMONIC": (Column("int"), "of the polariser angle; -1: none"),
     },
@@ -94,10 +94,10 @@ _TABLES: Mapping[str, Mapping[str, tuple[Column, str]]] = {
 
 @dataclasses.dataclass(frozen=True)
 class ResidualComparison:
-    """Residuals without and with something, as maps over the field and as curves over the exposures.
+    """Residuals without and with an effect, as maps over the field and as curves over the exposures.
 
     `effect` is empty where the starting model is compared with the final one. `combination` (plain ASCII) and
-    `harmonic` say which combination of the exposures the maps show; the module says what the columns are.
+    `harmonic` identify the combination of the exposures in the maps; the module docstring defines the columns.
     """
 
     effect: str
@@ -115,20 +115,20 @@ class ResidualComparison:
 
     @property
     def explained(self) -> PointMap:
-        """Effect on the maps, all other parameters having followed."""
+        """Effect on the maps, with all other parameters refitted."""
         return self.before - self.after
 
     @property
     def curve_explained(self) -> Curve:
-        """Effect on the curves, all other parameters having followed."""
+        """Effect on the curves, with all other parameters refitted."""
         return self.curve_before - self.curve_after
 
 
 @dataclasses.dataclass(frozen=True)
 class DiagnosisFigureData:
-    """Everything that `diagnosis.fits` holds; `comparisons[0]` is of the starting and the final model.
+    """Content of `diagnosis.fits`; `comparisons[0]` is that of the starting and the final model.
 
-    `ladder` and `shares` are the tables of these names, `exposures` the columns of CURVES that say which they are.
+    `ladder` and `shares` are the tables of these names, `exposures` the columns of CURVES that identify them.
     """
 
     points: Points
@@ -168,7 +168,7 @@ def _columns(data: DiagnosisFigureData) -> dict[str, Mapping[str, np.ndarray]]:
     count, many = len(all_of), np.arange(len(all_of))
 
     def stacked(name: str) -> np.ndarray:
-        return np.concatenate([getattr(one, name) for one in all_of])
+        return np.concatenate([getattr(comparison, name) for comparison in all_of])
 
     maps = ("before", "after", "explained", "mean_before", "mean_after", "rms_before", "rms_after")
     return {
@@ -176,9 +176,9 @@ def _columns(data: DiagnosisFigureData) -> dict[str, Mapping[str, np.ndarray]]:
         "SHARES": data.shares,
         "COMPARISONS": {
             "COMPARISON": many,
-            "EFFECT": np.array([one.effect for one in all_of]),
-            "COMBINATION": np.array([in_ascii(one.combination) for one in all_of]),
-            "HARMONIC": np.array([one.harmonic for one in all_of]),
+            "EFFECT": np.array([comparison.effect for comparison in all_of]),
+            "COMBINATION": np.array([in_ascii(comparison.combination) for comparison in all_of]),
+            "HARMONIC": np.array([comparison.harmonic for comparison in all_of]),
         },
         "FIELD": {
             "COMPARISON": np.repeat(many, len(points)),
@@ -202,8 +202,8 @@ def read_figure_data(path: str | os.PathLike[str]) -> DiagnosisFigureData:
     with open_fits(path, again) as opened:
         version = opened.hdus[0].header.get("DIAGVERS")
         if version != DIAGVERS:
-            found = "is missing" if version is None else f"is {version}, this program reads {DIAGVERS}"
-            raise fail(found, file=path, column="DIAGVERS", advice=again)
+            message = "is missing" if version is None else f"is {version}, this program reads {DIAGVERS}"
+            raise fail(message, file=path, column="DIAGVERS", advice=again)
         units = {hdu.name.strip().upper(): hdu for hdu in opened.hdus[1:]}
         tables: dict[str, dict[str, Any]] = {}
         for name, columns in _TABLES.items():
@@ -216,15 +216,15 @@ def _figure_data(tables: Mapping[str, Mapping[str, Any]]) -> DiagnosisFigureData
     field, curves, about = tables["FIELD"], tables["CURVES"], tables["COMPARISONS"]
     comparisons = []
     for number in about["COMPARISON"]:
-        here, there = field["COMPARISON"] == number, curves["COMPARISON"] == number
+        field_rows, curve_rows = field["COMPARISON"] == number, curves["COMPARISON"] == number
         maps = ("before", "after", "mean_before", "mean_after", "rms_before", "rms_after")
         comparisons.append(
             ResidualComparison(
                 effect=str(about["EFFECT"][number]),
                 combination=str(about["COMBINATION"][number]),
                 harmonic=int(about["HARMONIC"][number]),
-                **{name: field[name.upper()][here] for name in maps},
-                **{f"curve_{n}": curves[n.upper()][there] for n in ("before", "error", "after")},
+                **{name: field[name.upper()][field_rows] for name in maps},
+                **{f"curve_{n}": curves[n.upper()][curve_rows] for n in ("before", "error", "after")},
             )
         )
     first, rows = field["COMPARISON"] == 0, curves["COMPARISON"] == 0
@@ -248,7 +248,7 @@ LEAST_COVERAGE = 0.5  # share of Σ w² that the exposures of a point must hold 
 
 @dataclasses.dataclass(frozen=True)
 class _Combination:
-    """Weights of the exposures (norm 1), what they are in words, and the harmonic of the polariser angle or −1."""
+    """Weights of the exposures (norm 1), their description, and the harmonic of the polariser angle or −1."""
 
     words: str
     weight: Weight
@@ -292,8 +292,8 @@ def figure_data(diagnosis: Diagnosis) -> DiagnosisFigureData:
 
 
 def _unnamed_term(diagnosis: Diagnosis) -> bool:
-    known = [*diagnosis.before.model.effect_names, *(step.effect for step in diagnosis.steps)]
-    return FreeForm.name in diagnosis.after.model.effect_names and FreeForm.name not in known
+    names = [*diagnosis.before.model.effect_names, *(step.effect for step in diagnosis.steps)]
+    return FreeForm.name in diagnosis.after.model.effect_names and FreeForm.name not in names
 
 
 def compare_residuals(
@@ -310,9 +310,9 @@ def compare_residuals(
     size = np.sqrt(np.mean(pattern**2, axis=0))
     pattern = np.where(size > 0, pattern / np.where(size > 0, size, 1.0), 1.0)
     power = used.T.astype(float) @ pattern**2
-    known = np.where(power > 0, power, np.nan)
-    curves = [np.einsum("pek,pk->ek", cube, pattern) / known for cube in (before, after)]
-    scatter = np.sqrt(np.einsum("pek,pk->ek", after**2, pattern**2)) / known
+    weight = np.where(power > 0, power, np.nan)
+    curves = [np.einsum("pek,pk->ek", cube, pattern) / weight for cube in (before, after)]
+    scatter = np.sqrt(np.einsum("pek,pk->ek", after**2, pattern**2)) / weight
     rows = used.sum(axis=1, keepdims=True)
     rows = np.where(rows > 0, rows, np.nan)
     return ResidualComparison(
@@ -368,7 +368,7 @@ def _in_words(cube: Cube, used: Used, exposures: Exposures) -> Iterator[_Combina
 
 
 def _ladder(diagnosis: Diagnosis) -> Table:
-    """Starting model, every addition, and the final fit where it is another one than that of the last addition."""
+    """Starting model, every addition, and the final fit where it differs from that of the last addition."""
     final = diagnosis.after
     dof, rungs = diagnosis.before.dof, [("starting model", diagnosis.before.chi2, diagnosis.before.dof)]
     for step in diagnosis.steps:

@@ -1,4 +1,4 @@
-"""Findings of a diagnosis: values, words, where they sit, and the content of `diagnosis.json` (docs: files)."""
+"""Findings of a diagnosis: values, descriptions, locations, and the content of `diagnosis.json` (docs: files)."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from walop_jax.model.effects.change import Change
 
 HARMONICS = (0, 1, 2, 3, 4)
 FIELD_WORDS = ("uniform", "gradient", "quadratic", "cubic", "fourth order")
-DIFFERENT = 0.1  # of the whole: less is no difference
-FEWEST_FREE = 4  # exposures beyond what their settings explain, for a trend to be told
+DIFFERENT = 0.1  # of the total: smaller differences are ignored
+FEWEST_FREE = 4  # degrees of freedom of the exposures beyond their settings, for a trend to be determined
 SHARE = 0.2  # a group is mentioned when it carries this share of the largest
 
 
 def _named(groups: dict[str, float]) -> str:
-    total, most = sum(groups.values()) or 1.0, max(groups.values(), default=0.0)
+    total, largest = sum(groups.values()) or 1.0, max(groups.values(), default=0.0)
     order = sorted(groups.items(), key=lambda group: -group[1])
     shares = ((name, round(value / total, 3)) for name, value in order)
-    least = SHARE * round(most / total, 3)
+    least = SHARE * round(largest / total, 3)
     return ", ".join(f"{name} {100 * share:.0f}%" for name, share in shares if share >= least)
 
 
@@ -88,26 +88,26 @@ def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
 def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
     """Place of a change of the residuals (data rows of `design`), as `where` of diagnosis.json (docs: files).
 
-    None where its shares are those that the same change of every row would have: that is the plan, not the change.
+    None where its shares equal those of a uniform change of all rows: these reflect the plan, not the change.
     """
     cube = design.cube(rows)
     square = cube**2
     e, names = design.fit.calset.exposures, design.fit.model.template.cameras.names
-    by_exposure, seen = square.sum(axis=(0, 2)), design.measured.used.sum(axis=0)
+    by_exposure, point_counts = square.sum(axis=(0, 2)), design.measured.used.sum(axis=0)
 
     def grouped(labels: np.ndarray) -> str | None:
-        found, plan = (
+        shares, plan = (
             {str(label): float(of[labels == label].sum()) for label in np.unique(labels)}
-            for of in (by_exposure, seen)
+            for of in (by_exposure, point_counts)
         )
-        return _differing(found, plan)
+        return _differing(shares, plan)
 
     stood = {prefix: positions_of(e, prefix) for prefix in design.measured.likelihood.plan.moving}
     harmonics, field = _harmonics(design, cube)
     settings = np.unique(
         [e.kind, e.filter, *(at.astype(str) for at in stood.values())], axis=1, return_inverse=True
     )[1]
-    trend = _trend(e, settings.ravel(), np.sqrt(by_exposure / np.maximum(len(names) * seen, 1)))
+    trend = _trend(e, settings.ravel(), np.sqrt(by_exposure / np.maximum(len(names) * point_counts, 1)))
     cameras = dict(zip(names, square.sum(axis=(0, 1)).tolist(), strict=True))
     return {
         "camera": _differing(cameras, dict.fromkeys(names, 1.0)),
@@ -121,16 +121,16 @@ def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
 
 def _differing(groups: dict[str, float], plan: dict[str, float]) -> str | None:
     """Shares of groups in words where a tenth of the whole lies elsewhere than in the plan."""
-    total, whole = sum(groups.values()) or 1.0, sum(plan.values()) or 1.0
-    moved = 0.5 * sum(abs(groups[name] / total - plan[name] / whole) for name in groups)
+    total, plan_total = sum(groups.values()) or 1.0, sum(plan.values()) or 1.0
+    moved = 0.5 * sum(abs(groups[name] / total - plan[name] / plan_total) for name in groups)
     return _named(groups) if moved > DIFFERENT else None
 
 
 def _trend(e: Exposures, settings: Int[np.ndarray, " e"], rms: Float[np.ndarray, " e"]) -> float:
     """Correlation of the rms of exposures with their order in time, among those that a plan has alike.
 
-    What kind, setting and angle of the polariser (first and second harmonic of 2θ) explain of either is taken out: a
-    plan goes through them in order, so that they are not told from time.
+    Both are projected off kind, setting and angle of the polariser (first and second harmonic of 2θ): a plan
+    goes through these in order, so that they are degenerate with time.
     """
     alike = [settings == number for number in np.unique(settings)]
     through = e.clp_in & np.isfinite(e.clp_angle)
@@ -140,15 +140,15 @@ def _trend(e: Exposures, settings: Int[np.ndarray, " e"], rms: Float[np.ndarray,
     base = np.linalg.svd(columns, full_matrices=False)
     base = base[0][:, base[1] > 1e-9 * base[1][0]]
     order = np.argsort(np.argsort(e.mjd)).astype(float)
-    left = [one - base @ (base.T @ one) for one in (order, rms)]
-    size = [float(np.linalg.norm(one)) for one in left]
+    residuals = [column - base @ (base.T @ column) for column in (order, rms)]
+    size = [float(np.linalg.norm(column)) for column in residuals]
     free = len(e) - base.shape[1]
     if free < FEWEST_FREE or size[0] < 1e-9 * len(e) or size[1] < DIFFERENT * float(np.linalg.norm(rms)):
         return 0.0
-    return float(left[0] @ left[1]) / (size[0] * size[1])
+    return float(residuals[0] @ residuals[1]) / (size[0] * size[1])
 
 
-# -------------------------------------------------------------------------------------------------------- what is found
+# ------------------------------------------------------------------------------------------------------------- findings
 
 Outcome = Literal["consistent", "effect_found", "unexplained"]
 Cube = Float[np.ndarray, "p e k"]
@@ -160,15 +160,15 @@ def _no_cube() -> Cube:
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """One effect that was found, added and confirmed; `parameters` hold (value, sigma, unit).
+    """One identified, added and confirmed effect; `parameters` hold (value, sigma, unit).
 
     `score` and `p_value` (corrected for all that was tried) are of the linear test, `log_bayes` of the refit.
     `far` are amplitudes that lie beyond what their prior allows, in its widths: the data have refuted that prior.
     `change_of_qu` is the largest change that adding it makes to calibrated q or u of a star with p ≤ 5 % at any field
     point, `robust_ratio` the errors of its parameters when every exposure may have a disturbance of its own, over
     the errors stated. `choices` are discrete (which camera, which star), `alternatives` other shapes of the same
-    effect that explain the data as well. `equivalent` are the effects that this data set cannot tell from it,
-    `separation` how far (σ) each rival stays from it. `residual_before` and `residual_after` are the residuals
+    effect that explain the data as well. `equivalent` are the effects indistinguishable from it in this data set,
+    `separation` is the distance (σ) of each rival from it. `residual_before` and `residual_after` are the residuals
     (data − model, in standard deviations as given; point, exposure, camera) without and with the effect at the time it
     was added; where another name has been dropped since, they and χ² are of fits without that name. `told` are the
     sentences of an effect without a name (`described`) with amplitude and error, `nameless` those that are not
@@ -201,12 +201,12 @@ class Step:
 
     @property
     def confirmed(self) -> bool:
-        """True if data that took no part in the fit agree better with the effect than without."""
+        """True if held-out data agree better with the effect than without."""
         return self.heldout_after < self.heldout_before
 
     @property
     def negligible(self) -> bool:
-        """True if the effect hardly matters for calibrated q and u."""
+        """True if the effect is negligible for calibrated q and u."""
         return self.change_of_qu < thresholds.NEGLIGIBLE
 
 
@@ -231,10 +231,10 @@ class Unexplained:
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """A change of the description that was tried.
+    """A trial change of the description.
 
-    `left` is what it leaves of the squared residuals behind one linear step, over what the description given leaves,
-    and `better_by` the gain in χ², data and priors, when all is fitted (NaN where that was not done).
+    `left` is the ratio of squared residuals after one linear step, with the change and without it,
+    and `better_by` the gain in χ², data and priors, when all is fitted (NaN: not fitted).
     """
 
     change: str
@@ -247,7 +247,7 @@ class Diagnosis(Drawn):
     """Effects that a model lacks, according to one calibration set.
 
     `candidates` are (effect, score, corrected p) in the first examination; `before` is the fit of the model given,
-    `after` that of the extended one; `remaining_p` is the significance of what is left at the end. `choices` are other
+    `after` that of the extended one; `remaining_p` is the global p of the final residuals. `choices` are other
     descriptions of the instrument that were tried, the best first; none where nothing, or only a name, was missing.
     `noise_scale` is the scatter of what no candidate explains over what N_ERR says, `noise_p` the chance that noise of
     the stated size scatters as much. `classes` are significant effects of the first examination with those that
@@ -282,33 +282,33 @@ class Diagnosis(Drawn):
     descriptions: int = 0
 
     def why(self, name: str) -> str:
-        """Why an effect, a description or a change of the instrument was not named, with the numbers.
+        """Reasons for which an effect, a description or a change of the instrument was not named, with numbers.
 
         ValueError, with the nearest names, for what is none of them.
         """
         return why(document(self), name)
 
     def calibration(self) -> Calibration:
-        """The calibration of the extended model: its mean over what these data cannot tell apart, with its spread."""
+        """The calibration of the extended model: mean over indistinguishable models, with their spread."""
         return Calibration.from_fit(self.after)
 
     @property
     def caution(self) -> str:
         """Caution about these findings; empty when there is none."""
-        parts = []
+        cautions = []
         if self.ended:
-            parts.append(
+            cautions.append(
                 f"the search ended after {self.ended} with this model, the best so far: allow more minutes, if it was "
                 "you who set them, or start from it as --model"
             )
         looked_at = len(self.after.calset.points)
         if looked_at < self.points:
-            parts.append(
+            cautions.append(
                 f"{looked_at} of {self.points} field points were looked at, and fitted: refit all of them with the "
                 "model found"
             )
         if len(self.steps) > thresholds.MOST_NAMES:
-            parts.append(
+            cautions.append(
                 f"{len(self.steps)} names were needed: something that is not in the catalogue can look like several "
                 "that are"
             )
@@ -316,39 +316,39 @@ class Diagnosis(Drawn):
             f"{s.effect}.{name} ({widths:.0f} widths)" for s in self.steps for name, widths in s.far.items()
         ]
         if far:
-            parts.append(f"far beyond its prior, which was widened: {', '.join(far)}")
+            cautions.append(f"far beyond its prior, which was widened: {', '.join(far)}")
         weak = [s.effect for s in self.steps if s.robust_ratio > thresholds.LARGEST_ROBUST_RATIO]
         if weak:
-            parts.append(
+            cautions.append(
                 f"errors of {', '.join(weak)} are too small by more than a factor "
                 f"{thresholds.LARGEST_ROBUST_RATIO:g} if single exposures have disturbances of their own"
             )
-        return "; ".join(parts)
+        return "; ".join(cautions)
 
     def to_table(self) -> Any:
-        """The parameters of all effects that were found, as an astropy table."""
-        found = [(s, name, *entry) for s in self.steps for name, entry in s.parameters.items()]
+        """The parameters of all identified effects, as an astropy table."""
+        rows = [(s, name, *entry) for s in self.steps for name, entry in s.parameters.items()]
         return astropy_table(
             {
-                "EFFECT": (np.array([s.effect for s, *_ in found], "U32"), "", "effect"),
-                "PARAMETER": (np.array([name for _, name, *_ in found], "U96"), "", "its parameter"),
-                "VALUE": (np.array([v for _, _, v, _, _ in found], float), "", "fitted value"),
-                "SIGMA": (np.array([s for _, _, _, s, _ in found], float), "", "standard error"),
-                "UNIT": (np.array([u for *_, u in found], "U16"), "", "unit of the numbers of this row"),
-                "P_VALUE": (np.array([s.p_value for s, *_ in found], float), "", "corrected for all tried"),
+                "EFFECT": (np.array([s.effect for s, *_ in rows], "U32"), "", "effect"),
+                "PARAMETER": (np.array([name for _, name, *_ in rows], "U96"), "", "its parameter"),
+                "VALUE": (np.array([v for _, _, v, _, _ in rows], float), "", "fitted value"),
+                "SIGMA": (np.array([s for _, _, _, s, _ in rows], float), "", "standard error"),
+                "UNIT": (np.array([u for *_, u in rows], "U16"), "", "unit of the numbers of this row"),
+                "P_VALUE": (np.array([s.p_value for s, *_ in rows], float), "", "corrected for all tried"),
             },
             {"VERDICT": self.verdict},
         )
 
     def _found(self) -> str:
-        """Names of what was added to the starting model, and whether something without a name is left."""
+        """Names of the additions to the starting model, with a note on an unidentified remainder."""
         names = [step.effect for step in self.steps] + ["something without a name"] * (
             self.unexplained is not None
         )
         return ", ".join(names) or "nothing beyond the starting model"
 
     def display(self) -> Display:
-        """The verdict, and what was found."""
+        """The verdict and the findings."""
         rows = []
         for step in self.steps:
             entries: dict[str, Any] = {name: (value, 0.0, "") for name, value in step.choices.items()}
@@ -410,7 +410,7 @@ def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
 
 # ------------------------------------------------------------------------------------------ as plain data
 
-_ALIKE, _CLASSES = 6, 3  # names that look alike, and groups of them, that are printed: the file has all
+_ALIKE, _CLASSES = 6, 3  # printed indistinguishable names, and groups of them: the file has all
 
 
 def _number(value: float) -> float | None:
@@ -428,61 +428,61 @@ def _step(step: Step) -> dict[str, Any]:
     near = sorted(step.separation.items(), key=lambda s: s[1])
     return {name: getattr(step, name) for name in _AS_THEY_ARE} | {
         "parameters": {n: {"value": v, "sigma": s, "unit": unit} for n, (v, s, unit) in entries.items()},
-        "sentences": [_sentence(*one) for one in step.told],
+        "sentences": [_sentence(*entry) for entry in step.told],
         "change_of_qu": _number(step.change_of_qu),
         "robust_error_ratio": _number(step.robust_ratio),
         "separation_sigma": {name: value for name, value in near if math.isfinite(value)},
     }
 
 
-def _members(one: ClassOf) -> dict[str, Any]:
+def _members(addition: ClassOf) -> dict[str, Any]:
     return {
-        "added": one.added,
-        "members": [{"name": m.name, "probability": m.probability} for m in one.members],
-        "spread_of_p": one.spread,
-        "stated_error_of_p": one.stated,
-        "farthest_element_sigma": one.off,
+        "added": addition.added,
+        "members": [{"name": m.name, "probability": m.probability} for m in addition.members],
+        "spread_of_p": addition.spread,
+        "stated_error_of_p": addition.stated,
+        "farthest_element_sigma": addition.off,
     }
 
 
-def sentences(found: Mapping[str, Any]) -> Iterator[str]:
-    """Sentences beside the numbers of a diagnosis, from the content of diagnosis.json: `print`, the command and the
-    page say the same."""
-    for step in found["steps"]:
+def sentences(content: Mapping[str, Any]) -> Iterator[str]:
+    """Sentences beside the numbers of a diagnosis, from the content of diagnosis.json: the same in `print`, the command
+    and the page."""
+    for step in content["steps"]:
         yield from _of_step(step)
-    left = found.get("unexplained")
-    if left:
-        yield left["description"]
-        if left.get("free_form"):
+    remainder = content.get("unexplained")
+    if remainder:
+        yield remainder["description"]
+        if remainder.get("free_form"):
             yield (
-                f"added as a free-form term ({', '.join(left['free_form'])}): χ² {left['chi2_before']:.1f} → "
-                f"{left['chi2_after']:.1f}"
+                f"added as a free-form term ({', '.join(remainder['free_form'])}): χ² {remainder['chi2_before']:.1f} → "
+                f"{remainder['chi2_after']:.1f}"
             )
-    choices = found.get("choices", ())
-    fitted = [one for one in choices if one["better_by"] is not None]
+    choices = content.get("choices", ())
+    fitted = [choice for choice in choices if choice["better_by"] is not None]
     if choices:
         yield f"{len(choices)} other descriptions of the instrument were compared, {len(fitted)} of them fitted"
-    for one in fitted:
-        sense = "smaller" if one["better_by"] > 0 else "larger"
-        yield f"{one['change']}: χ² {sense} by {abs(one['better_by']):.4g}"
-    for alike in found.get("classes", ())[:_CLASSES]:
+    for choice in fitted:
+        sense = "smaller" if choice["better_by"] > 0 else "larger"
+        yield f"{choice['change']}: χ² {sense} by {abs(choice['better_by']):.4g}"
+    for alike in content.get("classes", ())[:_CLASSES]:
         yield (
             f"before anything was added {alike['effect']} was significant too; these data cannot distinguish it from "
             f"{some(alike['equivalent'], _ALIKE)}; what would: {alike['separated_by']}"
         )
-    if found.get("cannot_be_tested"):
-        yield f"not tested, since these data cannot show it: {', '.join(found['cannot_be_tested'])}"
-    if found.get("caution"):
-        yield found["caution"]
+    if content.get("cannot_be_tested"):
+        yield f"not tested, since these data cannot show it: {', '.join(content['cannot_be_tested'])}"
+    if content.get("caution"):
+        yield content["caution"]
 
 
 def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
-    """The sentences about one effect that was found."""
+    """The sentences about one identified effect."""
     name = step["effect"]
-    for told in step.get("sentences", ()):
-        yield f"{told['words']}: {told['tested_by']}"
-    for other in step.get("alternatives", ()):
-        yield f"{name}: equally consistent with {other}"
+    for sentence in step.get("sentences", ()):
+        yield f"{sentence['words']}: {sentence['tested_by']}"
+    for alternative in step.get("alternatives", ()):
+        yield f"{name}: equally consistent with {alternative}"
     held = ""
     if step.get("heldout_before") is not None and step.get("heldout_after") is not None:
         means = f"{step['heldout_before']:.3g} → {step['heldout_after']:.3g}"
@@ -539,7 +539,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
             for choice in diagnosis.choices
         ],
         "classes": diagnosis.classes,
-        "members": [_members(one) for one in diagnosis.members],
+        "members": [_members(addition) for addition in diagnosis.members],
         "cannot_be_tested": diagnosis.untestable,
         "chi2_per_dof_before": diagnosis.before.chi2 / max(diagnosis.before.dof, 1),
         "chi2_per_dof_after": diagnosis.after.chi2 / max(diagnosis.after.dof, 1),
@@ -547,7 +547,9 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
             {
                 "p_value": turn.p_value,
                 "added": turn.added,
-                "asked": [{**one._asdict(), "evidence": _number(one.evidence)} for one in turn.asked],
+                "asked": [
+                    {**reason._asdict(), "evidence": _number(reason.evidence)} for reason in turn.asked
+                ],
             }
             for turn in diagnosis.rounds
         ],

@@ -1,4 +1,4 @@
-"""Sentences on all that an instrument may lack: kind × place × dependence, from its own train and its exposures.
+"""Sentences on all possible omissions of an instrument model: kind × place × dependence, from train and exposures.
 
 A *group* of sentences is one candidate of the score test: a linear retarder has two axes, a harmonic a cosine and a
 sine, a gradient two directions.
@@ -8,10 +8,10 @@ sine, a gradient two directions.
                   the polariser, another moving element, a wave plate, a camera, an arm, a source
     dependence    those that `Kind.grows` names of a kind at a place: patterns over the field, each with every
                   dependence on wavelength, time, temperature, hour angle, angles, exposures and counts
-                  (`Combinations`), of those that the exposures can tell apart (`Dependences`)
+                  (`Combinations`), of those that the exposures can distinguish (`Dependences`)
 
-Each sentence pays the logarithm of their number; longer ones pay by their evidence. `beside_names` tells which
-groups an effect of the catalogue already is, or holds.
+The evidence of each sentence is reduced by the logarithm of their number. `beside_names` finds the groups that are
+equivalent to an effect of the catalogue, or part of one.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.slots import acts
 from walop_jax.model.specification import effect_context
 
-ROUNDED = 1e-4  # hours, of times that are written into a description
+ROUNDED = 1e-4  # hours, of times in descriptions
 
 
 def sentences(instrument: Instrument, exposures: Exposures, points: int) -> tuple[Probe, ...]:
@@ -61,11 +61,11 @@ def _probe(group: tuple[Sentence, ...]) -> Probe:
     return Probe("; ".join(sentence.text for sentence in group), Described, members)
 
 
-# ----------------------------------------------------------------------------------------- all that may be missing
+# --------------------------------------------------------------------------------------------- possible omissions
 
 
 class Hypotheses(NamedTuple):
-    """All that a model may lack: effects that fit the instrument, their probes, and sentences.
+    """All possible omissions of a model: effects that fit the instrument, their probes, and sentences.
 
     `sentences` are those that no effect holds, `parts` those that effects hold in part, with the holders, `every` are
     all of them, those that are an effect by another name as well.
@@ -86,18 +86,18 @@ class Hypotheses(NamedTuple):
 def hypotheses(
     catalogue: Sequence[EffectKind], instrument: Instrument, exposures: Exposures, points: int
 ) -> Hypotheses:
-    """The one list of what a diagnosis looks for, the verdict of a fit is held against, and limits are given beside."""
-    context, every = effect_context(instrument, exposures), sentences(instrument, exposures, points)
+    """The one list of candidates of a diagnosis, of the verdict on a fit, and of detection limits."""
+    context, all_probes = effect_context(instrument, exposures), sentences(instrument, exposures, points)
     effects = applicable(catalogue, context, instrument)
-    alone, parts = beside_names(every, effects, context, instrument)
-    return Hypotheses(effects, tuple(probes(effects, context)), alone, parts, every)
+    alone, partial = beside_names(all_probes, effects, context, instrument)
+    return Hypotheses(effects, tuple(probes(effects, context)), alone, partial, all_probes)
 
 
 # ------------------------------------------------------------------------------------- names that are sentences
 
 
 def beside_names(
-    every: Sequence[Probe], catalogue: Sequence[EffectKind], context: Context, instrument: Instrument
+    all_probes: Sequence[Probe], catalogue: Sequence[EffectKind], context: Context, instrument: Instrument
 ) -> tuple[list[Probe], list[tuple[Probe, frozenset[EffectKind]]]]:
     """The groups that are no effect of a catalogue by another name: those that none holds, and parts, with the holders.
 
@@ -108,37 +108,37 @@ def beside_names(
         for group in effect.probes(context):
             texts = frozenset(group[0].in_sentences(instrument))
             if len(texts) <= sum(
-                np.size(getattr(one, name)) for one in group for name in effect.amplitudes()
+                np.size(getattr(member, name)) for member in group for name in effect.amplitudes()
             ):
                 effects_as_sentences.append((texts, effect))
-    alone, parts = [], []
-    for probe in every:
+    alone, partial = [], []
+    for probe in all_probes:
         texts_of_probe = frozenset(said_by(probe))
         holders = frozenset(effect for texts, effect in effects_as_sentences if texts > texts_of_probe)
         if any(texts == texts_of_probe for texts, _ in effects_as_sentences):
             continue
         if holders:
-            parts.append((probe, holders))
+            partial.append((probe, holders))
         else:
             alone.append(probe)
-    return alone, parts
+    return alone, partial
 
 
 def retimed(sentence: Sentence, exposures: Exposures, end: int) -> list[Sentence]:
-    """The same with another start (`end` 0) or stop (1), at every time as near as others that are looked at first.
+    """The same with another start (`end` 0) or stop (1), at all times within the spacing of the first search.
 
-    None for what does not start or stop between two exposures.
+    Empty for a sentence without start and stop between two exposures.
     """
     times = starts_of_steps(exposures)
     if [factor.form for factor in sentence.grows_with] != ["hours"]:
         return []
-    given = [float(text) for text in sentence.grows_with[0].given]
-    at = int(np.argmin(np.abs(times - given[end])))
-    if abs(times[at] - given[end]) > ROUNDED:
+    hours = [float(text) for text in sentence.grows_with[0].given]
+    at = int(np.argmin(np.abs(times - hours[end])))
+    if abs(times[at] - hours[end]) > ROUNDED:
         return []
     reach = -(-len(times) // STEPS)
     near = times[max(at - reach, 0) : at + reach + 1]
-    spans = [(time, given[1]) if end == 0 else (given[0], time) for time in near]
+    spans = [(time, hours[1]) if end == 0 else (hours[0], time) for time in near]
     return [dataclasses.replace(sentence, factors=(between(*span),)) for span in spans if span[0] < span[1]]
 
 
@@ -149,7 +149,7 @@ Mask = Bool[np.ndarray, " e"]
 
 
 class Subject(NamedTuple):
-    """Changes that have the same dependences, by what is tried together (`Combinations.among`).
+    """Changes with the same dependences, by the groups of a joint trial (`Combinations.among`).
 
     They may grow with the angles of elements of some `prefixes`, and are seen in exposures that are `inside` (None: in
     all of them).
@@ -162,8 +162,8 @@ class Subject(NamedTuple):
     @classmethod
     def of(cls, *bases: Base, inside: Mask | None = None, **among: Sequence[Base]) -> Subject:
         """Each alone, and all of several together."""
-        every = [tuple(itertools.chain(*bases))][: len(bases) - 1]
-        return cls({"alone": bases, "all": every, **among}, (), inside)
+        together = [tuple(itertools.chain(*bases))][: len(bases) - 1]
+        return cls({"alone": bases, "all": together, **among}, (), inside)
 
 
 def _base(kinds: Iterable[str], where: str, place: str, origin: str = "") -> Base:
@@ -181,14 +181,14 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
         for over, along, among in KINDS[first.kind].grows(instrument, first).tried:
             patterns = [PATTERNS[name] for name in over if over_field or name == "even"]
             factors = itertools.chain(*map(shown.of, along))
-            every = itertools.chain(*(bases.get(name, ()) for name in among))
-            for group, pattern, base in itertools.product(factors, patterns, every):
+            alternatives = itertools.chain(*(bases.get(name, ()) for name in among))
+            for group, pattern, base in itertools.product(factors, patterns, alternatives):
                 pairs = [tuple(filter(None, pair[::order])) for pair in itertools.product(group, pattern)]
                 yield tuple(sentence.times(*pair) for sentence in base for pair in pairs)
 
 
 def _subjects(instrument: Instrument, exposures: Exposures, *, over_field: bool) -> Iterator[Subject]:
-    """All changes that an instrument has a place for, and exposures can show."""
+    """All changes that fit the instrument and are visible in the exposures."""
     polariser, sky = instrument.polariser, ~exposures.clp_in
     groups = [group for group in GROUPS if over_field or not group[0].endswith(("radial", "diagonal"))]
     for places in _places(instrument, exposures):
@@ -218,7 +218,7 @@ def _subjects(instrument: Instrument, exposures: Exposures, *, over_field: bool)
 
 
 def _places(instrument: Instrument, exposures: Exposures) -> Iterator[list[tuple[str, str]]]:
-    """Places that differ in what acts on polarisation: preposition and element; those of the same name in all arms."""
+    """Places between elements that act on polarisation: preposition and element; equal names in all arms together."""
     train, polariser, arms = list(instrument.train()), instrument.polariser, instrument.arms
     behind = train[len(instrument.telescope()) + (polariser is not None) :]
     if polariser is not None:
@@ -238,18 +238,22 @@ def _places(instrument: Instrument, exposures: Exposures) -> Iterator[list[tuple
 
 
 def _of_plates(instrument: Instrument, exposures: Exposures) -> Iterator[Subject]:
-    each = {place: instrument.element(place) for place in instrument.places(WavePlate)}
-    seen = {place: exposures.position(plate.moves).inside for place, plate in each.items() if plate.moves}
-    plates = {place: plate for place, plate in each.items() if place not in seen or seen[place].any()}
-    if fixed := [place for place in plates if place not in seen]:
+    every_plate = {place: instrument.element(place) for place in instrument.places(WavePlate)}
+    inside = {
+        place: exposures.position(plate.moves).inside for place, plate in every_plate.items() if plate.moves
+    }
+    plates = {
+        place: plate for place, plate in every_plate.items() if place not in inside or inside[place].any()
+    }
+    if fixed := [place for place in plates if place not in inside]:
         yield Subject.of(*(_base(("axis",), "of", place) for place in fixed))
-    for place in [place for place in plates if place in seen]:
-        yield Subject.of(_base(("axis",), "of", place), inside=seen[place])
+    for place in [place for place in plates if place in inside]:
+        yield Subject.of(_base(("axis",), "of", place), inside=inside[place])
     for place, plate in plates.items():
         layers = [f"{place}.{layer.name}" for layer in plate.layers]  # pyright: ignore[reportAttributeAccessIssue]
         yield Subject.of(tuple(Sentence("thickness", "of", layer) for layer in layers))
-        for kind, some in (("axis", layers[1:]), ("cut", layers)):
-            yield from (Subject.of(_base((kind,), "of", layer)) for layer in some)
+        for kind, affected in (("axis", layers[1:]), ("cut", layers)):
+            yield from (Subject.of(_base((kind,), "of", layer)) for layer in affected)
     if plates and varies(exposures.temp):
         yield Subject.of(tuple(Sentence("thermal", "of", place) for place in plates))
     for pair in probed_gaps(instrument.units) if plates else ():

@@ -1,10 +1,10 @@
-"""Mistakes that the data behind a fit would not show: of the set, of the cameras, and effects that the model has not.
+"""Errors undetectable in the data behind a fit: of the set, of the cameras, and effects missing from the model.
 
 A number that is wrong by h moves the parameters by δθ = R⁻¹QᵀC h (J = QR), and is found where h² |PC|² reaches the
 noncentrality of its test (`stated_conditions`), with a probability of 99 %. It hides at that size, or at the largest
-plausible one, for an effect the width of its prior. What the data hold no information on at all hides at that as well:
-P C = 0, or no exposure that could show it. Stars are wrong by what it does to their own light less what δθ makes up for
-(`calibration.could_hide`); what does neither cannot matter, and is left out.
+plausible one, for an effect the width of its prior. So does a number without any information in the data:
+P C = 0, or no sensitive exposure. The error of stars is the effect on their own light less the compensation by δθ
+(`calibration.could_hide`); without either of these a mistake has no consequence and is left out.
 
 Symbols     C derivative of the residuals; P projection off the free parameters, Q, R of their Jacobian J
 Limits      One mistake at a time, one amplitude of an effect at a time, to first order. Effects of many places or
@@ -35,14 +35,14 @@ from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Effect
 from walop_jax.model.instrument import Instrument
 
-STAR_POINTS = 16  # field points at which stars are asked what a mistake does to them
-MOST_HIDDEN = 12  # mistakes that a product keeps: what a star needs for each is a product of two vectors
-_FAINT = 0.5  # of the worst mistake, below which an effect that the data measure is not kept
-_NOTHING = 1e-9  # change of the analysis vectors that is none
+STAR_POINTS = 16  # field points at which the errors of stars are computed
+MOST_HIDDEN = 12  # mistakes in a product: each costs a star one product of two vectors
+_FAINT = 0.5  # of the worst mistake, below which a measured effect is dropped
+_NOTHING = 1e-9  # smallest change of the analysis vectors
 
 
 class _Mistake(NamedTuple):
-    """One number at the size at which it could hide, and what the parameters take up of it.
+    """One number at its largest undetected size, and its projection on the parameters.
 
     `informed`: whether the data hold information on it. Of an effect, at its size, `change` is what it does to the
     instrument matrix at the field points, and it `acts` on starlight if it does anything.
@@ -61,7 +61,7 @@ class _Mistake(NamedTuple):
 
 
 def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
-    """Single mistakes as large as the data would just have shown at 99 % probability, and what they do.
+    """Single mistakes at the size detected with 99 % probability, and their consequences.
 
     Kept are those that move the parameters by more than their standard errors, and effects that act on starlight; first
     those that make q and u of stars most wrong, in the median over the field. An effect that data show below its usual
@@ -70,38 +70,36 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     fit = design.fit
     usual = usual_exposure(fit.calset, fit.model.template)
     instrument = fit.model.instrument(fit.values)
-    found = list(_mistakes(design, singles, usual))
-    along = np.array([one.along for one in found]).reshape(len(found), -1).T
+    mistakes = list(_mistakes(design, singles, usual))
+    along = np.array([m.along for m in mistakes]).reshape(len(mistakes), -1).T
     changes = (fit.model.selection() @ design.taken_up(along)).T
-    turns = np.array([0.0 if one.effect is None else abs(turn_of(instrument, one.effect)) for one in found])
-    errors = _errors_of_stars(design, found, changes, usual) + 2.0 * LARGEST_P * turns
+    turns = np.array([0.0 if m.effect is None else abs(turn_of(instrument, m.effect)) for m in mistakes])
+    errors = _errors_of_stars(design, mistakes, changes, usual) + 2.0 * LARGEST_P * turns
     least, strong = _FAINT * errors.max(initial=0.0), np.linalg.norm(along, axis=0) > 1.0
     best: dict[str, tuple[int, bool, bool]] = {}
     for i in np.argsort(-errors, kind="stable").tolist():
-        one = found[i]
-        acts = one.acts or bool(turns[i] > 0.0)
+        m = mistakes[i]
+        acts = m.acts or bool(turns[i] > 0.0)
         # In the usual setting it is out of the beam; stars that are seen through it have it.
-        elsewhere = not (acts or one.informed or one.effect is None) and bool(
-            moves_with(one.effect, instrument)
-        )
-        if (errors[i] > least or not one.informed) if acts else (strong[i] or elsewhere):
-            best.setdefault(one.name, (i, acts, elsewhere))
-    unseen = {i for i, acts, _ in best.values() if acts and not found[i].informed}
+        elsewhere = not (acts or m.informed or m.effect is None) and bool(moves_with(m.effect, instrument))
+        if (errors[i] > least or not m.informed) if acts else (strong[i] or elsewhere):
+            best.setdefault(m.name, (i, acts, elsewhere))
+    unseen = {i for i, acts, _ in best.values() if acts and not mistakes[i].informed}
     always = unseen | {i for i, _, elsewhere in best.values() if elsewhere}
-    others = [i for i, *_ in best.values() if i not in always][:MOST_HIDDEN]
-    order = sorted([*always, *others], key=lambda i: -errors[i])
+    further = [i for i, *_ in best.values() if i not in always][:MOST_HIDDEN]
+    order = sorted([*always, *further], key=lambda i: -errors[i])
     acting = {i for i, acts, elsewhere in best.values() if acts or elsewhere}
-    some = [found[i] for i in order]
+    selected = [mistakes[i] for i in order]
     return Hidden(
-        names=tuple(one.name for one in some),
-        sizes=tuple(one.size for one in some),
-        units=tuple(one.unit for one in some),
+        names=tuple(m.name for m in selected),
+        sizes=tuple(m.size for m in selected),
+        units=tuple(m.unit for m in selected),
         changes=changes[order],
-        kinds=tuple(one.kind for one in some),
-        remedies=tuple(one.shown_by for one in some),
+        kinds=tuple(m.kind for m in selected),
+        remedies=tuple(m.shown_by for m in selected),
         acts=tuple(
-            as_text(one.effect) if one.effect is not None and i in acting else ""
-            for i, one in zip(order, some, strict=True)
+            as_text(m.effect) if m.effect is not None and i in acting else ""
+            for i, m in zip(order, selected, strict=True)
         ),
         measured=tuple(i not in unseen for i in order),
     )
@@ -112,23 +110,23 @@ def _mistakes(design: Design, singles: Singles, usual: int) -> Iterator[_Mistake
     of_stars = _Starlight(design, singles.asked, usual)
     p, first = local_p(thresholds.ALARM, len(singles.testable)), 0
     shown = set()
-    for one in singles.rivals:
-        count = len(one.candidate.widths)
+    for rival in singles.rivals:
+        count = len(rival.candidate.widths)
         at = slice(first, first + count)
         first += count
-        plausible, alive = np.broadcast_to(one.plausible, count), singles.alive[at]
+        plausible, alive = np.broadcast_to(rival.plausible, count), singles.alive[at]
         if not plausible.any():
             continue
-        least = noncentrality(p, max(singles.table[one.candidate.name].rank, 1), thresholds.PROBABILITY)
-        left = np.where(alive, singles.left[at], 1.0)
-        sizes = np.where(alive, np.minimum(plausible, np.sqrt(least / left)), plausible)
+        least = noncentrality(p, max(singles.table[rival.candidate.name].rank, 1), thresholds.PROBABILITY)
+        information = np.where(alive, singles.left[at], 1.0)
+        sizes = np.where(alive, np.minimum(plausible, np.sqrt(least / information)), plausible)
         along = singles.along[:, at] * sizes
-        if one.probe is not None:
-            shown.add(one.probe.name)
-            yield from of_stars.effects(one.probe, sizes, along, alive)
+        if rival.probe is not None:
+            shown.add(rival.probe.name)
+            yield from of_stars.effects(rival.probe, sizes, along, alive)
         else:
-            kind = EFFECT if one.stated is None else DATA
-            number = (one.candidate.name, kind, float(sizes[0]), one.unit, one.shown_by)
+            kind = EFFECT if rival.stated is None else DATA
+            number = (rival.candidate.name, kind, float(sizes[0]), rival.unit, rival.shown_by)
             yield _Mistake(*number, along[:, 0], bool(alive[0]))
     for probe in of_stars.asked:
         if probe.name not in shown:
@@ -146,13 +144,15 @@ class _Starlight:
         self.instrument = self.fit.model.instrument(self.fit.values)
         self.setting = first_setting(calset, self.instrument, exposure)
         columns = design.columns
-        changes = {p.name: [one for m in p.group for one in m.first_order(template)] for p in self.asked}
-        known = [name for name, some in changes.items() if some and all(map(columns.has, some))]
+        changes = {
+            p.name: [change for m in p.group for change in m.first_order(template)] for p in self.asked
+        }
+        linear = [name for name, terms in changes.items() if terms and all(map(columns.has, terms))]
         self.vectors, added = added_to_starlight(
-            columns, [one for name in known for one in changes[name]], exposure
+            columns, [change for name in linear for change in changes[name]], exposure
         )
-        ends = np.cumsum([len(changes[name]) for name in known])
-        self.added = dict(zip(known, np.split(added, ends[:-1], axis=-1), strict=True)) if known else {}
+        ends = np.cumsum([len(changes[name]) for name in linear])
+        self.added = dict(zip(linear, np.split(added, ends[:-1], axis=-1), strict=True)) if linear else {}
 
     def effects(
         self,
@@ -168,7 +168,7 @@ class _Starlight:
             if probe.name in self.added:
                 added = self.added[probe.name][..., number] * sizes[number]
                 change = of_matrix(self.vectors, added, pairs)
-            else:  # of a user's own: it has no slots
+            else:  # a user-defined effect has no slots
                 at = self.setting, fit.calset.filters, points.x, points.y
                 added = change = change_by_effect(self.instrument, effect, *at)
             size, unit = float(sizes[number]), declared[parameter].unit
@@ -178,26 +178,24 @@ class _Starlight:
 
 
 def of_matrix(
-    vectors: Float[np.ndarray, "p k 3"],
-    added: Float[np.ndarray, "p k 3"],
-    pairs: Sequence[tuple[int, int]],
+    vectors: Float[np.ndarray, "p k 3"], added: Float[np.ndarray, "p k 3"], pairs: Sequence[tuple[int, int]]
 ) -> Float[np.ndarray, "p a 3"]:
     """Change of the instrument matrix, to first order, where the analysis vectors change."""
-    one, other = ([pair[i] for pair in pairs] for i in (0, 1))
-    light = vectors[:, one, :1] + vectors[:, other, :1]
-    matrix = (vectors[:, one] - vectors[:, other]) / light
-    return (added[:, one] - added[:, other] - matrix * (added[:, one, :1] + added[:, other, :1])) / light
+    i, j = ([pair[i] for pair in pairs] for i in (0, 1))
+    light = vectors[:, i, :1] + vectors[:, j, :1]
+    matrix = (vectors[:, i] - vectors[:, j]) / light
+    return (added[:, i] - added[:, j] - matrix * (added[:, i, :1] + added[:, j, :1])) / light
 
 
 def _at_sizes(probe: Probe, sizes: Float[np.ndarray, " a"]) -> Iterator[tuple[str, Effect]]:
     """Each amplitude of a probe by itself: its parameter, and the effect with it at its size."""
-    rest = iter(sizes)
+    remaining = iter(sizes)
     for member in probe.group:
         for name in probe.effect.amplitudes():
             neutral = np.asarray(getattr(member, name), float)
             for at in np.ndindex(neutral.shape):
                 value = neutral.copy()
-                value[at] += next(rest)
+                value[at] += next(remaining)
                 yield name, member.replaced(**{name: jnp.asarray(value)})
 
 
@@ -210,15 +208,17 @@ def usual_exposure(calset: CalibrationSet, instrument: Instrument) -> int:
 def _errors_of_stars(
     design: Design, mistakes: Sequence[_Mistake], changes: Float[np.ndarray, "c n"], exposure: int
 ) -> Float[np.ndarray, " c"]:
-    """Median over some field points of what mistakes do to q and u; 0 where these are not measured."""
+    """Median error of q and u over some field points from each mistake; 0 where these are not measured."""
     fit, points = design.fit, design.fit.calset.points
-    some = np.unique(np.linspace(0, len(points) - 1, STAR_POINTS).astype(int))
+    places = np.unique(np.linspace(0, len(points) - 1, STAR_POINTS).astype(int))
     instrument = fit.model.instrument(fit.values)
     setting: Settings = first_setting(fit.calset, instrument, exposure)
-    matrix, slopes = matrix_slopes(instrument, setting, fit.calset.filters, points.x[some], points.y[some])
-    found = np.zeros(len(mistakes))
-    for i, (one, moved) in enumerate(zip(mistakes, changes, strict=True)):
-        own = one.change[some] if isinstance(one.change, np.ndarray) else one.change
-        error = change_of_qu(matrix, matrix + (own - slopes @ moved))
-        found[i] = np.median(error[np.isfinite(error)]) if np.isfinite(error).any() else 0.0
-    return found
+    matrix, slopes = matrix_slopes(
+        instrument, setting, fit.calset.filters, points.x[places], points.y[places]
+    )
+    errors = np.zeros(len(mistakes))
+    for i, (mistake, moved) in enumerate(zip(mistakes, changes, strict=True)):
+        direct = mistake.change[places] if isinstance(mistake.change, np.ndarray) else mistake.change
+        error = change_of_qu(matrix, matrix + (direct - slopes @ moved))
+        errors[i] = np.median(error[np.isfinite(error)]) if np.isfinite(error).any() else 0.0
+    return errors

@@ -1,7 +1,7 @@
-"""Effects that could be missing, group by group, and what each would do to the residuals.
+"""Possibly missing effects, group by group, and the derivatives of the residuals with respect to each.
 
-The columns of the score test come from the responses of the light path (`likelihood.columns`), but those of effects of
-a user's own, which are differentiated themselves. Structural effects have no amplitude: they can only be tried
+The columns of the score test come from the responses of the light path (`likelihood.columns`), but those of
+user-defined effects by direct differentiation. Structural effects have no amplitude and are fitted instead
 (`exact.try_effect`). Effects without a name are those of `grammar`.
 """
 
@@ -73,14 +73,14 @@ class Ranked:
 
     @property
     def name(self) -> str:
-        """Its name: of what has none, the descriptions."""
+        """Its name; without one, its descriptions."""
         return self.probe.name if self.effect is Described else self.effect.name
 
 
 def applicable(
     catalogue: Sequence[EffectKind], context: Context, instrument: Instrument
 ) -> tuple[EffectKind, ...]:
-    """The effects of a catalogue that have what they act on in an instrument; ValueError as `applies`."""
+    """The effects of a catalogue that apply to an instrument; ValueError as `applies`."""
     return tuple(kind for kind in catalogue if applies(kind.neutral(context), instrument))
 
 
@@ -97,17 +97,17 @@ def probes(catalogue: Sequence[EffectKind], context: Context) -> Iterator[Probe]
 
 
 def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) -> bool:
-    """True if a set has what an effect acts on: several field points, or the conditions that its elements ask for."""
+    """True if a set is sensitive to an effect: enough field points, and the conditions of its elements."""
     if effect.kind.over_field and len(calset.points) < FEWEST_POINTS:
         return False
     bare = dataclasses.replace(instrument, effects=())
-    asked = conditions_of_effect(bare, effect)
+    conditions = conditions_of_effect(bare, effect)
     stated = {name: getattr(calset.exposures, column.lower()) for name, column in CONDITIONS.items()}
-    return all(np.isfinite(stated[name]).any() for name in asked if name in stated)
+    return all(np.isfinite(stated[name]).any() for name in conditions if name in stated)
 
 
 def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Probe]) -> list[Probe]:
-    """The probes of effects that a set can show; shapes of one effect need the same."""
+    """The probes of effects that a set is sensitive to; all shapes of one effect have the same requirements."""
     shown: dict[EffectKind, bool] = {}
     for probe in wanted:
         if probe.effect not in shown:
@@ -127,33 +127,33 @@ def all_candidates(
     shown = showable(likelihood.calset, template, effects)
     changes: dict[int, list[Change]] = {}
     for number, probe in enumerate([*shown, *sentences]):
-        each = [member.first_order(template) for member in probe.group]
-        if all(one and all(columns.has(change) for change in one) for one in each):
-            changes[number] = [change for one in each for change in one]
-    gaps = [sentence.gap for some in changes.values() for change in some for sentence in fringes_of(change)]
+        members = [member.first_order(template) for member in probe.group]
+        if all(terms and all(columns.has(change) for change in terms) for terms in members):
+            changes[number] = [change for terms in members for change in terms]
+    gaps = [sentence.gap for sums in changes.values() for change in sums for sentence in fringes_of(change)]
     survives = columns.survives(gaps)
     blurred = {
         number
-        for number, some in changes.items()
-        if not all(survives[sentence.gap] for change in some for sentence in fringes_of(change))
+        for number, sums in changes.items()
+        if not all(survives[sentence.gap] for change in sums for sentence in fringes_of(change))
     }
-    kept = {number: some for number, some in changes.items() if number not in blurred}
-    exact = sum(len(some) for number, some in kept.items() if number < len(shown))
-    computed = columns.rounded([change for some in kept.values() for change in some], exact)
+    linear = {number: sums for number, sums in changes.items() if number not in blurred}
+    exact = sum(len(sums) for number, sums in linear.items() if number < len(shown))
+    computed = columns.rounded([change for sums in linear.values() for change in sums], exact)
     named: dict[str, Candidate] = {}
     described: dict[str, Candidate] = {}
     first = [0, 0]
     for number, probe in enumerate([*shown, *sentences]):
         of_sentence = number >= len(shown)
-        if number in kept:
-            part = computed[of_sentence][:, first[of_sentence] : first[of_sentence] + len(probe.widths)]
+        if number in linear:
+            block = computed[of_sentence][:, first[of_sentence] : first[of_sentence] + len(probe.widths)]
             first[of_sentence] += len(probe.widths)
         elif number in blurred:
             continue
         else:
-            part = own_columns(likelihood, values, probe.group)
+            block = own_columns(likelihood, values, probe.group)
         into = described if of_sentence else named
-        into[probe.name] = Candidate(probe.name, part, probe.widths)
+        into[probe.name] = Candidate(probe.name, block, probe.widths)
     return named, described
 
 

@@ -1,4 +1,4 @@
-"""The end of a search: additions that the final model does not need, and what remains without a name."""
+"""The end of a search: removal of unneeded additions, and the unidentified remainder."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ Remainder = tuple[State, Unexplained | None]
 
 
 def concluded(first: State, state: State, judge: Refits) -> Remainder:
-    """The state without what it does not need, and what remains without a name (None: nothing).
+    """The state without unneeded additions, and its unidentified remainder (None: nothing).
 
-    What predicts exposures worse than the first model is not adopted. More descriptions than
+    A model that predicts exposures worse than the first one is not adopted. More descriptions than
     `thresholds.MOST_SENTENCES` can be one thing that none of them holds.
     """
     state, remainder = _leftover(first, prune(first, state, judge), judge)
@@ -33,8 +33,8 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
         return _not_adopted(first, state, worse)
     said = _descriptions(state)
     if remainder is not None:
-        parts = tuple(text for name, text in _contradicted(state).items() if name not in said)
-        return state, dataclasses.replace(remainder, parts=(*remainder.parts, *parts))
+        against = tuple(text for name, text in _contradicted(state).items() if name not in said)
+        return state, dataclasses.replace(remainder, parts=(*remainder.parts, *against))
     if len(said) <= thresholds.MOST_SENTENCES:
         return state, None
     text = f"{len(said)} descriptions were needed: they say where it sits, no single one of them what it is"
@@ -48,10 +48,10 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
 
 
 def prune(first: State, state: State, judge: Refits) -> State:
-    """The state without additions that its model does not need, the least needed first."""
+    """The state without unneeded additions, removed in order of increasing evidence."""
     result = state.evidence.result
-    kept, steps = _needed(result, state.steps, judge)
-    return state if kept is result else _refitted(first, state, kept, steps, judge)
+    reduced, steps = _needed(result, state.steps, judge)
+    return state if reduced is result else _refitted(first, state, reduced, steps, judge)
 
 
 def _needed(result: FitResult, steps: Sequence[Trial], judge: Refits) -> tuple[FitResult, tuple[Trial, ...]]:
@@ -78,41 +78,41 @@ def _without(first: State, state: State, names: Sequence[str], judge: Refits) ->
 
 
 def _refitted(first: State, state: State, result: FitResult, steps: Sequence[Trial], judge: Refits) -> State:
-    """The state with a smaller model, and its additions as they lead to that one after the other."""
+    """The state with a smaller model, and its additions compared again in their order."""
     state = judge.adopt(state, result, steps, first.evidence)
     in_order = refitted_in_order(steps, first.evidence.design, state.evidence.design)
     return dataclasses.replace(state, steps=tuple(in_order))
 
 
-# ---------------------------------------------------------------------------------------- what remains
+# ------------------------------------------------------------------------------------------- remainder
 
 
 def _leftover(first: State, state: State, judge: Refits) -> Remainder:
     """Remainder of a state, with a free-form term for it where that is of use."""
-    parts: tuple[str, ...] = ()
+    partial: tuple[str, ...] = ()
     while True:
         result = state.evidence.result
         # Errors that are a few per cent too small are no effect: nothing but their size is wrong.
         if not state.evidence.alarm and (result.explains_data or result.nearly_explains_data):
             return state, None
         judge.tell("an unidentified residual remains")
-        if not parts and (names := _parts(first, state)):
-            parts = tuple(names.values())
+        if not partial and (names := _parts(first, state)):
+            partial = tuple(names.values())
             for name in names:
                 judge.tell(f"{name} explains a part only: not added")
             state = _without(first, state, list(names), judge)
             continue
         remainder, with_term = _with_free_form(state, judge)
-        if parts:
+        if partial:
             text = "explains a part and may stand in for something else, not added"
-            remainder = dataclasses.replace(_and(remainder, f"{text}: {'; '.join(parts)}"), parts=parts)
+            remainder = dataclasses.replace(_and(remainder, f"{text}: {'; '.join(partial)}"), parts=partial)
         if with_term is None:
             return state, remainder
-        kept, steps = _needed(with_term, state.steps, judge)
-        if kept is with_term:
-            return judge.adopt(state, kept, steps), remainder
-        # Those names only stood in for what has none: what is it without them?
-        bare = without(kept, FreeForm.name, [step.effect.name for step in steps])
+        reduced, steps = _needed(with_term, state.steps, judge)
+        if reduced is with_term:
+            return judge.adopt(state, reduced, steps), remainder
+        # These names were stand-ins for an unidentified effect: its remainder without them.
+        bare = without(reduced, FreeForm.name, [step.effect.name for step in steps])
         state = _refitted(first, state, bare, steps, judge)
 
 
@@ -123,18 +123,18 @@ def _parts(first: State, state: State) -> dict[str, str]:
     with it. Other descriptions of the instrument stay: they have no amplitude that could bend.
     """
     names = [step for step in state.steps if step.effect is not OtherDescription]
-    left, missing = (
-        one.chi2 / max(one.dof, 1) - 1.0 for one in (state.evidence.result, first.evidence.result)
+    remaining, missing = (
+        fit.chi2 / max(fit.dof, 1) - 1.0 for fit in (state.evidence.result, first.evidence.result)
     )
-    if not names or left < thresholds.POOR_FIT - 1.0 or left * thresholds.PART < missing:
+    if not names or remaining < thresholds.POOR_FIT - 1.0 or remaining * thresholds.PART < missing:
         return {}
-    found = {}
+    partial = {}
     for step in names:
         before, after = (
             step.compared[f"chi2_{when}"] / max(first.evidence.dof, 1) for when in ("before", "after")
         )
-        found[step.effect.name] = f"{step.effect.name} (χ²/dof {before:.3g} → {after:.3g})"
-    return found
+        partial[step.effect.name] = f"{step.effect.name} (χ²/dof {before:.3g} → {after:.3g})"
+    return partial
 
 
 def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult | None]:
@@ -149,11 +149,9 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     if FreeForm.name in result.model.effect_names or not blocks or judge.over(state.fits):
         return remainder, None
     # A block has all patterns of its kind: those that are not needed cost errors as well.
-    every = {
-        block: [measured.candidate(one) for one in strata(measured) if one.block == block] for block in blocks
-    }
+    terms = {block: [measured.candidate(s) for s in strata(measured) if s.block == block] for block in blocks}
     useful = tuple(
-        block for block in blocks if predicts_unseen(evidence.design, every[block], thresholds.USEFUL)
+        block for block in blocks if predicts_unseen(evidence.design, terms[block], thresholds.USEFUL)
     )
     if not useful:
         return _and(remainder, _LEFT_OUT), None
@@ -169,7 +167,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
 
 
 def _unexplained(evidence: Examination, patterns: tuple[tuple[str, float], ...]) -> Unexplained:
-    """Remainder of an examination without a name: its patterns, and where the residuals sit."""
+    """Unidentified remainder of an examination: its patterns, and the location of the residuals."""
     if not evidence.alarm:
         ratio = evidence.chi2 / evidence.dof
         text = f"residuals scatter more than N_ERR says (χ²/dof = {ratio:.3g}) without a known pattern"
@@ -185,33 +183,35 @@ def _unexplained(evidence: Examination, patterns: tuple[tuple[str, float], ...])
     where = describe(evidence.design, evidence.design.residual)
     words = {"cameras": "camera", "kinds": "kind", "field": "field"}
     words |= {prefix: prefix for prefix in evidence.design.measured.likelihood.plan.moving}
-    told = (f"{name} {where[key]}" for name, key in words.items() if where.get(key) is not None)
-    text += f". Residuals sit in: {'; '.join(told)}"
+    locations = (f"{name} {where[key]}" for name, key in words.items() if where.get(key) is not None)
+    text += f". Residuals sit in: {'; '.join(locations)}"
     return Unexplained(evidence.table.p_global, text, patterns)
 
 
-# ------------------------------------------------------------------------------------- what is not adopted
+# ------------------------------------------------------------------------------------ models not adopted
 
 
 def _worse(first: Examination, last: Examination) -> str:
     """Exposures that the final model predicts worse than the first, in words; empty: none."""
     if kinds := contradicting(first.design, last.design):
         return f"exposures of {kinds}, as all others predict them"
-    before, after = (held_out(one.design, "exposures") for one in (first, last))
+    before, after = (held_out(evidence.design, "exposures") for evidence in (first, last))
     if after > (1.0 + thresholds.HELD_OUT_WORSE) * before:
         return f"exposures that are left out (mean squared residual {before:.3g} → {after:.3g})"
     return ""
 
 
 def _not_adopted(first: State, state: State, worse: str) -> Remainder:
-    """The first model again: what was found is told as parts."""
-    parts = tuple(
+    """The first model again: the additions are reported as parts."""
+    partial = tuple(
         f"{step.effect.name} (χ² {step.compared['chi2_before']:.4g} → {step.compared['chi2_after']:.4g})"
         for step in state.steps
     )
-    text = f"with what was found the model predicts worse {worse}, so nothing was adopted: {'; '.join(parts)}"
+    text = (
+        f"with what was found the model predicts worse {worse}, so nothing was adopted: {'; '.join(partial)}"
+    )
     remainder = _and(_unexplained(first.evidence, tuple(first.evidence.patterns_needed())), text)
-    remainder = dataclasses.replace(remainder, parts=(*parts, *_contradicted(state).values()))
+    remainder = dataclasses.replace(remainder, parts=(*partial, *_contradicted(state).values()))
     return back_to(first, state), remainder
 
 
@@ -221,14 +221,12 @@ def back_to(first: State, state: State) -> State:
 
 
 def _contradicted(state: State) -> dict[str, str]:
-    """Everything that exposures of another KIND speak against, in words."""
-    return {
-        one.name: f"{one.name} ({one.reason})" for turn in state.rounds for one in turn.asked if one.against
-    }
+    """All candidates contradicted by exposures of another KIND, in words."""
+    return {r.name: f"{r.name} ({r.reason})" for turn in state.rounds for r in turn.asked if r.against}
 
 
 def _descriptions(state: State) -> tuple[str, ...]:
-    """Names of the groups of sentences that were added."""
+    """Names of the added groups of sentences."""
     return tuple(name for step in state.steps for name in step.said)
 
 

@@ -43,10 +43,10 @@ class DetectionLimit:
 
 @dataclasses.dataclass(frozen=True)
 class ConditionLimit:
-    """By how much a number that a set states may be wrong before its residuals show it.
+    """Detection limit for the error of a number that a set states.
 
     `detected` in `unit`, infinite where no residual shows it; `error_of_qu` as that of `DetectionLimit`, at `size`:
-    what is just detected, or the most that is plausible where nothing is.
+    the detection limit, or the largest plausible size where it is not detectable.
     """
 
     what: str
@@ -63,8 +63,8 @@ class DetectionLimits(Displayed):
     `separation` (row, column) is how far (σ) the effect of the column stays from that of the row when this is just
     detected. `protection` is, by field point (`x`, `y`, degrees), the largest error of q and u that a single effect
     can make without being detected, with a tenth on top for what is not of first order, `caused_by` the effect.
-    `untestable` effects leave no trace in these data. `conditions` are what the set states of itself: its field, its
-    filters, the colours of its light. `could_hide` are the mistakes that could hide, as every command says them.
+    `untestable` effects leave no trace in these data. `conditions` are those stated in the set: its field, its
+    filters, the colours of its light. `could_hide` are the undetectable mistakes, as in every command.
     """
 
     limits: tuple[DetectionLimit, ...]
@@ -117,12 +117,12 @@ class DetectionLimits(Displayed):
             },
             "untestable": list(self.untestable),
             "conditions": [dataclasses.asdict(entry) for entry in self.conditions],
-            "could_hide": [one._asdict() for one in self.could_hide],
+            "could_hide": [mistake._asdict() for mistake in self.could_hide],
         }
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> DetectionLimits:
-        """Inverse of `document`. Raises KeyError or TypeError for one that it has not made."""
+        """Inverse of `document`. Raises KeyError or TypeError for an invalid one."""
         protection = document["protection"]
         return cls(
             limits=_records(DetectionLimit, document["limits"], "named"),
@@ -135,17 +135,18 @@ class DetectionLimits(Displayed):
             untestable=tuple(document["untestable"]),
             conditions=_records(ConditionLimit, document.get("conditions", ()), "detected"),
             could_hide=tuple(
-                CouldHide(**{**one, "error": tuple(one["error"])}) for one in document.get("could_hide", ())
+                CouldHide(**{**entry, "error": tuple(entry["error"])})
+                for entry in document.get("could_hide", ())
             ),
         )
 
     @property
     def mistakes(self) -> tuple[CouldHide, ...]:
-        """All that is asked, by what it could do without being noticed: the largest error of q and u first.
+        """All mistakes in order of their undetected error of q and u, the largest first.
 
-        Of what is in `could_hide` the error stands there; of anything else that of its own limit.
+        Errors are those of `could_hide`, for all others those of their own limits.
         """
-        known = {one.name for one in self.could_hide}
+        names = {m.name for m in self.could_hide}
         effects = (
             CouldHide(
                 f"{e.effect}.{e.parameter}", EFFECT, e.detected[1], e.unit, "", True, False, e.error_of_qu
@@ -156,8 +157,8 @@ class DetectionLimits(Displayed):
         data = (
             CouldHide(e.what, DATA, e.size, e.unit, "", True, False, e.error_of_qu) for e in self.conditions
         )
-        others = [one for one in (*effects, *data) if one.name not in known and np.isfinite(one.error[0])]
-        return tuple(sorted((*self.could_hide, *others), key=lambda one: (-one.error[0], -one.error[1])))
+        further = [m for m in (*effects, *data) if m.name not in names and np.isfinite(m.error[0])]
+        return tuple(sorted((*self.could_hide, *further), key=lambda m: (-m.error[0], -m.error[1])))
 
     def display(self) -> Display:
         """The worst that could hide in a sentence; a row for each effect and parameter, and each number of the set."""
@@ -165,17 +166,15 @@ class DetectionLimits(Displayed):
         conditions = {entry.what: entry for entry in self.conditions}
         rows: list[tuple[str, ...]] = []
         for kind, title in ((EFFECT, "EFFECTS"), (DATA, "ERRORS IN THE DATA")):
-            some = [one for one in self.mistakes if one.kind == kind]
-            names = {one.name: one for one in some} | dict.fromkeys(
+            mistakes = [m for m in self.mistakes if m.kind == kind]
+            names = {m.name: m for m in mistakes} | dict.fromkeys(
                 name
                 for name in (effects if kind == EFFECT else conditions)
-                if name not in {o.name for o in some}
+                if name not in {m.name for m in mistakes}
             )
             if names:
                 rows.append((title, *("",) * (len(HEAD) - 1)))
-            rows += [
-                self._row(name, one, effects.get(name), conditions.get(name)) for name, one in names.items()
-            ]
+            rows += [self._row(name, m, effects.get(name), conditions.get(name)) for name, m in names.items()]
         notes = (
             (f"cannot be detected in these data: {', '.join(self.untestable)}",) if self.untestable else ()
         )
@@ -188,18 +187,24 @@ class DetectionLimits(Displayed):
         )
 
     def _row(
-        self, name: str, one: CouldHide | None, limit: DetectionLimit | None, condition: ConditionLimit | None
+        self,
+        name: str,
+        hidden: CouldHide | None,
+        limit: DetectionLimit | None,
+        condition: ConditionLimit | None,
     ) -> tuple[str, ...]:
-        error = "" if one is None else two_digits_range(*(100.0 * value for value in one.error))
-        remark = "" if one is None or one.measured else f"error at {two_digits(one.size)}, the usual size"
+        error = "" if hidden is None else two_digits_range(*(100.0 * value for value in hidden.error))
+        remark = (
+            "" if hidden is None or hidden.measured else f"error at {two_digits(hidden.size)}, the usual size"
+        )
         if limit is not None:
             named = two_digits(limit.named) if np.isfinite(limit.named) else "never"
             taken_for = ", ".join(limit.taken_for)
             return name, two_digits_range(*limit.detected), named, limit.unit, error, taken_for
         if condition is not None and not np.isfinite(condition.detected):
             remark = f"error at {two_digits(condition.size)} {condition.unit}".rstrip()
-        detected = np.inf if remark else one.size if one is not None else np.nan
-        unit = condition.unit if condition is not None else one.unit if one is not None else ""
+        detected = np.inf if remark else hidden.size if hidden is not None else np.nan
+        unit = condition.unit if condition is not None else hidden.unit if hidden is not None else ""
         return name, two_digits(detected) if np.isfinite(detected) else "never", "", unit, error, remark
 
     def protection_in_words(self) -> str:
@@ -216,17 +221,17 @@ class DetectionLimits(Displayed):
 
     @property
     def worst(self) -> int | None:
-        """The field point where most can go unnoticed; None if one exposure nowhere gives q and u."""
+        """The field point with the largest undetected error; None if one exposure nowhere gives q and u."""
         return int(np.nanargmax(self.protection)) if np.isfinite(self.protection).any() else None
 
 
 def _records(kind: Any, entries: Any, endless: str) -> tuple[Any, ...]:
     """Records from plain data, where numbers that are not finite are null: ∞ in the field `endless`, NaN in others."""
 
-    def value(name: str, found: Any) -> Any:
-        if isinstance(found, list):
-            return tuple(value(name, one) for one in found)
-        return (np.inf if name == endless else np.nan) if found is None else found
+    def value(name: str, entry: Any) -> Any:
+        if isinstance(entry, list):
+            return tuple(value(name, element) for element in entry)
+        return (np.inf if name == endless else np.nan) if entry is None else entry
 
     names = [field.name for field in dataclasses.fields(kind)]
     return tuple(kind(**{name: value(name, entry[name]) for name in names}) for entry in entries)
@@ -234,7 +239,7 @@ def _records(kind: Any, entries: Any, endless: str) -> tuple[Any, ...]:
 
 def over_field(errors: Float[np.ndarray, "c p"]) -> tuple[float, float]:
     """Median and largest over the field, of the worst shape."""
-    known = errors[np.isfinite(errors).any(axis=1)]
-    if not known.size:
+    finite = errors[np.isfinite(errors).any(axis=1)]
+    if not finite.size:
         return float("nan"), float("nan")
-    return float(np.nanmedian(known, axis=1).max()), float(np.nanmax(known))
+    return float(np.nanmedian(finite, axis=1).max()), float(np.nanmax(finite))

@@ -54,10 +54,10 @@ def predicts_unseen(
 
     Symbols     d prediction error of the unit, A its rows of the Jacobian, H normal matrix of all others and priors
     """
-    widths = np.concatenate([one.widths for one in terms])
-    own = design.stacked([one.columns for one in terms])
+    widths = np.concatenate([term.widths for term in terms])
+    term_columns = design.stacked([term.columns for term in terms])
     prior = np.zeros((len(widths), design.jacobian.shape[1]))
-    rows = np.vstack([np.hstack([design.jacobian, own]), np.hstack([prior, np.diag(1.0 / widths)])])
+    rows = np.vstack([np.hstack([design.jacobian, term_columns]), np.hstack([prior, np.diag(1.0 / widths)])])
     residual = np.append(design.residual, np.zeros(len(widths)))
     calset = design.fit.calset
     units = {"cells": field_cells(calset)[design.point]}
@@ -86,8 +86,8 @@ def gains_by_kind(before: Design, after: Design) -> dict[str, float]:
     names = np.unique(kinds)
     if len(names) < 2:
         return {}
-    one, other = ((d.jacobian, d.residual, d.projector.free, d.fit.noise_scale) for d in (before, after))
-    return dict(zip(map(str, names), gains_of_units(kinds, one, other).tolist(), strict=True))
+    first, second = ((d.jacobian, d.residual, d.projector.free, d.fit.noise_scale) for d in (before, after))
+    return dict(zip(map(str, names), gains_of_units(kinds, first, second).tolist(), strict=True))
 
 
 def gains_of_units(unit: np.ndarray, before: LaidOut, after: LaidOut) -> Float[np.ndarray, " u"]:
@@ -96,18 +96,15 @@ def gains_of_units(unit: np.ndarray, before: LaidOut, after: LaidOut) -> Float[n
     Of each model the Jacobian, the residuals at its minimum, priors last, its degrees of freedom, and the factor on the
     errors in whose units the data rows are.
     """
-    count, found = np.unique(unit, return_counts=True)[1], []
+    count, densities = np.unique(unit, return_counts=True)[1], []
     for rows, residual, free, noise in (before, after):
         density = _predictions(rows, residual, unit, free)[:, 0]
-        found.append(density - count * free / len(unit) * np.log(noise))
-    return found[1] - found[0]
+        densities.append(density - count * free / len(unit) * np.log(noise))
+    return densities[1] - densities[0]
 
 
 def _predictions(
-    rows: Float[np.ndarray, "r n"],
-    residual: Float[np.ndarray, " r"],
-    unit: np.ndarray,
-    free: int,
+    rows: Float[np.ndarray, "r n"], residual: Float[np.ndarray, " r"], unit: np.ndarray, free: int
 ) -> Float[np.ndarray, "u 2"]:
     """ln p of the data rows of each unit as all the others predict them, and the square of how far they are off.
 
@@ -119,15 +116,15 @@ def _predictions(
     gram, along = scaled.T @ scaled + ridge, scaled.T @ residual
     step = np.linalg.solve(gram, along)
     scale = max(1.0, float(residual @ residual - along @ step) / max(free, 1))
-    whole = np.linalg.slogdet(gram)[1]
-    found = []
-    for one in np.unique(unit):
-        a, r = scaled[: len(unit)][unit == one], residual[: len(unit)][unit == one]
-        rest = gram - a.T @ a
-        d = r - a @ np.linalg.solve(rest, along - a.T @ r)
+    log_determinant = np.linalg.slogdet(gram)[1]
+    predictions = []
+    for label in np.unique(unit):
+        a, r = scaled[: len(unit)][unit == label], residual[: len(unit)][unit == label]
+        remaining = gram - a.T @ a
+        d = r - a @ np.linalg.solve(remaining, along - a.T @ r)
         pull = a.T @ d
         square = d @ d - pull @ np.linalg.solve(gram, pull)
-        spread = whole - np.linalg.slogdet(rest)[1]
+        spread = log_determinant - np.linalg.slogdet(remaining)[1]
         density = -0.5 * (square / scale + spread + len(r) * free / len(unit) * np.log(scale))
-        found.append((density, float(d @ d)))
-    return np.array(found)
+        predictions.append((density, float(d @ d)))
+    return np.array(predictions)

@@ -68,9 +68,9 @@ class Alternative:
 
 def refuse_mixups(result: FitResult) -> None:
     """Raise `DataError` with the remedy if a fit leaves what another reading of its data explains."""
-    found = mixups_of(result)
-    if found:
-        raise refusal(result, found)
+    alternatives = mixups_of(result)
+    if alternatives:
+        raise refusal(result, alternatives)
 
 
 def mixups_of(result: FitResult) -> tuple[Alternative, ...]:
@@ -80,9 +80,9 @@ def mixups_of(result: FitResult) -> tuple[Alternative, ...]:
     return mixups(result.calset, result.model, result.chi2 / result.dof)
 
 
-def refusal(result: FitResult, found: Sequence[Alternative]) -> DataError:
+def refusal(result: FitResult, alternatives: Sequence[Alternative]) -> DataError:
     """The error of data that other readings explain."""
-    reasons = "; or if ".join(str(one) for one in found)
+    reasons = "; or if ".join(str(alternative) for alternative in alternatives)
     return DataError(
         f"the model does not fit (χ²/dof = {result.chi2 / result.dof:.3g}); it would if {reasons}"
     )
@@ -98,65 +98,69 @@ def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternati
     # The program that a small set was fitted with is there already.
     few = calset if len(calset.points) <= _FEW else thinned(calset, _POINTS, neighbours=1)
     block = few.intensities.block(0, len(few.points))
-    seen = block.used[..., None] & (block.counts > 0)
-    if not seen.any():
+    lit = block.used[..., None] & (block.counts > 0)
+    if not lit.any():
         return ()
     # What has gone wrong with all exposures misses all of the light by so much.
-    coarse = np.median(block.sigma[seen] / block.counts[seen]) * np.sqrt(left) >= thresholds.READING_COARSE
+    coarse = np.median(block.sigma[lit] / block.counts[lit]) * np.sqrt(left) >= thresholds.READING_COARSE
     few = dataclasses.replace(few, intensities=TableIntensities.dense(few.points, block))
     likelihood = Likelihood.of(few, model)
-    stands, values = _left(likelihood, left, _STEPS[1])
+    stands, values = _misfit(likelihood, left, _STEPS[1])
     left = min(left, stands)
     if left < thresholds.POOR_FIT:  # the fit has lost its way, not the data
         return ()
     of_all = (_readings(few, model), _instruments(few)) if coarse and left >= FAR_OFF else ()
     for readings in (_of_some_exposures(likelihood, _worst_exposures(likelihood, values)), *of_all):
-        tried = [_judged(one, few, model, left, _STEPS[0]) for one in readings]
-        best = [_judged(one, few, model, one.explained, _STEPS[1]) for one in _sorted(tried)[:_BEST]]
+        tried = [_judged(item, few, model, left, _STEPS[0]) for item in readings]
+        best = [_judged(item, few, model, item.explained, _STEPS[1]) for item in _sorted(tried)[:_BEST]]
         enough = min(1.0 + (left - 1.0) / thresholds.READING_GAIN, FAR_OFF)
-        good = [one for one in _sorted(best) if one.explained < enough]
+        good = [item for item in _sorted(best) if item.explained < enough]
         if good:
-            return tuple(one for one in good if one.explained < thresholds.READING_ALIKE * good[0].explained)
+            return tuple(
+                item for item in good if item.explained < thresholds.READING_ALIKE * good[0].explained
+            )
     return ()
 
 
-def _sorted(found: list[Alternative]) -> list[Alternative]:
-    return sorted(found, key=lambda one: one.explained)
+def _sorted(alternatives: list[Alternative]) -> list[Alternative]:
+    return sorted(alternatives, key=lambda item: item.explained)
 
 
-def _judged(one: Alternative, calset: CalibrationSet, model: Model, left: float, steps: int) -> Alternative:
+def _judged(
+    item: Alternative, calset: CalibrationSet, model: Model, misfit: float, steps: int
+) -> Alternative:
     """An alternative with χ²/dof after some Gauss–Newton steps from the model as designed; ∞ where none can be made."""
     try:
-        rewritten = one.change(calset)
+        rewritten = item.change(calset)
         if rewritten.instrument != calset.instrument:
             model = base_model(rewritten)
         elif rewritten.sources is not calset.sources:  # what is known of them beforehand
             model = model_like(rewritten, model)
-        return dataclasses.replace(one, explained=_left(Likelihood.of(rewritten, model), left, steps)[0])
+        return dataclasses.replace(item, explained=_misfit(Likelihood.of(rewritten, model), misfit, steps)[0])
     except (ValueError, np.linalg.LinAlgError):
-        return one
+        return item
 
 
-def _left(likelihood: Likelihood, before: float, steps: int) -> tuple[float, Vector]:
+def _misfit(likelihood: Likelihood, before: float, steps: int) -> tuple[float, Vector]:
     """χ²/dof after some steps, the errors of the data scaled as `before`, then as the step before, asks for; and where.
 
     The smallest of all steps, and the values there.
     """
     model, least = likelihood.model, before
     x = model.start[model.free]
-    here, found, best = None, np.inf, model.start
+    step, smallest, best = None, np.inf, model.start
     for number in range(steps + 1):
         values = model.full(x)
-        here = likelihood.expand(values, np.sqrt(max(least, 1.0)), here)
-        if here.dof <= 0 or not np.isfinite(here.chi2):
+        step = likelihood.expand(values, np.sqrt(max(least, 1.0)), step)
+        if step.dof <= 0 or not np.isfinite(step.chi2):
             break
-        least = here.chi2 / here.dof
-        if least < found:
-            found, best = least, values
+        least = step.chi2 / step.dof
+        if least < smallest:
+            smallest, best = least, values
         if number < steps:
-            width = np.sqrt(np.diag(here.matrix))
-            x = x - np.linalg.solve(here.matrix / np.outer(width, width), here.gradient / width) / width
-    return found, best
+            width = np.sqrt(np.diag(step.matrix))
+            x = x - np.linalg.solve(step.matrix / np.outer(width, width), step.gradient / width) / width
+    return smallest, best
 
 
 def _worst_exposures(likelihood: Likelihood, values: Vector) -> list[int]:
@@ -198,15 +202,15 @@ def _of_some_exposures(likelihood: Likelihood, worst: Sequence[int]) -> Iterator
     """Readings that concern sky and standards, or single exposures, where these are among the worst."""
     yield from _dead(likelihood)
     calset = likelihood.calset
-    for what, remedy, asked, change in _TABLE:
-        if asked(calset, calset.exposures[np.array(worst)]):
+    for what, remedy, concerned, change in _TABLE:
+        if concerned(calset, calset.exposures[np.array(worst)]):
             yield Alternative(what, remedy, change)
     yield from _signs_of_stars(calset, worst)
     number = calset.exposures.exposure
     for pair in itertools.combinations(sorted(worst), 2):
-        one, other = (number[i] for i in pair)
+        first, second = (number[i] for i in pair)
         yield Alternative(
-            f"the intensities of exposures {one} and {other} were exchanged",
+            f"the intensities of exposures {first} and {second} were exchanged",
             "exchange their EXPOSURE numbers in the table of intensities",
             lambda calset, pair=pair: _exchanged(calset, pair),
         )
@@ -239,9 +243,9 @@ def refuse_dead_cameras(result: FitResult) -> None:
     """
     calset = result.calset
     block = calset.intensities.block(0, min(len(calset.points), _FEW))
-    seen = block.used.sum(axis=0) > 1
-    counts = np.where(block.used[..., None], block.counts, np.nan)[:, seen]
-    if not seen.any():
+    repeated = block.used.sum(axis=0) > 1
+    counts = np.where(block.used[..., None], block.counts, np.nan)[:, repeated]
+    if not repeated.any():
         return
     still = np.nanmax(counts, axis=(0, 1)) == np.nanmin(counts, axis=(0, 1))
     if still.any():
@@ -258,13 +262,13 @@ def _dead(likelihood: Likelihood) -> Iterator[Alternative]:
     block = calset.intensities.block(0, len(calset.points))
     _, residual = likelihood.residuals(model.start)
     lacking = np.where(block.used[..., None], residual, np.nan)
-    seen = np.flatnonzero(block.used.any(axis=0))
-    expected = np.nanmedian((block.counts - lacking * block.sigma)[:, seen], axis=0)
-    level = np.nanmedian(np.where(block.used[..., None], block.counts, np.nan)[:, seen], axis=0)
-    dead = (level < _NO_LIGHT * expected) & (np.nanmedian(lacking[:, seen], axis=0) < -_MISSING)
+    exposures = np.flatnonzero(block.used.any(axis=0))
+    expected = np.nanmedian((block.counts - lacking * block.sigma)[:, exposures], axis=0)
+    level = np.nanmedian(np.where(block.used[..., None], block.counts, np.nan)[:, exposures], axis=0)
+    dead = (level < _NO_LIGHT * expected) & (np.nanmedian(lacking[:, exposures], axis=0) < -_MISSING)
     for k in np.flatnonzero(dead.any(axis=0) & ~dead.all(axis=0)):
-        off = seen[dead[:, k]]
-        listed = some([str(one) for one in calset.exposures.exposure[off]], 6)
+        off = exposures[dead[:, k]]
+        listed = some([str(number) for number in calset.exposures.exposure[off]], 6)
         yield Alternative(
             f"exposures {listed} were left out, in which camera {model.template.cameras.names[k]} holds no light",
             "leave them out, or reduce them again",
@@ -273,10 +277,10 @@ def _dead(likelihood: Likelihood) -> Iterator[Alternative]:
 
 
 def _without_exposures(calset: CalibrationSet, off: np.ndarray) -> CalibrationSet:
-    there = calset.intensities.block(0, len(calset.points))
-    used = there.used.copy()
+    intensities = calset.intensities.block(0, len(calset.points))
+    used = intensities.used.copy()
     used[:, off] = False
-    block = dataclasses.replace(there, used=used)
+    block = dataclasses.replace(intensities, used=used)
     return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
 
 
@@ -311,8 +315,8 @@ def _with_site(name: str) -> Change:
 
 
 def _has_stars(calset: CalibrationSet, worst: Exposures) -> bool:
-    known = bool(len(calset.sources) and np.hypot(calset.sources.q, calset.sources.u).max() > 0.0)
-    return known and "standard" in worst.kind
+    polarised = bool(len(calset.sources) and np.hypot(calset.sources.q, calset.sources.u).max() > 0.0)
+    return polarised and "standard" in worst.kind
 
 
 def _has_moon(calset: CalibrationSet, worst: Exposures) -> bool:
@@ -323,14 +327,14 @@ def _has_rotator(calset: CalibrationSet, worst: Exposures) -> bool:
     return bool(np.isfinite(worst.rotator).any())
 
 
-def _below(column: str, most: float) -> Callable[[CalibrationSet, Exposures], bool]:
+def _below(column: str, limit: float) -> Callable[[CalibrationSet, Exposures], bool]:
     """Moon exposures in which a column is nowhere larger."""
 
-    def asked(calset: CalibrationSet, worst: Exposures) -> bool:
+    def concerned(calset: CalibrationSet, worst: Exposures) -> bool:
         values = np.abs(getattr(calset.exposures, column))
-        return _has_moon(calset, worst) and float(np.nanmax(values)) <= most
+        return _has_moon(calset, worst) and float(np.nanmax(values)) <= limit
 
-    return asked
+    return concerned
 
 
 def _orders(model: Model) -> Iterator[Alternative]:
@@ -396,8 +400,10 @@ def _fields(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
 
 
 def _with_cameras(calset: CalibrationSet, order: list[int]) -> CalibrationSet:
-    there = calset.intensities.block(0, len(calset.points))
-    block = dataclasses.replace(there, counts=there.counts[..., order], sigma=there.sigma[..., order])
+    intensities = calset.intensities.block(0, len(calset.points))
+    block = dataclasses.replace(
+        intensities, counts=intensities.counts[..., order], sigma=intensities.sigma[..., order]
+    )
     return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
 
 

@@ -58,10 +58,10 @@ class Refits:
 
     def examined(self, result: FitResult, earlier: Examination | None = None) -> Examination:
         """A fit, scored; the columns of an `earlier` one serve again where the light has hardly changed."""
-        found = examine(result, self.wanted, self.rng, earlier, self.sentences, self.parts)
-        if found.alarm:
-            self.tell(Stage(f"p = {found.table.p_global:.2g}: something is missing", "naming"))
-        return found
+        evidence = examine(result, self.wanted, self.rng, earlier, self.sentences, self.parts)
+        if evidence.alarm:
+            self.tell(Stage(f"p = {evidence.table.p_global:.2g}: something is missing", "naming"))
+        return evidence
 
     def adopt(
         self, state: State, result: FitResult, steps: Sequence[Trial], earlier: Examination | None = None
@@ -80,25 +80,25 @@ class Refits:
         if item.effect is Described:
             if not self._hopeful(evidence, item):
                 return dataclasses.replace(trial, predicts=False)
-            told = self._with_best_times(evidence, shortest(item))
-            found = try_sentences(evidence.result, told, self.context, len(evidence.sentences))
+            description = self._with_best_times(evidence, shortest(item))
+            refitted = try_sentences(evidence.result, description, self.context, len(evidence.sentences))
         else:
             shapes = sum(probe.effect is item.effect for probe in evidence.probes)
-            found = try_shapes(evidence.result, item, self.context, shapes)
-        return dataclasses.replace(found, item=item, linear=trial.linear)
+            refitted = try_shapes(evidence.result, item, self.context, shapes)
+        return dataclasses.replace(refitted, item=item, linear=trial.linear)
 
     def _with_best_times(self, evidence: Examination, said: Described) -> Described:
         """A description that starts or stops in time, where it explains most by linear steps; any other as it is."""
-        ((change, amplitude), *more) = said.terms()
+        ((change, amplitude), *further) = said.terms()
         result = evidence.result
-        for end in (0, 1) if not more else ():
+        for end in (0, 1) if not further else ():
             if times := grammar.retimed(change, result.calset.exposures, end):
-                own = columns(result.likelihood, result.values, [[(1.0, one)] for one in times])
-                own = evidence.design.projector(evidence.design.stacked([own]))
-                along, square = own.T @ evidence.design.residual, np.sum(own**2, axis=0)
+                c = columns(result.likelihood, result.values, [[(1.0, sentence)] for sentence in times])
+                c = evidence.design.projector(evidence.design.stacked([c]))
+                along, square = c.T @ evidence.design.residual, np.sum(c**2, axis=0)
                 best = int(np.argmax(along**2 / np.where(square > 0, square, np.inf)))
                 change, amplitude = times[best], -along[best] / square[best]
-        return said if more else Described.saying([change.text], [float(amplitude)])
+        return said if further else Described.saying([change.text], [float(amplitude)])
 
     def _hopeful(self, evidence: Examination, item: Ranked) -> bool:
         """True if a sentence predicts what it has not seen, by its linear step: nobody has a name for it to believe."""
@@ -136,27 +136,31 @@ class Refits:
 
     def decided(self, trials: list[Trial]) -> list[Trial]:
         """Trials in order of evidence; what scaled errors leave even at the top is decided with errors as stated."""
-        even = [one for one in trials if trials[0].evidence - one.evidence < thresholds.EVEN_ODDS]
-        scaled = len(even) > 1 and all(one.fit is not None and one.fit.noise_scale > 1.0 for one in even)
+        even = [trial for trial in trials if trials[0].evidence - trial.evidence < thresholds.EVEN_ODDS]
+        scaled = len(even) > 1 and all(
+            trial.fit is not None and trial.fit.noise_scale > 1.0 for trial in even
+        )
         if not scaled:
             return trials
-        exact = [fit(one.fit.likelihood, start=one.fit.values, noise_scale=1.0) for one in even if one.fit]
-        best = min(one.posterior.objective for one in exact)
+        exact = [
+            fit(trial.fit.likelihood, start=trial.fit.values, noise_scale=1.0) for trial in even if trial.fit
+        ]
+        best = min(trial.posterior.objective for trial in exact)
         clearly = [
             dataclasses.replace(
-                one, fit=again, evidence=one.evidence - 0.5 * (again.posterior.objective - best)
+                trial, fit=again, evidence=trial.evidence - 0.5 * (again.posterior.objective - best)
             )
-            for one, again in zip(even, exact, strict=True)
+            for trial, again in zip(even, exact, strict=True)
         ]
-        rest = [one for one in trials if all(one is not other for other in even)]
-        return [*sorted(clearly, key=names_first), *rest]
+        remaining = [trial for trial in trials if all(trial is not t for t in even)]
+        return [*sorted(clearly, key=names_first), *remaining]
 
     def adopted(self, state: State, trial: Trial) -> State:
         """The state with the model of a trial, fitted again where priors or errors were in its way."""
         assert trial.fit is not None
         evidence, name = state.evidence, trial.effect.name
         result = settled(trial.fit, [name, *(step.effect.name for step in state.steps)])
-        compared, said = dict(trial.compared), (trial.name,) if trial.effect is Described else ()
+        compared, groups = dict(trial.compared), (trial.name,) if trial.effect is Described else ()
         if result is not trial.fit:
             compared |= before_and_after(name, evidence.design, Design.of(result))
         item = trial.item or next((r for r in evidence.ranked if r.effect is trial.effect), None)
@@ -169,8 +173,8 @@ class Refits:
             compared |= {
                 key: earlier.compared[key] for key in ("chi2_before", "heldout_before", "residual_before")
             }
-            said = (*earlier.said, *said)
-        step = dataclasses.replace(trial, compared=compared, said=said)
+            groups = (*earlier.said, *groups)
+        step = dataclasses.replace(trial, compared=compared, said=groups)
         self.tell(f"added {name}; scoring what is left")
         return self.adopt(state, result, [*steps, step])
 
@@ -187,9 +191,9 @@ def settled(result: FitResult, names: Collection[str]) -> FitResult:
     return result
 
 
-def without(result: FitResult, name: str, rest: Collection[str]) -> FitResult:
+def without(result: FitResult, name: str, remaining: Collection[str]) -> FitResult:
     """A fit without an effect, beside the `rest` of those that were added."""
-    return settled(refit_without(result, name), rest)
+    return settled(refit_without(result, name), remaining)
 
 
 def contradicting(before: Design, after: Design) -> str:

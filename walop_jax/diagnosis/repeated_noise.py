@@ -43,8 +43,10 @@ def repeated_noise(design: Design) -> Iterator[str]:
     pairs = pairs_alike(design, thresholds.ALARM)
     if pairs:
         number = design.fit.calset.exposures.exposure
-        each = [f"{number[p.first]} and {number[p.second]} (correlation {p.correlation:.2f})" for p in pairs]
-        listed = some(each, _SHOWN, "; ")
+        descriptions = [
+            f"{number[p.first]} and {number[p.second]} (correlation {p.correlation:.2f})" for p in pairs
+        ]
+        listed = some(descriptions, _SHOWN, "; ")
         yield (
             f"exposures hold the same noise, as independent ones never do: {listed}: remove one of each pair, "
             "repeated data shrink the errors"
@@ -57,9 +59,9 @@ def pairs_alike(design: Design, alarm: float = thresholds.ALARM) -> list[_Pair]:
     if measured.shared.exposures is not None:
         return []
     residual, used = design.cube(design.projector(design.residual)), measured.used.astype(float)
-    cameras, known = residual.shape[-1], np.broadcast_to(measured.known, used.shape)[0]
+    cameras, flux_known = residual.shape[-1], np.broadcast_to(measured.known, used.shape)[0]
     fluxes = 1 if measured.shared.cameras is None else np.linalg.matrix_rank(measured.shared.cameras)
-    free = np.where(known, cameras, cameras - fluxes)
+    free = np.where(flux_known, cameras, cameras - fluxes)
     product = np.einsum("pek,pfk->ef", residual, residual, optimize=True)
     # Of two exposures the sums run over the points that both have.
     square = np.einsum("pek,pf->ef", residual**2, used, optimize=True)
@@ -70,16 +72,16 @@ def pairs_alike(design: Design, alarm: float = thresholds.ALARM) -> list[_Pair]:
     first, second = first[keep], second[keep]
     if not len(first):
         return []
-    own, other = square[first, second], square[second, first]
-    correlation = product[first, second] / np.sqrt(own * other)
+    first_square, second_square = square[first, second], square[second, first]
+    correlation = product[first, second] / np.sqrt(first_square * second_square)
     # The fit takes something of every exposure: the noise is measured by what it leaves.
     deviate = correlation * np.sqrt(expected[first, second])
     limit = -special.ndtri(local_p(alarm, len(first)))
-    excess = 0.5 * (own / free[first] + other / free[second]) / shared[first, second] - 1.0
+    excess = 0.5 * (first_square / free[first] + second_square / free[second]) / shared[first, second] - 1.0
     pattern = correlation / np.maximum(1.0 - correlation, 1e-12)
-    found = (deviate > limit) & (correlation > LEAST) & (excess < 0.5 * pattern)
+    alike = (deviate > limit) & (correlation > LEAST) & (excess < 0.5 * pattern)
     pairs = [
         _Pair(int(a), int(b), float(c))
-        for a, b, c in zip(first[found], second[found], correlation[found], strict=True)
+        for a, b, c in zip(first[alike], second[alike], correlation[alike], strict=True)
     ]
     return sorted(pairs, key=lambda pair: -pair.correlation)

@@ -268,8 +268,8 @@ class ScoreSpace:
         along = self.gram[:, place] @ w
 
         def reduce(scores: Vector, square: float) -> tuple[Vector, float]:
-            taken = w.T @ scores[place]
-            return scores - along @ taken, square - float(taken @ taken)
+            explained = w.T @ scores[place]
+            return scores - along @ explained, square - float(explained @ explained)
 
         free = self.free - (w.shape[1] if widths is None else 0)
         return dataclasses.replace(self, gram=self.gram - along @ along.T, free=free), reduce
@@ -356,15 +356,15 @@ class _Root:
 
     def __init__(self, gram: Matrix) -> None:
         norm = np.sqrt(np.clip(np.diag(gram), 0.0, None))
-        seen = np.flatnonzero(norm)
+        nonzero = np.flatnonzero(norm)
         self.whole, self.rank = np.zeros((len(norm), 0)), 0
-        if not len(seen):
+        if not len(nonzero):
             return
-        scaled = gram[np.ix_(seen, seen)] / np.outer(norm[seen], norm[seen])
+        scaled = gram[np.ix_(nonzero, nonzero)] / np.outer(norm[nonzero], norm[nonzero])
         factor, pivots, self.rank, _ = linalg.lapack.dpstrf(  # pyright: ignore[reportAttributeAccessIssue]
             scaled, tol=ROOT_TOLERANCE, overwrite_a=True
         )
-        order = seen[pivots - 1]
+        order = nonzero[pivots - 1]
         upper = np.triu(factor)[: self.rank]
         self.whole = np.zeros((len(norm), self.rank))
         self.whole[order] = upper.T * norm[order, None]
@@ -374,8 +374,8 @@ class _Root:
         """sᵀ G⁺ s of the scores s = Cᵀr: the square of what of r lies in the span of the columns C."""
         if not self.rank:
             return 0.0
-        part = linalg.solve_triangular(self.whole[self._chosen], scores[self._chosen], lower=True)
-        return float(part @ part)
+        solution = linalg.solve_triangular(self.whole[self._chosen], scores[self._chosen], lower=True)
+        return float(solution @ solution)
 
 
 def log_bayes(
@@ -392,8 +392,8 @@ def log_bayes(
     t = (scales if len(widths) > 1 else np.ones(1))[:, None] ** 2
     # None is below 0: rounding of columns that are nearly alike must not make it so.
     value, s = t * np.clip(value, 0.0, None), vector.T @ (scores * widths)
-    each = 0.5 * np.sum(t * s**2 / (1.0 + value) - np.log1p(value), axis=1)
-    return float(np.logaddexp.reduce(each) - np.log(len(each)))
+    log_factors = 0.5 * np.sum(t * s**2 / (1.0 + value) - np.log1p(value), axis=1)
+    return float(np.logaddexp.reduce(log_factors) - np.log(len(log_factors)))
 
 
 def _log_of_chi2(statistic: Any, rank: int) -> Any:
@@ -437,12 +437,15 @@ def gram(columns: Float[np.ndarray, "d n"], exact: int | None = None) -> Float[n
     pieces = [slice(first, stop) for first, stop in itertools.pairwise(sorted(starts))]
 
     def product(pair: tuple[slice, slice]) -> None:
-        one, other = pair
-        source = columns if exact is None or other.stop <= exact else single
-        products[one, other] = source[:, one].T @ source[:, other]
-        products[other, one] = products[one, other].T
+        left_piece, right_piece = pair
+        source = columns if exact is None or right_piece.stop <= exact else single
+        products[left_piece, right_piece] = source[:, left_piece].T @ source[:, right_piece]
+        products[right_piece, left_piece] = products[left_piece, right_piece].T
 
-    _on_all_cores(product, [(one, other) for i, one in enumerate(pieces) for other in pieces[i:]])
+    _on_all_cores(
+        product,
+        [(left_piece, right_piece) for i, left_piece in enumerate(pieces) for right_piece in pieces[i:]],
+    )
     return products
 
 

@@ -144,9 +144,9 @@ def hopeless(evidence: Evidence, trial: Trial) -> str:
     """Reason not to try what a linear step would refuse even if it were better by as much as such steps may miss."""
     if trial.evidence <= thresholds.LINEAR_BELOW:
         return refused(evidence, trial)
-    more = 1.0 + thresholds.LINEAR_SHARE
-    left = evidence.chi2 - more * (evidence.chi2 - trial.left)
-    return refused(evidence, dataclasses.replace(trial, evidence=more * trial.evidence, left=left))
+    factor = 1.0 + thresholds.LINEAR_SHARE
+    remaining = evidence.chi2 - factor * (evidence.chi2 - trial.left)
+    return refused(evidence, dataclasses.replace(trial, evidence=factor * trial.evidence, left=remaining))
 
 
 # ------------------------------------------------------------------------------------------------------ one round
@@ -155,19 +155,19 @@ def hopeless(evidence: Evidence, trial: Trial) -> str:
 def linear_trials(evidence: Evidence) -> list[Trial]:
     """The leading names, and sentences that are more probable than every name, by linear steps; best first."""
     trials = [linear_trial(evidence, item) for item in leaders(evidence.significant)]
-    some = evidence.sentences_before_names()[: thresholds.MOST_SENTENCES]
-    return sorted((*trials, *(linear_trial(evidence, item) for item in some)), key=names_first)
+    sentences = evidence.sentences_before_names()[: thresholds.MOST_SENTENCES]
+    return sorted((*trials, *(linear_trial(evidence, item) for item in sentences)), key=names_first)
 
 
 def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
     """Trial of one candidate by its linear step; `linear` is what a fit should find, with its errors."""
     noise, statistic = evidence.table.noise_scale, item.score.statistic
-    left = evidence.chi2 - statistic * (noise * evidence.scale) ** 2
+    remaining = evidence.chi2 - statistic * (noise * evidence.scale) ** 2
     return Trial(
         item.effect,
         item.log_bayes,
-        left,
-        explains(left, evidence.dof - item.score.rank),
+        remaining,
+        explains(remaining, evidence.dof - item.score.rank),
         item=item,
         linear=item.log_bayes + 0.5 * statistic * (noise**2 - 1.0),
     )
@@ -204,7 +204,7 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
             passed = log.passed([judge.fitted(evidence, linear)])
             new += passed
             if passed:
-                tried = [passed[0] if one is linear else one for one in tried]
+                tried = [passed[0] if candidate is linear else candidate for candidate in tried]
                 if _is_sure(passed[0], waiting):
                     break
         if not (new or sentences_asked):  # names that came first by linear steps that were not to be believed
@@ -217,10 +217,10 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
         explained = any(t.noise or evidence.chi2 - t.left > thresholds.GOOD_SHARE * missing for t in new)
         if not others_asked and not explained and (evidence.poor or not new):
             others_asked = True
-            others, choices = judge.others(dataclasses.replace(state, fits=fits))
-            fits += len(others)
-            others = log.passed(others)
-            new, tried = [*new, *others], [*tried, *others]
+            alternatives, choices = judge.others(dataclasses.replace(state, fits=fits))
+            fits += len(alternatives)
+            alternatives = log.passed(alternatives)
+            new, tried = [*new, *alternatives], [*tried, *alternatives]
         for trial in judge.decided(sorted(new, key=names_first)):
             if accepted := next(iter(log.passed([judge.confronted(evidence, trial)])), None):
                 break
@@ -243,22 +243,24 @@ def _is_sure(trial: Trial, waiting: Sequence[Trial]) -> bool:
 
 def _sentences_behind(evidence: Evidence, tried: Sequence[Trial]) -> list[Trial]:
     """The leading sentences, without those that were tried."""
-    some = [item for item in evidence.significant_sentences if not any(item is one.item for one in tried)]
-    return [linear_trial(evidence, item) for item in some[: thresholds.MOST_SENTENCES]]
+    untried = [
+        item for item in evidence.significant_sentences if not any(item is trial.item for trial in tried)
+    ]
+    return [linear_trial(evidence, item) for item in untried[: thresholds.MOST_SENTENCES]]
 
 
 def _with_rivals(evidence: Evidence, trial: Trial, tried: Sequence[Trial]) -> Trial:
     """A trial with what is not improbable beside it, and other shapes of its effect that are as probable."""
     rivals, shapes = [], list(trial.alternatives)
-    for other in tried:
-        if other.name == trial.name:
+    for rival in tried:
+        if rival.name == trial.name:
             continue
-        linear = other.fit is None and not np.isnan(trial.linear)
-        apart = abs(other.linear - trial.linear if linear else other.evidence - trial.evidence)
-        if other.effect is not trial.effect and apart < thresholds.IMPROBABLE:
-            rivals.append(other.effect.name)
-        elif other.effect is trial.effect and other.fit is not None and apart < thresholds.EVEN_ODDS:
-            shapes.append(in_words(other.instance))
+        linear = rival.fit is None and not np.isnan(trial.linear)
+        apart = abs(rival.linear - trial.linear if linear else rival.evidence - trial.evidence)
+        if rival.effect is not trial.effect and apart < thresholds.IMPROBABLE:
+            rivals.append(rival.effect.name)
+        elif rival.effect is trial.effect and rival.fit is not None and apart < thresholds.EVEN_ODDS:
+            shapes.append(in_words(rival.instance))
     item = trial.item or next((r for r in evidence.ranked if r.effect is trial.effect), None)
     nameless = () if item is None else evidence.nameless(item, trial.sentences)
     rivals += () if item is None else evidence.held_in_part(item)
@@ -288,7 +290,7 @@ def _came_first(added: str) -> str:
 def _too_far(evidence: Evidence, item: Ranked) -> str:
     """Reason for which a significant candidate was not tried: what comes before it."""
     names, sentences = evidence.significant, evidence.significant_sentences
-    best = max([*names[:1], *sentences[:1]], key=lambda one: one.log_bayes)
+    best = max([*names[:1], *sentences[:1]], key=lambda ranked: ranked.log_bayes)
     gap = best.log_bayes - item.log_bayes
     if best is item or gap <= 0.0:
         return "others were tried first"

@@ -32,52 +32,52 @@ def sentence_scores(design: Design, seed: int = 0) -> ScoreTable:
     calset: CalibrationSet = fit.calset
     listed = grammar.hypotheses(fit.model.catalogue, fit.model.template, calset.exposures, len(calset.points))
     absent = [probe for probe in listed.names if probe.effect.name not in fit.model.effect_names]
-    every = (*absent, *listed.sentences, *(probe for probe, _ in listed.parts))
+    probes = (*absent, *listed.sentences, *(probe for probe, _ in listed.parts))
     residual = design.projector(design.residual)
     noise = float(np.sqrt(residual @ residual / max(design.projector.free, 1))) or 1.0
     names: list[str] = []
     sizes: list[int] = []
-    parts: list[tuple[np.ndarray, ...]] = []
+    blocks: list[tuple[np.ndarray, ...]] = []
     normal = np.random.default_rng(seed).standard_normal((len(residual), DRAWS), dtype=np.float32)
     normal -= (design.projector.basis @ (design.projector.basis.T @ normal)).astype(np.float32)
-    for some in _batches(every, len(design.residual)):
-        for probe, columns in _columns(design, some):
-            own = columns.astype(float) / fit.noise_scale
-            along = design.projector.basis[: len(own)].T @ own
-            square = own.T @ own
+    for batch in _batches(probes, len(design.residual)):
+        for probe, columns in _columns(design, batch):
+            c = columns.astype(float) / fit.noise_scale
+            along = design.projector.basis[: len(c)].T @ c
+            square = c.T @ c
             names.append(probe.name)
-            sizes.append(own.shape[1])
-            drawn = own.T.astype(np.float32) @ normal[: len(own)]
-            parts.append(
-                (probe.widths, np.diag(square), own.T @ residual[: len(own)], drawn, square - along.T @ along)
+            sizes.append(c.shape[1])
+            drawn = c.T.astype(np.float32) @ normal[: len(c)]
+            blocks.append(
+                (probe.widths, np.diag(square), c.T @ residual[: len(c)], drawn, square - along.T @ along)
             )
     if not names:
         return ScoreTable((), noise, 1.0, 1.0)
-    widths, before, scores, drawn = (np.concatenate(each) for each in list(zip(*parts, strict=True))[:4])
-    gram = np.asarray(linalg.block_diag(*(block for *_, block in parts)))
+    widths, before, scores, drawn = (np.concatenate(arrays) for arrays in list(zip(*blocks, strict=True))[:4])
+    gram = np.asarray(linalg.block_diag(*(block for *_, block in blocks)))
     space = ScoreSpace(tuple(names), tuple(sizes), widths, before, gram, design.projector.free)
     trials = effective_trials(space.smallest_of(drawn))
     return space.table_after(ScoreTable((), noise, 1.0, trials), scores)
 
 
-def _batches(every: tuple[Probe, ...], rows: int) -> Iterator[list[Probe]]:
-    most, some, count = max(1, int(TOGETHER / max(rows, 1))), list[Probe](), 0
-    for probe in every:
-        if some and count + len(probe.widths) > most:
-            yield some
-            some, count = [], 0
-        some.append(probe)
+def _batches(probes: tuple[Probe, ...], rows: int) -> Iterator[list[Probe]]:
+    limit, batch, count = max(1, int(TOGETHER / max(rows, 1))), list[Probe](), 0
+    for probe in probes:
+        if batch and count + len(probe.widths) > limit:
+            yield batch
+            batch, count = [], 0
+        batch.append(probe)
         count += len(probe.widths)
-    if some:
-        yield some
+    if batch:
+        yield batch
 
 
-def _columns(design: Design, some: list[Probe]) -> Iterator[tuple[Probe, np.ndarray]]:
+def _columns(design: Design, batch: list[Probe]) -> Iterator[tuple[Probe, np.ndarray]]:
     names, sentences = (
-        [p for p in some if (p.effect is Described) == described] for described in (False, True)
+        [p for p in batch if (p.effect is Described) == described] for described in (False, True)
     )
     candidates = collections.ChainMap(*all_candidates(design.columns, names, sentences))
-    yield from ((probe, candidates[probe.name].columns) for probe in some if probe.name in candidates)
+    yield from ((probe, candidates[probe.name].columns) for probe in batch if probe.name in candidates)
 
 
 def described_doubts(design: Design, seed: int = 0) -> Iterator[str]:

@@ -38,14 +38,7 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import log_evidence_ratio
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates, applicable, probes, showable
 from walop_jax.diagnosis.readings import with_exposures, with_places
-from walop_jax.diagnosis.score import (
-    Candidate,
-    Score,
-    ScoreSpace,
-    ScoreTable,
-    corrected_p,
-    local_p,
-)
+from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, ScoreTable, corrected_p, local_p
 from walop_jax.fit.refit import NEARLY, FitResult, fit
 from walop_jax.io.text import with_error
 from walop_jax.likelihood.flux import project_flux
@@ -135,9 +128,14 @@ class Singles:
     @classmethod
     def of(cls, design: Design) -> Singles:
         """Conditions that the set states, priors, terms of a camera that have one amplitude, effects with a name."""
-        asked = _asked_effects(design)
-        rivals = (*_conditions(design), *_priors(design), *_of_cameras(design), *_of_catalogue(design, asked))
-        return dataclasses.replace(scored(design, rivals), asked=asked)
+        effects = _asked_effects(design)
+        rivals = (
+            *_conditions(design),
+            *_priors(design),
+            *_of_cameras(design),
+            *_of_catalogue(design, effects),
+        )
+        return dataclasses.replace(scored(design, rivals), asked=effects)
 
     @property
     def testable(self) -> list[Score]:
@@ -147,16 +145,16 @@ class Singles:
 
 def scored(design: Design, rivals: tuple[_Single, ...]) -> Singles:
     """Single numbers with their scores in the residuals of a design."""
-    names = [one.candidate.name for one in rivals]
-    widths = [one.candidate.widths for one in rivals]
+    names = [r.candidate.name for r in rivals]
+    widths = [r.candidate.widths for r in rivals]
     columns = np.concatenate(
-        [np.zeros((len(design.residual), 0)), *(one.candidate.columns for one in rivals)], axis=1
+        [np.zeros((len(design.residual), 0)), *(r.candidate.columns for r in rivals)], axis=1
     )
     along = design.projector.basis.T @ columns
     if not rivals:
         return Singles((), ScoreTable((), 1.0, 1.0, 1.0), along, np.zeros(0), np.zeros(0, bool))
-    each = [one.candidate.columns for one in rivals]
-    space = ScoreSpace.projected(design.projector, names, widths, each)
+    matrices = [r.candidate.columns for r in rivals]
+    space = ScoreSpace.projected(design.projector, names, widths, matrices)
     residual = design.projector(design.residual)
     table = space.table(columns.T @ residual, float(residual @ residual))
     return Singles(rivals, table, along, np.diag(space.gram), space.alive)
@@ -169,24 +167,24 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     """
     singles = singles or Singles.of(design)
     rivals, table, scores = singles.rivals, singles.table, singles.testable
-    found = [score for score in scores if corrected_p(score.log_p, len(scores)) < thresholds.ALARM]
-    if not found:
+    clear = [score for score in scores if corrected_p(score.log_p, len(scores)) < thresholds.ALARM]
+    if not clear:
         return
-    found.sort(key=lambda score: score.log_p)
-    best, result = found[0], design.fit
+    clear.sort(key=lambda score: score.log_p)
+    best, result = clear[0], design.fit
     square = float(np.sum(design.projector(design.residual) ** 2))
-    left = square - best.statistic * table.noise_scale**2
-    if not result.explains_data and left * result.noise_scale**2 > NEARLY * design.projector.free:
+    rest = square - best.statistic * table.noise_scale**2
+    if not result.explains_data and rest * result.noise_scale**2 > NEARLY * design.projector.free:
         return
-    likely = [one for one in found if one.statistic - one.rank > best.statistic - best.rank - _ALIKE]
+    likely = [item for item in clear if item.statistic - item.rank > best.statistic - best.rank - _ALIKE]
     # Of an element and one of its numbers alone, the shorter statement if it explains as much.
-    likely = [one for one in likely if not any(_holds(one, other) for other in likely)]
-    likely.sort(key=lambda one: (one.rank, one.log_p))  # a mistake of one number before sixteen
-    said = {one.candidate.name: one.said for one in rivals}
-    told = "; or for ".join(said[score.name](score) for score in likely[:_SHOWN])
-    more = f"; or for {len(likely) - _SHOWN} others" if len(likely) > _SHOWN else ""
+    likely = [item for item in likely if not any(_holds(item, rival) for rival in likely)]
+    likely.sort(key=lambda item: (item.rank, item.log_p))  # a mistake of one number before sixteen
+    wordings = {item.candidate.name: item.said for item in rivals}
+    causes = "; or for ".join(wordings[score.name](score) for score in likely[:_SHOWN])
+    further = f"; or for {len(likely) - _SHOWN} others" if len(likely) > _SHOWN else ""
     p = corrected_p(best.log_p, len(scores))
-    yield f"the residuals ask for {told}{more} (p = {p:.2g}, limit {thresholds.ALARM:g})"
+    yield f"the residuals ask for {causes}{further} (p = {p:.2g}, limit {thresholds.ALARM:g})"
 
 
 def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
@@ -205,8 +203,8 @@ def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
     ]
     if alike:
         alike.sort(key=lambda pair: -pair[0])
-        said = "; or ".join(_in_words(item.stated, item.score) for _, item in alike[:_SHOWN])
-        yield f"what was found explains no more than one number that the set states would, if it were {said}"
+        causes = "; or ".join(_in_words(item.stated, item.score) for _, item in alike[:_SHOWN])
+        yield f"what was found explains no more than one number that the set states would, if it were {causes}"
 
 
 def instead_of_names(before: FitResult, after: FitResult) -> str:
@@ -218,34 +216,34 @@ def instead_of_names(before: FitResult, after: FitResult) -> str:
     Compared are the evidence of the names, ln B of `after` against `before`, and that of the number, fitted exactly,
     with its width as prior: ½ (χ² − χ²_c) − ½ ln(1 + w² C̃ᵀC̃). One number may so come before sixteen.
     """
-    asked = [one for one in condition_scores(Design.of(before)) if one.score.testable]
-    asked = [one for one in asked if corrected_p(one.score.log_p, len(asked)) < thresholds.ALARM]
+    listed = [c for c in condition_scores(Design.of(before)) if c.score.testable]
+    listed = [c for c in listed if corrected_p(c.score.log_p, len(listed)) < thresholds.ALARM]
     if after.noise_scale != before.noise_scale:  # one scale of the errors, or χ² of both are not comparable
         after = fit(after.likelihood, start=after.values, noise_scale=before.noise_scale)
     added = after is not before
     least, likely = log_evidence_ratio(before, after) if added else 0.0, list[tuple[float, str]]()
-    for one in sorted(asked, key=lambda one: one.score.log_p)[:_FITTED]:
-        found, size, result, now = one.stated, 0.0, before, one
+    for c in sorted(listed, key=lambda c: c.score.log_p)[:_FITTED]:
+        stated, size, result, current = c.stated, 0.0, before, c
         for _ in range(_ROUNDS):  # Gauss and Newton: hours are no small step
-            size += float(now.score.amplitudes[0])
-            if abs(size) >= found.width:  # a latitude beyond the pole, a negative temperature
+            size += float(current.score.amplitudes[0])
+            if abs(size) >= stated.width:  # a latitude beyond the pole, a negative temperature
                 break
-            likelihood = Likelihood.of(found.changed(size), before.model)
+            likelihood = Likelihood.of(stated.changed(size), before.model)
             result = fit(likelihood, start=result.values, noise_scale=before.noise_scale)
-            there = {one.stated.what: one for one in condition_scores(Design.of(result))}
-            if not result.converged or found.what not in there:
+            rescored = {c.stated.what: c for c in condition_scores(Design.of(result))}
+            if not result.converged or stated.what not in rescored:
                 break
-            now = there[found.what]
-        score, square = now.score, now.square
+            current = rescored[stated.what]
+        score, square = current.score, current.square
         worth = 0.5 * (before.posterior.objective - result.posterior.objective)
-        worth -= 0.5 * float(np.log1p(square * found.width**2))
+        worth -= 0.5 * float(np.log1p(square * stated.width**2))
         explained = result.explains_data or result.nearly_explains_data
-        if result.converged and abs(size) < found.width and worth > least and (added or explained):
-            value = size if found.value is None else found.value + size
+        if result.converged and abs(size) < stated.width and worth > least and (added or explained):
+            value = size if stated.value is None else stated.value + size
             sigma = float(np.sqrt(score.covariance[0, 0]))
-            by = " changed by" if found.value is None else ""
-            text = f"{found.what}{by} {with_error(value, sigma)} {found.unit}".rstrip()
-            text += f" ({found.remedy}; χ²/dof = {result.chi2 / max(result.dof, 1):.3g})"
+            by = " changed by" if stated.value is None else ""
+            text = f"{stated.what}{by} {with_error(value, sigma)} {stated.unit}".rstrip()
+            text += f" ({stated.remedy}; χ²/dof = {result.chi2 / max(result.dof, 1):.3g})"
             likely.append((worth, text))
     best = max((worth for worth, _ in likely), default=0.0)
     return "; or ".join(
@@ -253,50 +251,55 @@ def instead_of_names(before: FitResult, after: FitResult) -> str:
     )
 
 
-def _holds(one: Score, other: Score) -> bool:
+def _holds(score: Score, rival: Score) -> bool:
     """True if another statement, shorter or longer about the same element, is the better one."""
-    if other.name.startswith(f"{one.name}."):
-        return other.log_p <= one.log_p
-    return one.name.startswith(f"{other.name}.") and other.log_p < one.log_p
+    if rival.name.startswith(f"{score.name}."):
+        return rival.log_p <= score.log_p
+    return score.name.startswith(f"{rival.name}.") and rival.log_p < score.log_p
 
 
 def _conditions(design: Design) -> Iterator[_Single]:
     """The numbers that the set states and that are used."""
-    asked = list(_stated(design.fit.calset))
-    columns = [design.stacked([column[:, None]]) for column in _columns(design, asked)]
-    for one, column in zip(asked, columns, strict=True):
+    statements = list(_stated(design.fit.calset))
+    columns = [design.stacked([column[:, None]]) for column in _columns(design, statements)]
+    for item, column in zip(statements, columns, strict=True):
         if not column.any():  # a number may be stated and not used
             continue
-        candidate = Candidate(one.what, column, np.array([one.width]))
+        candidate = Candidate(item.what, column, np.array([item.width]))
         # What stars see as well is no mistake of the matrix alone.
-        plausible = 0.0 if one.seen_by_stars else one.width
+        plausible = 0.0 if item.seen_by_stars else item.width
         yield _Single(
-            candidate, lambda score, one=one: _in_words(one, score), plausible, one.unit, one.shown_by, one
+            candidate,
+            lambda score, item=item: _in_words(item, score),
+            plausible,
+            item.unit,
+            item.shown_by,
+            item,
         )
 
 
 def _priors(design: Design) -> Iterator[_Single]:
     """The prior of every free parameter, and those of all numbers of an element, as what may be wrong."""
     rows, parameters = design.fit.likelihood.priors, design.fit.model.parameters
-    known = np.flatnonzero(rows.known).tolist()
-    names = {parameters[rows.index[i]].name: [i] for i in known}
+    constrained = np.flatnonzero(rows.known).tolist()
+    names = {parameters[rows.index[i]].name: [i] for i in constrained}
     together: dict[str, list[int]] = {}
-    for i in known:
+    for i in constrained:
         together.setdefault(parameters[rows.index[i]].name.rpartition(".")[0], []).append(i)
     elements = {k: v for k, v in together.items() if k and 1 < len(v) <= MOST_OF_ELEMENT} | names
 
-    def said(score: Score) -> str:
+    def wording(score: Score) -> str:
         texts = []
         for number, i in enumerate(elements[score.name]):
             p, mean, width = parameters[rows.index[i]], float(rows.mean[i]), float(rows.width[i])
-            found = _told(p.name, score, number, p.unit, mean, width)
-            texts.append(f"{found}, not {mean:g} ± {width:g}")
+            text = _worded(p.name, score, number, p.unit, mean, width)
+            texts.append(f"{text}, not {mean:g} ± {width:g}")
         return " with ".join(texts) + " (check what the model file knows of it)"
 
     for name, members in elements.items():
         columns = np.zeros((len(design.residual), len(members)))
         columns[design.rows + np.array(members), np.arange(len(members))] = 1.0
-        yield _Single(Candidate(name, columns, np.full(len(members), _PRIOR_WIDTHS)), said)
+        yield _Single(Candidate(name, columns, np.full(len(members), _PRIOR_WIDTHS)), wording)
 
 
 def _of_cameras(design: Design) -> Iterator[_Single]:
@@ -304,8 +307,8 @@ def _of_cameras(design: Design) -> Iterator[_Single]:
     measured, names = design.measured, design.fit.model.template.cameras.names
     counts = measured.flux[..., None] * measured.model / np.where(measured.weight > 0, measured.weight, 1.0)
     counts = np.where(measured.used[..., None], counts, 0.0)
-    median, seen = np.zeros(counts.shape[1:]), measured.used.any(axis=0)
-    median[seen] = np.nanmedian(np.where(measured.used[..., None], counts, np.nan)[:, seen], axis=0)
+    median, exposed = np.zeros(counts.shape[1:]), measured.used.any(axis=0)
+    median[exposed] = np.nanmedian(np.where(measured.used[..., None], counts, np.nan)[:, exposed], axis=0)
     typical = float(np.median(counts[measured.used])) if measured.used.any() else 0.0
 
     def single(k: int, change: np.ndarray, width: float, words: str, unit: str, shown_by: str) -> _Single:
@@ -315,8 +318,8 @@ def _of_cameras(design: Design) -> Iterator[_Single]:
         rows = design.stacked([-column[measured.used].reshape(-1, 1)])
 
         name = words.format(names[k])
-        said = functools.partial(_told, f"{name} of", unit=unit)
-        return _Single(Candidate(name, rows, np.array([width])), said, width, unit, shown_by)
+        wording = functools.partial(_worded, f"{name} of", unit=unit)
+        return _Single(Candidate(name, rows, np.array([width])), wording, width, unit, shown_by)
 
     if not measured.used.any():
         return
@@ -325,28 +328,33 @@ def _of_cameras(design: Design) -> Iterator[_Single]:
         level = np.broadcast_to(median[:, k], counts.shape[:2])
         yield single(k, level, 0.003, "scattered light in {}", "of the median counts", _LEVELS)
         yield single(k, np.ones_like(counts[..., k]), 0.003 * typical, "a pedestal in {}", "electrons", _DARK)
-        for other in range(measured.cameras):
-            if other != k:
-                words = f"light of {names[other]} in {{}}"
-                yield single(k, counts[..., other], 0.02, words, "of its counts", _ONE_STAR)
+        for source in range(measured.cameras):
+            if source != k:
+                words = f"light of {names[source]} in {{}}"
+                yield single(k, counts[..., source], 0.02, words, "of its counts", _ONE_STAR)
 
 
 def _asked_effects(design: Design) -> tuple[Probe, ...]:
     """Probes of effects that the model has not; those with a place or a gap of their own are left to the patterns."""
     fit = design.fit
     template, calset = fit.model.template, fit.calset
-    context, known = effect_context(template, calset.exposures), (*fit.model.effect_names, *_ASKED_OTHERWISE)
-    kinds = [kind for kind in fit.model.catalogue if kind.name not in known and not set(kind.shape) & _PLACES]
+    context, excluded = (
+        effect_context(template, calset.exposures),
+        (*fit.model.effect_names, *_ASKED_OTHERWISE),
+    )
+    kinds = [
+        kind for kind in fit.model.catalogue if kind.name not in excluded and not set(kind.shape) & _PLACES
+    ]
     return tuple(probes(applicable(kinds, context, template), context))
 
 
-def _of_catalogue(design: Design, asked: Sequence[Probe]) -> Iterator[_Single]:
+def _of_catalogue(design: Design, effects: Sequence[Probe]) -> Iterator[_Single]:
     """The effects that are asked, as far as the set can show them."""
     fit = design.fit
     template = fit.model.template
-    wanted = showable(fit.calset, template, asked)
-    named, _ = all_candidates(design.columns, wanted, ())
-    for probe in (one for one in wanted if one.name in named):
+    testable = showable(fit.calset, template, effects)
+    named, _ = all_candidates(design.columns, testable, ())
+    for probe in (probe for probe in testable if probe.name in named):
         rows = design.stacked([named[probe.name].columns])
         yield _Single(
             Candidate(probe.name, rows, probe.widths),
@@ -370,7 +378,7 @@ def _effect_in_words(probe: Probe, score: Score, cameras: Sequence[str]) -> str:
     return f"{effect.name}, {', '.join(texts)}"
 
 
-def _told(
+def _worded(
     what: str, score: Score, number: int = 0, unit: str = "", start: float = 0.0, width: float = 1.0
 ) -> str:
     """An amplitude of a score in words, counted from `start` in units of `width`, with its standard error."""
@@ -380,39 +388,39 @@ def _told(
 
 def _in_words(stated: _Stated, score: Score) -> str:
     if stated.value is None:
-        return f"{_told(f'{stated.what} changed by', score, unit=stated.unit)} ({stated.remedy})"
-    found = _told(stated.what, score, unit=stated.unit, start=stated.value)
-    return f"{found}, not {stated.value:g} ({stated.remedy})"
+        return f"{_worded(f'{stated.what} changed by', score, unit=stated.unit)} ({stated.remedy})"
+    text = _worded(stated.what, score, unit=stated.unit, start=stated.value)
+    return f"{text}, not {stated.value:g} ({stated.remedy})"
 
 
 def condition_scores(design: Design) -> list[_Scored]:
     """The numbers that a set states, each with the score of changing it."""
-    found = scored(design, tuple(_conditions(design)))
+    singles = scored(design, tuple(_conditions(design)))
     return [
-        _Scored(one.stated, found.table[one.candidate.name], one.candidate.columns[:, 0], float(left))
-        for one, left in zip(found.rivals, found.left, strict=True)
-        if one.stated is not None
+        _Scored(r.stated, singles.table[r.candidate.name], r.candidate.columns[:, 0], float(info))
+        for r, info in zip(singles.rivals, singles.left, strict=True)
+        if r.stated is not None
     ]
 
 
-def _columns(design: Design, asked: Sequence[_Stated]) -> Iterator[Float[np.ndarray, " _"]]:
-    of_field = [one for one in asked if one.along is not None]
-    by_place = [_column(design, one) for one in of_field[:2]]  # X and Y come first
-    for one in asked:
-        if one.along is None:
-            yield _column(design, one)
+def _columns(design: Design, statements: Sequence[_Stated]) -> Iterator[Float[np.ndarray, " _"]]:
+    of_field = [item for item in statements if item.along is not None]
+    by_place = [_column(design, item) for item in of_field[:2]]  # X and Y come first
+    for item in statements:
+        if item.along is None:
+            yield _column(design, item)
         else:
-            (in_x, in_y), (by_x, by_y) = one.along, by_place
+            (in_x, in_y), (by_x, by_y) = item.along, by_place
             yield in_x[design.point] * by_x + in_y[design.point] * by_y
 
 
-def _column(design: Design, one: _Stated) -> np.ndarray:
+def _column(design: Design, statement: _Stated) -> np.ndarray:
     def residual(step: float) -> np.ndarray:
-        likelihood = Likelihood.of(one.changed(step), design.fit.model)
+        likelihood = Likelihood.of(statement.changed(step), design.fit.model)
         return likelihood.residuals(design.fit.values)[1][design.measured.used].reshape(-1)
 
-    step = STEP * one.width
-    if one.along is None:  # smooth: what a one-sided difference leaves out is as small as the step
+    step = STEP * statement.width
+    if statement.along is None:  # smooth: what a one-sided difference leaves out is as small as the step
         return (residual(step) - design.measured.residual[design.measured.used].reshape(-1)) / step
     return (residual(step) - residual(-step)) / (2.0 * step)
 
@@ -484,14 +492,18 @@ def _of_sky(calset: CalibrationSet) -> Iterator[_Stated]:
             moved = functools.partial(_moved, calset, moon, name.lower(), 1.0)
             yield _Stated(f"{name} of sky exposures", unit, remedy, shown_by, width, moved)
         for name, width in (("longitude", 180.0), ("latitude", 90.0)):
-            there = float(getattr(site, name))
+            coordinate = float(getattr(site, name))
 
-            def elsewhere(step: float, name: str = name, there: float = there) -> CalibrationSet:
-                moved = float(np.clip(there + step, -90.0, 90.0)) if name == "latitude" else there + step
+            def elsewhere(step: float, name: str = name, coordinate: float = coordinate) -> CalibrationSet:
+                moved = (
+                    float(np.clip(coordinate + step, -90.0, 90.0))
+                    if name == "latitude"
+                    else coordinate + step
+                )
                 return dataclasses.replace(calset, site=dataclasses.replace(site, **{name: moved}))
 
             remedy, shown_by = "check the site in the header", "the position of the telescope on a map"
-            yield _Stated(f"the {name} of the site", "deg", remedy, shown_by, width, elsewhere, there)
+            yield _Stated(f"the {name} of the site", "deg", remedy, shown_by, width, elsewhere, coordinate)
     for kind in np.unique(e.kind[np.isfinite(e.rotator)]):
         remedy = "check its zero and its sense (docs: conventions)"
         moved = functools.partial(_moved, calset, e.kind == kind, "rotator", 1.0)
@@ -506,10 +518,10 @@ def _of_field(calset: CalibrationSet) -> Iterator[_Stated]:
     check = "check X and Y against the frames (docs: conventions)"
     solved = "an independent check of the field positions"
     x, y = calset.points.x, calset.points.y
-    radius, one = float(np.hypot(x, y).max()), np.ones(len(x))
+    radius, ones = float(np.hypot(x, y).max()), np.ones(len(x))
     for what, unit, width, along in (
-        ("X of all field points", "deg", radius, (one, 0.0 * one)),
-        ("Y of all field points", "deg", radius, (0.0 * one, one)),
+        ("X of all field points", "deg", radius, (ones, 0.0 * ones)),
+        ("Y of all field points", "deg", radius, (0.0 * ones, ones)),
         ("the scale of X and Y", "", 1.0, (x, y)),
         ("the angle of the field", "rad", 1.0, (-y, x)),
     ):

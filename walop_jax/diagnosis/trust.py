@@ -90,10 +90,10 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
     near = result.explains_data or result.nearly_explains_data
     if not (near or as_written):
         refuse_mixups(result)
-    whole = on_field_points(result)
+    field_fit = on_field_points(result)
     if not near and (scaled := tuple(_errors_too_small(result, seed))):
         return result.judged(scaled)
-    design = Design.of(sampled(whole, _most(whole)))
+    design = Design.of(sampled(field_fit, _most(field_fit)))
     if result.errors_too_large and _hold_no_noise(design):
         return result.judged(noiseless=True)
     pixels = _of_pixels(result)
@@ -111,18 +111,18 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
             *repeated_noise(design),
         )
     else:  # anything may be in such residuals; what single places of the field share sits on stars as well
-        components = [one for one in components if one.grouping.structure]
+        components = [component for component in components if component.grouping.structure]
         doubts = (*stated_conditions(design), *in_words(components))
     doubts = (*doubts, *_summed_pixels(result), *_far_from_pixels(result))
     structure = structure_of(components)
-    found = with_honest_errors(result)
+    final = with_honest_errors(result)
     if structure:
-        of_points = [one for one in components if not any(one is other for other in pixels)]
-        found = with_structure(found, design, of_points, len(whole.calset.points))
-    found = found.judged(doubts, structure=_with_summed_pixels(result, structure))
+        of_points = [component for component in components if not any(component is pixel for pixel in pixels)]
+        final = with_structure(final, design, of_points, len(field_fit.calset.points))
+    final = final.judged(doubts, structure=_with_summed_pixels(result, structure))
     if unseen := hidden.not_measured() if hidden is not None else ():
-        found = found.remarked(NOT_MEASURED.format("; ".join(unseen)))
-    return dataclasses.replace(found, hidden=hidden)
+        final = final.remarked(NOT_MEASURED.format("; ".join(unseen)))
+    return dataclasses.replace(final, hidden=hidden)
 
 
 def _of_pixels(result: FitResult) -> list[VarianceComponent]:
@@ -134,28 +134,28 @@ def _of_pixels(result: FitResult) -> list[VarianceComponent]:
 
 def _summed_pixels(result: FitResult) -> Iterator[str]:
     """Findings in the pixels that a set stands for, when they were summed."""
-    found = result.calset.compression
-    if found is None:
+    compression = result.calset.compression
+    if compression is None:
         return
-    if found.gain is None and not result.explains_data:
+    if compression.gain is None and not result.explains_data:
         yield (
-            f"χ² of the {found.pixels} pixels that were summed lies {result.excess:.3g} standard deviations above its "
-            "expectation, and nobody looked for the cause: compress the frames again"
+            f"χ² of the {compression.pixels} summed pixels lies {result.excess:.3g} standard deviations above its "
+            "expectation, and the cause was not searched for: compress the frames again"
         )
-    elif found.gain or found.response:
+    elif compression.gain or compression.response:
         yield (
             "residuals of the same pixel agreed between exposures when the pixels were summed: structure of "
-            f"{max(found.gain or 0.0, found.response or 0.0):.2g} that the model does not have"
+            f"{max(compression.gain or 0.0, compression.response or 0.0):.2g} that the model does not have"
         )
 
 
 def _with_summed_pixels(result: FitResult, structure: Structure) -> Structure:
     """The structure of field points with that of the pixels that they stand for."""
-    found = result.calset.compression
-    if found is None:
+    compression = result.calset.compression
+    if compression is None:
         return structure
-    gain = np.hypot(structure.gain, found.gain or 0.0)
-    return Structure(float(gain), float(np.hypot(structure.response, found.response or 0.0)))
+    gain = np.hypot(structure.gain, compression.gain or 0.0)
+    return Structure(float(gain), float(np.hypot(structure.response, compression.response or 0.0)))
 
 
 def pixel_structure(result: FitResult) -> Structure:
@@ -172,8 +172,8 @@ def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:
     """A warning if residuals far larger than the stated errors are nothing but noise."""
     factor = float(np.sqrt(result.chi2 / max(result.dof, 1)))
     scaled = fit(result.likelihood, start=result.values, noise_scale=factor)
-    whole = on_field_points(scaled)
-    design = Design.of(sampled(whole, _most(whole)))
+    field_fit = on_field_points(scaled)
+    design = Design.of(sampled(field_fit, _most(field_fit)))
     rough = found_components([*variance_components(design), *_of_pixels(scaled)])
     rough = rough or any(_summed_pixels(result))
     if pattern_scores(design, seed).p_global >= thresholds.ALARM and not (rough or any(_groups(design))):
@@ -196,8 +196,8 @@ def _far_from_pixels(result: FitResult) -> Iterator[str]:
 def _hold_no_noise(design: Design) -> bool:
     """True if the data are the model's at some values of its parameters: what priors pull at, noise has not made."""
     data = slice(0, design.rows)
-    left = Projector(design.jacobian[data])(design.residual[data])
-    return float(left @ left) < NOISELESS * design.rows
+    remainder = Projector(design.jacobian[data])(design.residual[data])
+    return float(remainder @ remainder) < NOISELESS * design.rows
 
 
 def sampled(result: FitResult, most: int) -> FitResult:
@@ -239,37 +239,37 @@ def group_scores(design: Design) -> list[_GroupScore]:
     w = np.where(measured.known[..., None], 0.0, measured.model**2 / np.where(power > 0, power, 1.0))
     absorbed = design.cube(np.sum(design.projector.basis**2, axis=1))
     expected = np.where(measured.used[..., None], np.clip(1.0 - w - absorbed, 0.0, None), 0.0)
-    found = []
+    scores = []
     for name, chosen in _groups_of(design).items():
         group = np.broadcast_to(chosen, residual.shape) & measured.used[..., None]
-        rest = ~group & measured.used[..., None]
-        means = [float(expected[part].sum()) for part in (group, rest)]
+        complement = ~group & measured.used[..., None]
+        means = [float(expected[subset].sum()) for subset in (group, complement)]
         if min(means) <= 0:
             continue
         # ‖P‖² among what has a flux in common; what the parameters couple beyond that is small beside it.
-        taken = [np.where(part, w, 0.0) for part in (group, rest)]
-        sums = [shared.summed(part) for part in taken]
-        own = [
-            np.where(part, (1.0 - w) ** 2 - w**2, 0.0).sum() + np.sum(t * s)
-            for part, t, s in zip((group, rest), taken, sums, strict=True)
+        flux_shares = [np.where(subset, w, 0.0) for subset in (group, complement)]
+        sums = [shared.summed(subset) for subset in flux_shares]
+        squared_norms = [
+            np.where(subset, (1.0 - w) ** 2 - w**2, 0.0).sum() + np.sum(t * s)
+            for subset, t, s in zip((group, complement), flux_shares, sums, strict=True)
         ]
-        variance = 2.0 * (own[0] / means[0] ** 2 + own[1] / means[1] ** 2)
-        variance -= 4.0 * np.sum(taken[0] * sums[1]) / (means[0] * means[1])
-        squares = [float(np.sum(residual[part] ** 2)) for part in (group, rest)]
+        variance = 2.0 * (squared_norms[0] / means[0] ** 2 + squared_norms[1] / means[1] ** 2)
+        variance -= 4.0 * np.sum(flux_shares[0] * sums[1]) / (means[0] * means[1])
+        squares = [float(np.sum(residual[subset] ** 2)) for subset in (group, complement)]
         ratio = squares[0] / means[0] / max(squares[1] / means[1], 1e-300)
         degrees = 2.0 / variance
         above = float(special.chdtrc(degrees, ratio * degrees))
-        found.append(_GroupScore(name, ratio, 2.0 * min(above, 1.0 - above)))
-    return found
+        scores.append(_GroupScore(name, ratio, 2.0 * min(above, 1.0 - above)))
+    return scores
 
 
 def _groups_of(design: Design) -> Mapping[str, Bool[np.ndarray, "1 e k"]]:
     e, cameras = design.fit.calset.exposures, design.fit.model.template.cameras.names
-    every = np.ones((1, len(e), len(cameras)), bool)
-    groups = {f"camera {name}": every & (np.arange(len(cameras)) == k) for k, name in enumerate(cameras)}
+    all_data = np.ones((1, len(e), len(cameras)), bool)
+    groups = {f"camera {name}": all_data & (np.arange(len(cameras)) == k) for k, name in enumerate(cameras)}
     for what, labels in (("kind", e.kind), ("filter", e.filter), ("exposure", e.exposure)):
         for label in np.unique(labels):
-            groups[f"{what} {label}"] = every & (labels == label)[None, :, None]
+            groups[f"{what} {label}"] = all_data & (labels == label)[None, :, None]
     return groups
 
 

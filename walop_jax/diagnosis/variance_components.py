@@ -80,7 +80,11 @@ def variance_components(design: Design, *, pixels: bool = False) -> list[Varianc
     residual = design.projector(design.residual)
     square = float(residual @ residual)
     ready = (asked(design, grouping, residual[:, None]) for grouping in groupings(design, pixels=pixels))
-    return [one[0].answered(one[1][:, 0], square) for one in ready if one is not None and square > 0]
+    return [
+        prepared[0].answered(prepared[1][:, 0], square)
+        for prepared in ready
+        if prepared is not None and square > 0
+    ]
 
 
 def found_components(components: list[VarianceComponent]) -> list[VarianceComponent]:
@@ -89,29 +93,29 @@ def found_components(components: list[VarianceComponent]) -> list[VarianceCompon
     return sorted((c for c in components if c.p_value < limit), key=lambda c: c.p_value)
 
 
-def in_words(found: list[VarianceComponent]) -> Iterator[str]:
+def in_words(components: list[VarianceComponent]) -> Iterator[str]:
     """One sentence on what was found; a grouping that is asked as well often answers to the same structure."""
-    if not found:
+    if not components:
         return
-    first = found[0]
-    more = ", ".join(f"{c.grouping.name} {c.deviate:.2g} σ" for c in found[1 : 1 + _SHOWN])
+    first = components[0]
+    further = ", ".join(f"{c.grouping.name} {c.deviate:.2g} σ" for c in components[1 : 1 + _SHOWN])
     yield (
         f"residuals {first.grouping.words}, {first.deviate:.2g} σ: structure of {first.size:.2g} that the model does "
-        f"not have" + (f" (also {more})" if more else "")
+        f"not have" + (f" (also {further})" if further else "")
     )
 
 
-def structure_of(found: list[VarianceComponent]) -> Structure:
+def structure_of(components: list[VarianceComponent]) -> Structure:
     """Differences between field points, of the components that were found."""
 
     def size(name: str) -> float:
-        return float(np.sqrt(sum(c.size**2 for c in found if c.grouping.structure == name)))
+        return float(np.sqrt(sum(c.size**2 for c in components if c.grouping.structure == name)))
 
     return Structure(size("gain"), size("response"))
 
 
 def with_structure(
-    result: FitResult, design: Design, found: list[VarianceComponent], points: int
+    result: FitResult, design: Design, components: list[VarianceComponent], points: int
 ) -> FitResult:
     """The fit with what the structure of field points does to its parameters added to their covariance.
 
@@ -120,13 +124,13 @@ def with_structure(
     """
     rows, size = design.jacobian.shape
     added, places = np.zeros((size, size)), 1
-    for component in found:
+    for component in components:
         blocks = _blocks(design, component.grouping, np.zeros((rows, 0)))
         if not component.grouping.structure or blocks is None:
             continue
         places, basis = len(blocks[0]), design.projector.basis
-        taken = design.taken_up(blocks[1].reshape(-1, basis.shape[1]).T)
-        added += component.size**2 * taken @ taken.T
+        response = design.taken_up(blocks[1].reshape(-1, basis.shape[1]).T)
+        added += component.size**2 * response @ response.T
     share = len(design.fit.calset.points) ** 2 / (places * points)
     select = result.model.selection()
     return dataclasses.replace(
@@ -141,21 +145,21 @@ def groupings(design: Design, *, pixels: bool = False) -> Iterator[_Grouping]:
     """The groupings that the data have; of two that cut them alike, the first."""
     measured, calset = design.measured, design.fit.calset
     e, points, used = calset.exposures, calset.points, measured.used
-    one = np.ones((*used.shape, 1))
+    constant = np.ones((*used.shape, 1))
     stokes = measured.likelihood.stokes(measured.values)[..., 1:3]
     reach = max(float(np.hypot(points.x, points.y).max(initial=0.0)), 1e-12)
     plane = np.stack([np.ones(len(points)), points.x / reach, points.y / reach], axis=-1)
     plane = np.broadcast_to(plane[:, None], (*used.shape, 3))
     point = "pixel" if pixels else "field point"
     agree = f"of the same {point} agree between exposures"
-    every = -(-used.shape[0] // MOST_PLACES)
+    stride = -(-used.shape[0] // MOST_PLACES)
     number = np.arange(used.shape[0])
-    at_points = np.where(number % every == 0, number // every, -1)[:, None]
+    at_points = np.where(number % stride == 0, number // stride, -1)[:, None]
     at_points = np.broadcast_to(at_points, used.shape)
     if used.shape[0] > 1:
-        yield _Grouping(f"{point}s", agree, at_points, one, "gain")
-        said = f"{agree} in q and u"
-        yield _Grouping(f"{point}s in q and u", said, at_points, stokes, "response")
+        yield _Grouping(f"{point}s", agree, at_points, constant, "gain")
+        agree_in_qu = f"{agree} in q and u"
+        yield _Grouping(f"{point}s in q and u", agree_in_qu, at_points, stokes, "response")
     if pixels:
         return
     positions = [
@@ -163,17 +167,17 @@ def groupings(design: Design, *, pixels: bool = False) -> Iterator[_Grouping]:
     ]
     night = night_of(e.mjd, calset.site.longitude)
     source = calset.intensities.block(0, len(points)).source
-    seen = [np.zeros(used.shape, int)]
+    cuts = [np.zeros(used.shape, int)]
     for name, words, place, features in (
         ("exposures", "of the same exposure agree between field points", _numbered(e.exposure), plane),
         ("states", "of the same filter and moving elements agree", _numbered(e.filter, *positions), stokes),
-        ("sources", "of the same standard agree", source, np.concatenate([one, stokes], axis=-1)),
+        ("sources", "of the same standard agree", source, np.concatenate([constant, stokes], axis=-1)),
         ("nights", "of the same night agree", _numbered(night), plane),
         ("kinds", "of the same kind of exposure agree", _numbered(e.kind), plane),
     ):
         place = np.broadcast_to(place, used.shape)
-        if len(np.unique(place[used])) > 1 and not any(np.array_equal(place, other) for other in seen):
-            seen.append(place)
+        if len(np.unique(place[used])) > 1 and not any(np.array_equal(place, earlier) for earlier in cuts):
+            cuts.append(place)
             yield _Grouping(name, words, place, features)
 
 
@@ -217,16 +221,16 @@ def asked(
     db, dd = d @ b, d @ d
     flat, along = b.reshape(-1, b.shape[-1]), db.reshape(-1, b.shape[-1])
     m, m2, m3 = flat.T @ flat, flat.T @ along, along.T @ along
-    whole = float(np.einsum("laa->", d))
-    first = whole - np.trace(m)
+    trace = float(np.einsum("laa->", d))
+    first = trace - np.trace(m)
     second = np.sum(d**2) - 2.0 * np.trace(m2) + np.sum(m**2)
     third = np.sum(dd * d) - 3.0 * np.trace(m3) + 3.0 * np.sum(m2 * m) - np.sum(m @ m * m)
     share = first / max(free, 1)
-    known = second - share * first
-    if not (free > 0 and first > 1e-6 * whole and known > 1e-6 * second):
+    variance = second - share * first
+    if not (free > 0 and first > 1e-6 * trace and variance > 1e-6 * second):
         return None
-    skew = 8.0 * (third - 3.0 * share * second + 2.0 * share**2 * first) / (2.0 * known) ** 1.5
-    question = _Question(grouping, free, float(share), float(np.sqrt(2.0 / known)), float(skew))
+    skew = 8.0 * (third - 3.0 * share * second + 2.0 * share**2 * first) / (2.0 * variance) ** 1.5
+    question = _Question(grouping, free, float(share), float(np.sqrt(2.0 / variance)), float(skew))
     return question, pull.reshape(-1, pull.shape[-1])
 
 
@@ -266,20 +270,20 @@ def _blocks(
     for label, start, stop in zip(labels, starts, [*starts[1:], len(order)], strict=True):
         if label < 0:
             continue
-        here = order[start:stop]
-        if here[-1] - here[0] == len(here) - 1:
-            here = slice(here[0], here[-1] + 1)  # rows of a field point lie together: no copy
-        c, a = change[here].transpose(1, 2, 0), along[here]
+        members = order[start:stop]
+        if members[-1] - members[0] == len(members) - 1:
+            members = slice(members[0], members[-1] + 1)  # rows of a field point lie together: no copy
+        c, a = change[members].transpose(1, 2, 0), along[members]
         if group is not None:
-            a = np.equal.outer(np.unique(group[here]), group[here]).astype(float) @ a
+            a = np.equal.outer(np.unique(group[members]), group[members]).astype(float) @ a
         block = -(a.T @ a) * together
-        own = c @ c.transpose(0, 2, 1)
+        squares = c @ c.transpose(0, 2, 1)
         for k in range(cameras):
             at = slice(k * width, (k + 1) * width)
-            block[at, at] += own[k]
+            block[at, at] += squares[k]
         found_d.append(block)
-        found_b.append((c @ rows[here].transpose(1, 0, 2)).reshape(cameras * width, -1))
+        found_b.append((c @ rows[members].transpose(1, 0, 2)).reshape(cameras * width, -1))
     if len(found_d) < 2:
         return None
-    both = np.stack(found_b)
-    return np.stack(found_d), both[..., : basis.shape[1]], both[..., basis.shape[1] :]
+    stacked = np.stack(found_b)
+    return np.stack(found_d), stacked[..., : basis.shape[1]], stacked[..., basis.shape[1] :]

@@ -74,21 +74,21 @@ def diagnose(
     catalogue = model.catalogue if catalogue is None else catalogue
     calset = in_field_points(calset, model, tell, pixel_structure)
     context = effect_context(model.template, calset.exposures)
-    asked = hypotheses(catalogue, model.template, calset.exposures, len(calset.points))
-    some = thinned(calset, most_points(calset, model.template, asked.amplitudes), neighbours=1)
-    if len(some.points) < len(calset.points):
-        tell(f"looking at {len(some.points)} of {len(calset.points)} field points")
+    candidates = hypotheses(catalogue, model.template, calset.exposures, len(calset.points))
+    sample = thinned(calset, most_points(calset, model.template, candidates.amplitudes), neighbours=1)
+    if len(sample.points) < len(calset.points):
+        tell(f"looking at {len(sample.points)} of {len(calset.points)} field points")
     tell(Stage("fitting the model", "fitting"))
-    before = fit(Likelihood.of(some, model))
+    before = fit(Likelihood.of(sample, model))
     readings = () if as_written else mixups_of(before)
     if readings and readings[0].explained < thresholds.READING_SURE:
         raise refusal(before, readings)
     judge = Refits(
         context=context,
-        catalogue=asked.effects,
-        wanted=asked.names,
-        sentences=asked.sentences,
-        parts=asked.parts,
+        catalogue=candidates.effects,
+        wanted=candidates.names,
+        sentences=candidates.sentences,
+        parts=candidates.parts,
         rng=np.random.default_rng(seed),
         tell=tell,
         minutes=np.inf if minutes is None else minutes,
@@ -103,10 +103,10 @@ def diagnose(
     if remainder and readings and readings[0].explained * after.dof < after.chi2:
         raise refusal(before, readings)
     if (state.steps or remainder) and (stated := instead_of_names(before, after)):
-        parts = () if remainder is None else remainder.parts
-        names = ", ".join([step.effect.name for step in state.steps] or parts) or "none that holds"
+        partial = () if remainder is None else remainder.parts
+        names = ", ".join([step.effect.name for step in state.steps] or partial) or "none that holds"
         text = f"one number that the set states explains more than names do ({names}), if it is {stated}"
-        remainder = Unexplained(first.evidence.table.p_global, text, (), parts=parts)
+        remainder = Unexplained(first.evidence.table.p_global, text, (), parts=partial)
         state = back_to(first, state)
         after = before
     evidence, added = state.evidence, [step.effect.name for step in state.steps]
@@ -115,12 +115,12 @@ def diagnose(
     tell("examining what is left")
     alike = {name for step in steps for name in (*step.equivalent, *step.nameless)} - {Described.name}
     groups = [name for step in state.steps for name in step.said]
-    found = Diagnosis(
+    diagnosis = Diagnosis(
         verdict=verdict,
         steps=steps,
         candidates=first.evidence.summary(),
         limits=tuple(evidence.limits()),
-        untestable=first.evidence.untestable(asked.effects),
+        untestable=first.evidence.untestable(candidates.effects),
         unexplained=remainder,
         p_value=first.evidence.table.p_global,
         remaining_p=evidence.table.p_global,
@@ -135,41 +135,41 @@ def diagnose(
         ended=state.ended or (judge.over(state.fits) if remainder else ""),
         members=classes_of(evidence, context, set(added), groups, alike),
         rounds=state.rounds,
-        not_scored=_not_scored(catalogue, asked),
-        descriptions=len(asked.sentences) + len(asked.parts),
+        not_scored=_not_scored(catalogue, candidates),
+        descriptions=len(candidates.sentences) + len(candidates.parts),
     )
     del first, state, evidence  # the columns of all candidates, gigabytes of a large set
-    return _examined(found, seed)
+    return _examined(diagnosis, seed)
 
 
-def _examined(found: Diagnosis, seed: int) -> Diagnosis:
+def _examined(diagnosis: Diagnosis, seed: int) -> Diagnosis:
     """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked."""
-    after = examined(with_honest_errors(found.after), seed, as_written=True)
-    for sentence in only_a_class(found.members):
+    after = examined(with_honest_errors(diagnosis.after), seed, as_written=True)
+    for sentence in only_a_class(diagnosis.members):
         after = after.doubted(Quality.CLASS_ONLY, sentence)
-    after = with_average(after, found.members)
-    if found.before is found.after:
-        return dataclasses.replace(found, before=after, after=after)
-    for sentence in rival_conditions(Design.of(found.before), found.after.chi2):
+    after = with_average(after, diagnosis.members)
+    if diagnosis.before is diagnosis.after:
+        return dataclasses.replace(diagnosis, before=after, after=after)
+    for sentence in rival_conditions(Design.of(diagnosis.before), diagnosis.after.chi2):
         after = after.remarked(sentence)
     # Where χ² speaks against the model given, the steps say what is missing.
-    explained = found.before.explains_data or found.before.nearly_explains_data
-    before = found.before.judged()
+    explained = diagnosis.before.explains_data or diagnosis.before.nearly_explains_data
+    before = diagnosis.before.judged()
     if explained:
-        before = examined(found.before, seed, as_written=True)
-    return dataclasses.replace(found, before=before, after=after)
+        before = examined(diagnosis.before, seed, as_written=True)
+    return dataclasses.replace(diagnosis, before=before, after=after)
 
 
-def _not_scored(catalogue: Sequence[EffectKind], asked: Hypotheses) -> dict[str, str]:
+def _not_scored(catalogue: Sequence[EffectKind], candidates: Hypotheses) -> dict[str, str]:
     """Everything that was not scored, by name, each with the reason."""
-    probed = {probe.effect for probe in asked.names}
-    scored = {probe.name for probe in (*asked.sentences, *(probe for probe, _ in asked.parts))}
+    probed = {probe.effect for probe in candidates.names}
+    scored = {probe.name for probe in (*candidates.sentences, *(probe for probe, _ in candidates.parts))}
     reasons = {
-        one.name: "the instrument has nothing that it acts on"
-        for one in catalogue
-        if one not in asked.effects
+        kind.name: "the instrument has nothing that it acts on"
+        for kind in catalogue
+        if kind not in candidates.effects
     }
-    for effect in asked.effects:
+    for effect in candidates.effects:
         if effect.is_structural():
             reasons[effect.name] = (
                 f"it has no amplitude and no score: it is tried where χ²/dof is above {thresholds.POOR_FIT:g} and no "
@@ -178,7 +178,7 @@ def _not_scored(catalogue: Sequence[EffectKind], asked: Hypotheses) -> dict[str,
         elif effect not in probed:
             reasons[effect.name] = "the exposures have nothing that it acts on"
     name = "it is an effect of the catalogue by another name"
-    return reasons | {probe.name: name for probe in asked.every if probe.name not in scored}
+    return reasons | {probe.name: name for probe in candidates.every if probe.name not in scored}
 
 
 def _promise(choice: Choice) -> tuple[float, float]:
@@ -191,7 +191,7 @@ def _finished(trial: Trial, evidence: Examination, context: Context, added: Sequ
     result, name = evidence.result, trial.effect.name
     change = signature(result, name, context)
     separation = evidence.separation(name, change)
-    close = {other for other, s in separation.items() if s < thresholds.SEPARATION} | set(trial.rivals)
+    close = {rival for rival, s in separation.items() if s < thresholds.SEPARATION} | set(trial.rivals)
     close -= set(added)
     effect = result.model.instrument(result.values).effect(name)
     standard = np.asarray(values_of(effect.standard_form())) if not effect.kind.is_structural() else ()
@@ -210,7 +210,7 @@ def _finished(trial: Trial, evidence: Examination, context: Context, added: Sequ
         far=beyond_prior(result, name),
         choices=spoken_choices(effect),
         robust_ratio=evidence.design.robust_ratio(name),
-        equivalent=tuple(sorted(close, key=lambda other: (separation.get(other, np.inf), other))),
+        equivalent=tuple(sorted(close, key=lambda rival: (separation.get(rival, np.inf), rival))),
         separation=separation,
         separated_by=effect.kind.separated_by if close or trial.nameless else "",
         where=describe(evidence.design, change),
