@@ -54,10 +54,10 @@ def changed(instrument: Instrument, sentence: str) -> Instrument:
 
     Raises ValueError, with the nearest sentences, for one that the instrument has no place for.
     """
-    for part in sentence.split(JOINED) if sentence else ():
-        known = alternatives(instrument)
-        check_names(f"change of {instrument.name}", [part], known)
-        instrument = known[part](instrument)
+    for name in sentence.split(JOINED) if sentence else ():
+        available = alternatives(instrument)
+        check_names(f"change of {instrument.name}", [name], available)
+        instrument = available[name](instrument)
     return instrument
 
 
@@ -93,7 +93,7 @@ def _layers(instrument: Instrument) -> Iterator[Named]:
     yield from _each_and_all(
         [place for place, plate in _used(instrument, WavePlate).items() if len(plate.layers) > 1],
         "with layers in the other order",
-        lambda i, place: i.changed(place, layers=lambda own: own[::-1]),
+        lambda i, place: i.changed(place, layers=lambda layers: layers[::-1]),
     )
 
 
@@ -124,19 +124,19 @@ def _beams(instrument: Instrument) -> Iterator[Named]:
         "with exchanged beams",
         lambda i, place: _with_cameras(i, {place: _used(i, Analyser)[place].cameras[::-1]}),
     )
-    for one, other in itertools.combinations(arms, 2):
-        places = [f"{arm.name}.{arm.analyser.name}" for arm in (one, other)]
-        seen = dict(zip(places, (other.analyser.cameras, one.analyser.cameras), strict=True))
-        what = f"{one.name} and {other.name} with exchanged cameras"
-        yield what, lambda i, seen=seen: _with_cameras(i, seen)
+    for first, second in itertools.combinations(arms, 2):
+        places = [f"{arm.name}.{arm.analyser.name}" for arm in (first, second)]
+        cameras = dict(zip(places, (second.analyser.cameras, first.analyser.cameras), strict=True))
+        what = f"{first.name} and {second.name} with exchanged cameras"
+        yield what, lambda i, cameras=cameras: _with_cameras(i, cameras)
 
 
 def _with_cameras(instrument: Instrument, names: dict[str, tuple[str, ...]]) -> Instrument:
     """The instrument with other cameras behind the analysers at some places."""
     for place, cameras in names.items():
         instrument = instrument.changed(place, cameras=cameras)
-    known = instrument.cameras.names
-    arms = tuple(tuple(map(known.index, arm.analyser.cameras)) for arm in instrument.arms)
+    order = instrument.cameras.names
+    arms = tuple(tuple(map(order.index, arm.analyser.cameras)) for arm in instrument.arms)
     return dataclasses.replace(instrument, cameras=dataclasses.replace(instrument.cameras, arms=arms))
 
 
@@ -149,8 +149,8 @@ def _order(instrument: Instrument) -> Iterator[Named]:
             def exchanged(
                 instrument: Instrument, holder: str = holder, first: str = first, second: str = second
             ) -> Instrument:
-                other = {first: second, second: first}
-                return instrument.changed(holder, path=lambda way: tuple(other.get(n, n) for n in way))
+                swapped = {first: second, second: first}
+                return instrument.changed(holder, path=lambda way: tuple(swapped.get(n, n) for n in way))
 
             yield f"{prefix}{first} behind {prefix}{second}", exchanged
 
@@ -184,12 +184,12 @@ def _dispersion(instrument: Instrument) -> Iterator[Named]:
     """Every plate of a crystal with another published curve of it."""
     plates = _used(instrument, WavePlate)
     used = {layer.material for plate in plates.values() for layer in plate.layers}
-    for crystal, others in materials.OTHER_CURVES.items():
-        family = (crystal, *others)
+    for crystal, curves in materials.OTHER_CURVES.items():
+        family = (crystal, *curves)
         for material in family:
             if material in used or not used & set(family):
                 continue
-            source = others.get(material) or materials.CRYSTALS[material].source.split(",")[0]
+            source = curves.get(material) or materials.CRYSTALS[material].source.split(",")[0]
 
             def changed_curve(
                 instrument: Instrument, material: str = material, family: tuple[str, ...] = family

@@ -46,11 +46,11 @@ def made_by(kind: str) -> str:
 def with_origins(text: str, elements: Sequence[Element]) -> str:
     """A description with a line for each kind of element of one's own: whoever reads it elsewhere needs the class."""
     lines = {}
-    for one in elements:
-        if not any(type(one) is kind for kind in ELEMENTS) and made_by(one.kind) not in text:
-            module = sys.modules.get(type(one).__module__)
+    for element in elements:
+        if not any(type(element) is kind for kind in ELEMENTS) and made_by(element.kind) not in text:
+            module = sys.modules.get(type(element).__module__)
             file = Path(getattr(module, "__file__", None) or "a Python session").name
-            lines[one.kind] = f"{made_by(one.kind)}class {type(one).__qualname__} of {file}"
+            lines[element.kind] = f"{made_by(element.kind)}class {type(element).__qualname__} of {file}"
     return "\n".join((text.rstrip("\n"), *lines.values(), "")) if lines else text
 
 
@@ -84,14 +84,14 @@ def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:
     names, fault = description.cameras, description.read.fault
     beams = []
     for arm, elements, path in arms:
-        (analyser,) = (one for one in elements if one.name == path[-1])
+        (analyser,) = (element for element in elements if element.name == path[-1])
         assert isinstance(analyser, Analyser)
         for name in analyser.cameras:
             if name not in names:
                 raise fault(f"arms.{arm}", f"camera {name!r} does not exist; {nearest(name, names)}")
         beams.append(tuple(map(names.index, analyser.cameras)))
-    seen = [camera for own in beams for camera in own]
-    if sorted(seen) != list(range(len(names))):
+    cameras = [camera for beam in beams for camera in beam]
+    if sorted(cameras) != list(range(len(names))):
         raise fault("cameras", f"every camera must stand behind one analyser: {', '.join(names)}")
     return Cameras(names=names, arms=tuple(beams), split=description.split, floor=description.floor)
 
@@ -117,7 +117,7 @@ class _Maker:
         path = self.read.words(table.get("path"), "path", place)
         described = self.read.table(table.get("elements", {}), place, "elements = ")
         elements = tuple(self.elements(described, path, f"{place}.elements"))
-        last = next(one for one in elements if one.name == path[-1])
+        last = next(element for element in elements if element.name == path[-1])
         if not isinstance(last, Analyser):
             raise self.read.fault(place, f"its path must end with an analyser, not with {path[-1]!r}")
         if len(last.cameras) not in (1, 2):
@@ -130,10 +130,10 @@ class _Maker:
                 what = f"path names {name!r}, which is not described; {nearest(name, table)}"
                 raise self.read.fault(place, what)
         for name, content in table.items():
-            here = f"{place}.{self.read.name(name, place)}"
+            location = f"{place}.{self.read.name(name, place)}"
             if name not in path:
-                raise self.read.fault(here, "is described but does not stand in the path")
-            yield self.element(name, self.read.table(content, here), here)
+                raise self.read.fault(location, "is described but does not stand in the path")
+            yield self.element(name, self.read.table(content, location), location)
 
     def element(self, name: str, table: Table, place: str) -> Element:
         if "kind" not in table:
@@ -153,10 +153,10 @@ class _Maker:
             raise self.read.fault(place, f"an element of kind {kind.kind!r} has no layers")
         if moves is not None:
             moves = self.read.text(moves, "moves", place)
-        made = self.made(kind, place, name=name, moves=moves, declared=declared, **fields)
-        self.check_moves(made, place)
-        self.check_edge(made, place)
-        return made
+        element = self.made(kind, place, name=name, moves=moves, declared=declared, **fields)
+        self.check_moves(element, place)
+        self.check_edge(element, place)
+        return element
 
     def made(self, kind: type[Any], place: str, **fields: Any) -> Any:
         """A component; what it says of its numbers is an error of the file."""
@@ -165,9 +165,9 @@ class _Maker:
         except ValueError as error:
             raise self.read.fault(place, str(error)) from None
 
-    def check_moves(self, made: Element, place: str) -> None:
-        moves, what = made.moves, f"an element of kind {made.kind!r}"
-        if isinstance(made, Polariser):
+    def check_moves(self, element: Element, place: str) -> None:
+        moves, what = element.moves, f"an element of kind {element.kind!r}"
+        if isinstance(element, Polariser):
             if moves not in (None, POLARISER):
                 raise self.read.fault(place, f"moves = {moves!r}: the columns of a polariser are {POLARISER}")
         elif moves is None:
@@ -175,28 +175,30 @@ class _Maker:
         elif not PREFIX.fullmatch(moves):
             what = f"moves = {moves!r} cannot begin the names of columns: capital letters, digits and _, a letter first"
             raise self.read.fault(place, what)
-        elif isinstance(made, Analyser):
+        elif isinstance(element, Analyser):
             raise self.read.fault(place, "an analyser does not move")
-        elif not hasattr(made, "axis"):
+        elif not hasattr(element, "axis"):
             raise self.read.fault(place, f"moves, but {what} has no axis that could turn")
-        elif type(made).ray is not Element.ray:
+        elif type(element).ray is not Element.ray:
             raise self.read.fault(place, f"{what} changes the ray and cannot move")
 
-    def check_edge(self, made: Element, place: str) -> None:
+    def check_edge(self, element: Element, place: str) -> None:
         """Raise `DataError` for numbers that, as sure as they are, leave no possible light at the edge of the field."""
-        mapping = isinstance(made, PupilMapping)  # r (1 + κ r²) must grow with r, and stay ahead of 90 deg
-        r, share, most = self.farthest, 0.0, 1.0 / 3.0 if mapping else 1.0
-        for key, said in made.declarations().items():
-            if power := PER_FIELD.fullmatch(said.unit):
+        mapping = isinstance(element, PupilMapping)  # r (1 + κ r²) must grow with r, and stay ahead of 90 deg
+        r, share, limit = self.farthest, 0.0, 1.0 / 3.0 if mapping else 1.0
+        for key, parameter in element.declarations().items():
+            if power := PER_FIELD.fullmatch(parameter.unit):
                 grown = r ** int(power[1])
-                share = (float(np.max(np.abs(getattr(made, key)))) + SURE * (said.width or 0.0)) * grown
-                if share >= most:
+                share = (
+                    float(np.max(np.abs(getattr(element, key)))) + SURE * (parameter.width or 0.0)
+                ) * grown
+                if share >= limit:
                     what = f"{key} may be {share:.3g} at the edge of the field ({r:.3g} deg from its centre), where "
-                    what += f"less than {most:.2g} is possible: |value| + {SURE:g} sigma below {most / grown:.2g} "
-                    raise self.read.fault(place, f"{what}{said.unit}, or a smaller field")
-        if mapping and (turn := r * abs(float(made.magnification)) * (1.0 + share)) >= 90.0:
-            what = f"magnification = {float(made.magnification):g} turns rays from the edge of the field ({r:.3g} deg "
-            what += f"from its centre) by {turn:.0f} deg, 90 at most: correct it, or give a smaller field"
+                    what += f"less than {limit:.2g} is possible: |value| + {SURE:g} sigma below {limit / grown:.2g} "
+                    raise self.read.fault(place, f"{what}{parameter.unit}, or a smaller field")
+        if mapping and (turn := r * abs(float(element.magnification)) * (1.0 + share)) >= 90.0:
+            what = f"magnification = {float(element.magnification):g} turns rays from the edge of the field "
+            what += f"({r:.3g} deg from its centre) by {turn:.0f} deg, 90 at most: correct it, or give a smaller field"
             raise self.read.fault(place, what)
 
     def layers(self, tables: Any, place: str) -> Iterator[Layer]:
@@ -207,15 +209,15 @@ class _Maker:
         self.read.words([table["name"] for table in tables], "layers", place)
         for table in tables:
             name = self.read.name(table["name"], f"{place}.layers")
-            here = f"{place}.layers.{name}"
-            fields, declared = self.fields(Layer, {k: v for k, v in table.items() if k != "name"}, here)
+            location = f"{place}.layers.{name}"
+            fields, declared = self.fields(Layer, {k: v for k, v in table.items() if k != "name"}, location)
             if not fields.get("thickness", 0.0) > 0.0:
-                raise self.read.fault(here, "needs a thickness (um) above 0; leave a layer of none out")
-            yield self.made(Layer, here, name=name, declared=declared, **fields)
+                raise self.read.fault(location, "needs a thickness (um) above 0; leave a layer of none out")
+            yield self.made(Layer, location, name=name, declared=declared, **fields)
 
     def fields(self, kind: type[Component], table: Table, place: str) -> tuple[dict[str, Any], Declared]:
         """Fields of a component from what a file says of it, and which of them are parameters."""
-        known = numbers_of(kind)
+        numbers = numbers_of(kind)
         plain = {
             f.name: f.default
             for f in dataclasses.fields(kind)
@@ -228,45 +230,45 @@ class _Maker:
                 values[key] = self.choice(value, plain[key], key, place)
                 if (key == "at" or key.endswith("_at")) and values[key] != plain[key]:
                     self.check_wavelengths(values[key], key, place)
-            elif key in known:
-                values[key], said = self.number(value, known[key], is_row(kind, key), key, place)
-                if said is not None:
-                    declared[key] = said
+            elif key in numbers:
+                values[key], parameter = self.number(value, numbers[key], is_row(kind, key), key, place)
+                if parameter is not None:
+                    declared[key] = parameter
                 if key == "wavelength":
                     self.check_wavelengths(values[key], key, place)
                 if key in SHARES and np.max(np.abs(values[key])) > 1.0:
                     what = f"{key} = {values[key]:g} must be between 0 and 1 (a share, not per cent)"
                     raise self.read.fault(place, what)
             else:
-                raise self.read.fault(place, str(unknown_name("key", key, [*known, *plain])))
+                raise self.read.fault(place, str(unknown_name("key", key, [*numbers, *plain])))
         # In the order of the class, as the tree is flattened.
-        return values, tuple((key, declared[key]) for key in known if key in declared)
+        return values, tuple((key, declared[key]) for key in numbers if key in declared)
 
     def number(
-        self, given: Any, known: Parameter, row: bool, key: str, place: str
+        self, entry: Any, declaration: Parameter, row: bool, key: str, place: str
     ) -> tuple[float | tuple[float, ...], Parameter | None]:
         """The value of a number, or of a row of them; the parameter that it is where more is said than its value."""
         several = self.read.numbers if row else self.read.number
-        if not isinstance(given, Mapping):
-            value = several(given, key, place)
-            self.check_angle(value, known.unit, key, place)
+        if not isinstance(entry, Mapping):
+            value = several(entry, key, place)
+            self.check_angle(value, declaration.unit, key, place)
             return value, None
-        here = f"{place}.{key}"
-        self.read.known(given, NUMBER_KEYS, here)
-        if "value" not in given:
-            raise self.read.fault(here, "has no value")
-        if given.get("unit", known.unit) != known.unit:
-            what = f"{key} is in {known.unit!r}, not in {given['unit']!r}; "
-            raise self.read.fault(place, what + _converted(given, known.unit))
+        location = f"{place}.{key}"
+        self.read.known(entry, NUMBER_KEYS, location)
+        if "value" not in entry:
+            raise self.read.fault(location, "has no value")
+        if entry.get("unit", declaration.unit) != declaration.unit:
+            what = f"{key} is in {declaration.unit!r}, not in {entry['unit']!r}; "
+            raise self.read.fault(place, what + _converted(entry, declaration.unit))
         advice = "; leave it out where there is none"
         widths = {
-            k: self.read.positive(given[k], k, here, advice)
+            k: self.read.positive(entry[k], k, location, advice)
             for k in ("sigma", "scale", "loose")
-            if k in given
+            if k in entry
         }
-        texts = {k: self.read.text(given[k], k, here) for k in ("source", "name", "tie") if k in given}
+        texts = {k: self.read.text(entry[k], k, location) for k in ("source", "name", "tie") if k in entry}
         declared = dataclasses.replace(
-            known,
+            declaration,
             name=texts.get("name", ""),
             source=texts.get("source", self.source),
             prior=(0.0, widths["sigma"]) if "sigma" in widths else None,
@@ -274,9 +276,9 @@ class _Maker:
             loose=widths.get("loose"),
             tie=texts.get("tie"),
         )
-        value = several(given["value"], "value", here)
-        if "unit" not in given:
-            self.check_angle(value, known.unit, key, place)
+        value = several(entry["value"], "value", location)
+        if "unit" not in entry:
+            self.check_angle(value, declaration.unit, key, place)
         return value, declared
 
     def check_angle(self, value: float | tuple[float, ...], unit: str, key: str, place: str) -> None:
@@ -290,11 +292,13 @@ class _Maker:
     def check_wavelengths(self, value: float | tuple[float, ...], key: str, place: str) -> None:
         """Raise `DataError` for wavelengths (µm) that no camera sees."""
         low, high = WAVELENGTHS
-        for one in np.atleast_1d(value).tolist():
-            if not low <= one <= high:
-                unit, size = ("nm", 1e-3) if one < NANOMETRES else ("Angstrom", 1e-4)
-                advice = f"; in {unit}? write {one * size:g}" if low <= one * size <= high else ""
-                what = f"{key} = {one:g} um is not light of a camera ({low:g} to {high:g} um){advice}"
+        for wavelength in np.atleast_1d(value).tolist():
+            if not low <= wavelength <= high:
+                unit, size = ("nm", 1e-3) if wavelength < NANOMETRES else ("Angstrom", 1e-4)
+                advice = (
+                    f"; in {unit}? write {wavelength * size:g}" if low <= wavelength * size <= high else ""
+                )
+                what = f"{key} = {wavelength:g} um is not light of a camera ({low:g} to {high:g} um){advice}"
                 raise self.read.fault(place, what)
 
     def choice(self, value: Any, default: Any, key: str, place: str) -> Any:

@@ -145,17 +145,17 @@ class Cameras(Component):
         if not self.split:
             return None
         arm = np.zeros(len(self.names), int)
-        for number, own in enumerate(self.arms):
-            arm[list(own)] = number
+        for number, members in enumerate(self.arms):
+            arm[list(members)] = number
         return (arm[:, None] == arm).astype(float)
 
     @property
     def orthogonal(self) -> tuple[int, ...]:
         """For each camera the one that sees the other beam of its analyser."""
-        other = list(range(len(self)))
+        partners = list(range(len(self)))
         for a, b in self.pairs:
-            other[a], other[b] = b, a
-        return tuple(other)
+            partners[a], partners[b] = b, a
+        return tuple(partners)
 
 
 def with_floor(

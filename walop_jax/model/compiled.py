@@ -62,12 +62,16 @@ class _NotKept(Exception):
 def folder() -> Path | None:
     """Folder in which programs are kept; None where they are not."""
     cache = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    here = Path(cache) / FOLDER if cache else None
-    return here if here is not None and here.is_dir() else None
+    path = Path(cache) / FOLDER if cache else None
+    return path if path is not None and path.is_dir() else None
 
 
 def program(
-    here: Path, name: str, function: Callable[..., Any], args: tuple[Any, ...], options: dict[str, Any] | None
+    directory: Path,
+    name: str,
+    function: Callable[..., Any],
+    args: tuple[Any, ...],
+    options: dict[str, Any] | None,
 ) -> Callable[..., Any] | None:
     """Program that runs `function` on arguments like these: a kept one, or one that is kept from now on.
 
@@ -76,11 +80,11 @@ def program(
     leaves, tree = jax.tree.flatten(args)
     try:
         key = _key(name, tree.unflatten(range(tree.num_leaves)), [kind(leaf) for leaf in leaves])
-        kept = _read(here / key)
-        if kept is None:
-            kept = _traced(function, tree, leaves)
-            _write(here / key, kept)
-        structure, exported = kept[0], export.deserialize(bytearray(kept[1]))
+        stored = _read(directory / key)
+        if stored is None:
+            stored = _traced(function, tree, leaves)
+            _write(directory / key, stored)
+        structure, exported = stored[0], export.deserialize(bytearray(stored[1]))
     except Exception:  # whatever stands in the way: the call itself shows it, if it matters
         return None
     run, shape = jax.jit(exported.call, compiler_options=options), jax.tree.structure(structure)
@@ -89,8 +93,8 @@ def program(
 
 def kind(leaf: Any) -> tuple[Any, ...]:
     """Kind of a number, as far as a program depends on it."""
-    seen = leaf.aval if isinstance(leaf, jax.Array) else jax.typeof(leaf)
-    return seen.shape, seen.dtype, bool(seen.weak_type)
+    aval = leaf.aval if isinstance(leaf, jax.Array) else jax.typeof(leaf)
+    return aval.shape, aval.dtype, bool(aval.weak_type)
 
 
 def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> tuple[Any, bytes]:
@@ -98,9 +102,9 @@ def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> t
     shapes: list[Any] = []
 
     def flat(*leaves: Any) -> list[Any]:
-        found, shape = jax.tree.flatten(function(*tree.unflatten(leaves)))
+        results, shape = jax.tree.flatten(function(*tree.unflatten(leaves)))
         shapes.append(shape)
-        return found
+        return results
 
     exported = export.export(jax.jit(flat))(*leaves)
     return shapes[-1].unflatten(range(shapes[-1].num_leaves)), bytes(exported.serialize())
@@ -109,8 +113,8 @@ def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> t
 def _key(name: str, structure: Any, kinds: Sequence[Any]) -> str:
     flags = os.environ.get("XLA_FLAGS", "")
     double = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-    said = repr((name, kinds, jax.default_backend(), double, flags)) + json.dumps(_plain(structure))
-    return hashlib.sha256(_source() + said.encode()).hexdigest()
+    description = repr((name, kinds, jax.default_backend(), double, flags)) + json.dumps(_plain(structure))
+    return hashlib.sha256(_source() + description.encode()).hexdigest()
 
 
 def _plain(value: Any) -> Any:
@@ -159,19 +163,19 @@ def _made(plain: Any) -> Any:
     """The structure that `_plain` was given; a set as a frozen one, a mapping as a dict."""
     if not isinstance(plain, list):
         return plain
-    kind, *rest = plain
+    kind, *entries = plain
     if kind == "array":
-        return np.frombuffer(bytes.fromhex(rest[2]), rest[0]).reshape(rest[1])
+        return np.frombuffer(bytes.fromhex(entries[2]), entries[0]).reshape(entries[1])
     if kind == "dict":
-        return {_made(key): _made(entry) for key, entry in rest}
+        return {_made(key): _made(entry) for key, entry in entries}
     if kind == "object":
-        made = object.__new__(_found(rest[0]))
-        for name, value in rest[1].items():
-            object.__setattr__(made, name, _made(value))
-        return made
+        instance = object.__new__(_found(entries[0]))
+        for name, value in entries[1].items():
+            object.__setattr__(instance, name, _made(value))
+        return instance
     if kind in ("name", "named"):
-        return _found(rest[0]) if kind == "name" else _found(rest[0])._make(map(_made, rest[1:]))
-    return {"tuple": tuple, "list": list, "frozenset": frozenset}[kind](map(_made, rest))
+        return _found(entries[0]) if kind == "name" else _found(entries[0])._make(map(_made, entries[1:]))
+    return {"tuple": tuple, "list": list, "frozenset": frozenset}[kind](map(_made, entries))
 
 
 @functools.cache
@@ -194,8 +198,8 @@ def _read(path: Path) -> tuple[Any, bytes] | None:
         content = path.read_bytes()
         if hashlib.sha256(content[_DIGEST:]).digest() == content[:_DIGEST]:
             os.utime(path)
-            text, _, rest = content[_DIGEST:].partition(b"\n")
-            return _made(json.loads(text)), rest
+            text, _, payload = content[_DIGEST:].partition(b"\n")
+            return _made(json.loads(text)), payload
     return None
 
 
@@ -258,13 +262,13 @@ def compiled(
 
     def kept(args: tuple[Any, ...], once: bool) -> Any:
         """The program for arguments like these, from disk where it is there; None where none is kept."""
-        here = folder()
-        if here is None:
+        directory = folder()
+        if directory is None:
             return None
         leaves, tree = jax.tree.flatten(args)
         at = tree, tuple(kind(leaf) for leaf in leaves), once
         if at not in programs:
-            programs[at] = program(here, kept_as, function, args, options(once))
+            programs[at] = program(directory, kept_as, function, args, options(once))
         return programs[at]
 
     @functools.wraps(function)
@@ -293,8 +297,8 @@ def float64() -> contextlib.AbstractContextManager[Any]:
     """JAX computes in float64 in the block, by the calling thread alone; the rest of the session stays as it is."""
     if jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         return contextlib.nullcontext()
-    here = jax if hasattr(jax, "enable_x64") else importlib.import_module("jax.experimental")  # jax < 0.8
-    return here.enable_x64(True)
+    module = jax if hasattr(jax, "enable_x64") else importlib.import_module("jax.experimental")  # jax < 0.8
+    return module.enable_x64(True)
 
 
 def usual_threads() -> int:
@@ -315,21 +319,21 @@ def cache_folder() -> Path | None:
         return None
     try:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        kept = Path(chosen) if chosen else Path(base) / "walop-jax" / "xla"
-        kept.mkdir(parents=True, exist_ok=True)
+        path = Path(chosen) if chosen else Path(base) / "walop-jax" / "xla"
+        path.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError):  # no home
         return None
-    return kept if os.access(kept, os.W_OK | os.X_OK) else None
+    return path if os.access(path, os.W_OK | os.X_OK) else None
 
 
 def switch_on() -> None:
     """Switch JAX on for a program: float64, and the cache of compiled code, which makes later runs start fast."""
     jax.config.update("jax_enable_x64", True)
-    kept = cache_folder()
-    if kept is not None:
+    path = cache_folder()
+    if path is not None:
         with contextlib.suppress(OSError):
-            (kept / FOLDER).mkdir(exist_ok=True)
-        jax.config.update("jax_compilation_cache_dir", str(kept))
+            (path / FOLDER).mkdir(exist_ok=True)
+        jax.config.update("jax_compilation_cache_dir", str(path))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
         jax.config.update("jax_raise_persistent_cache_errors", False)

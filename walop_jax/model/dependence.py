@@ -52,31 +52,34 @@ def needs(instrument: Instrument) -> Needs:
 
 @functools.lru_cache(maxsize=256)
 def _needs(structure: Any, shapes: Shapes) -> Needs:
-    def run(asked: Set[str], instrument: Instrument) -> tuple[Instrument, Array]:
-        patched, plan = instrument.patched(), blank_plan(instrument, asked - {"median"}, "median" in asked)
+    def run(quantities: Set[str], instrument: Instrument) -> tuple[Instrument, Array]:
+        patched, plan = (
+            instrument.patched(),
+            blank_plan(instrument, quantities - {"median"}, "median" in quantities),
+        )
         x, y = map(jnp.asarray, AT)
         rows = light.band_rows(patched, plan, x, y)
-        each = jnp.zeros_like(plan.exposures.kind)
-        sight = Sight(plan.exposures, jnp.zeros((*each.shape, 2)), each - 1, x, y)
-        counts = light.counts(patched, rows, patched.throughput.at(x, y), sight, each)
+        zeros = jnp.zeros_like(plan.exposures.kind)
+        sight = Sight(plan.exposures, jnp.zeros((*zeros.shape, 2)), zeros - 1, x, y)
+        counts = light.counts(patched, rows, patched.throughput.at(x, y), sight, zeros)
         return patched, light.detected(patched, plan.exposures, counts)
 
-    (patched, _), asked = _asking(run, of_shapes(structure, shapes))
-    parts = [*patched.elements, *(element for arm in patched.arms for element in arm.elements)]
-    longest = max((part.path_difference for part in parts), default=0.0)
-    return Needs(asked - {"median"}, "median" in asked, longest)
+    (patched, _), quantities = _asking(run, of_shapes(structure, shapes))
+    elements = [*patched.elements, *(element for arm in patched.arms for element in arm.elements)]
+    longest = max((item.path_difference for item in elements), default=0.0)
+    return Needs(quantities - {"median"}, "median" in quantities, longest)
 
 
 def _asking(run: Callable[[Set[str], Any], Any], of: Any) -> tuple[Any, frozenset[str]]:
     """Shapes of a computation for which all is there that it asks for, and what that is."""
-    asked: frozenset[str] = frozenset()
+    quantities: frozenset[str] = frozenset()
     while True:
         try:
-            return jax.eval_shape(functools.partial(run, asked), of), asked
+            return jax.eval_shape(functools.partial(run, quantities), of), quantities
         except NotPlannedError as missing:
-            if missing.quantity in asked:
+            if missing.quantity in quantities:
                 raise
-            asked |= {missing.quantity}
+            quantities |= {missing.quantity}
 
 
 def optical_indices(instrument: Instrument) -> Int[np.ndarray, " o"]:
@@ -137,10 +140,10 @@ def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
 
 @functools.lru_cache(maxsize=1024)
 def _conditions_asked(structure: Any, shapes: Shapes) -> frozenset[str]:
-    def run(asked: Set[str], element: Element) -> tuple[Any, Any]:
-        one, zero = jnp.ones(1), jnp.zeros(())
-        conditions = Conditions(band_width=0.1 * one, planned=dict.fromkeys(asked, one))
-        ray = Ray.entering(zero, zero, (0.62 * one, conditions))
+    def run(quantities: Set[str], element: Element) -> tuple[Any, Any]:
+        ones, zero = jnp.ones(1), jnp.zeros(())
+        conditions = Conditions(band_width=0.1 * ones, planned=dict.fromkeys(quantities, ones))
+        ray = Ray.entering(zero, zero, (0.62 * ones, conditions))
         return element.ray(ray), element.mueller(ray)
 
     return _asking(run, of_shapes(structure, shapes))[1]
@@ -173,18 +176,18 @@ def left_behind(instrument: Instrument) -> tuple[str, ...]:
     bare = dataclasses.replace(instrument, effects=())
     names = []
     for effect in instrument.effects:
-        there = effect.patch(bare)
-        cameras = there.cameras
-        kept = all(is_undone(part, len(cameras)) for part in cameras.detectors)
+        patched = effect.patch(bare)
+        cameras = patched.cameras
+        undone = all(is_undone(detector, len(cameras)) for detector in cameras.detectors)
         unknown = conditions_of_effect(bare, effect) - KNOWN
-        if cameras.ghosts or cameras.exposures or there.sky_films or not kept or unknown:
+        if cameras.ghosts or cameras.exposures or patched.sky_films or not undone or unknown:
             names.append(effect.name)
     return tuple(names)
 
 
 def reported(instrument: Instrument, counts: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """Counts that are reported for counts (electrons) by the detectors that can be undone."""
-    for part in instrument.patched().cameras.detectors:
-        if is_undone(part, len(instrument.cameras)):
-            counts = part.reported(counts, blank(_Unknown))
+    for detector in instrument.patched().cameras.detectors:
+        if is_undone(detector, len(instrument.cameras)):
+            counts = detector.reported(counts, blank(_Unknown))
     return counts

@@ -116,9 +116,9 @@ class Instrument(LightPath):
         ahead, *inside = fold.in_state(common, arms, moving, state)
         of_arm = []
         for behind in inside:
-            whole = fold.product((*ahead, *behind))
-            whole = jnp.eye(4) if whole is None else whole
-            of_arm.append(jnp.broadcast_to(whole, (len(nodes), 4, 4)).reshape(*jnp.shape(wavelength), 4, 4))
+            matrix = fold.product((*ahead, *behind))
+            matrix = jnp.eye(4) if matrix is None else matrix
+            of_arm.append(jnp.broadcast_to(matrix, (len(nodes), 4, 4)).reshape(*jnp.shape(wavelength), 4, 4))
         place = {camera: i for i, arm in enumerate(instrument.arms) for camera in arm.analyser.cameras}
         return jnp.stack([of_arm[place[camera]] for camera in instrument.cameras.names])
 
@@ -133,7 +133,7 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
     for what does not exist or would do nothing where it stands.
     """
     common, arms, throughput, cameras = parts(description, elements)
-    every = (*common, *(element for _, inside, _ in arms for element in inside))
+    all_elements = (*common, *(element for _, inside, _ in arms for element in inside))
     instrument = Instrument(
         name=description.name,
         sources=sources(),
@@ -145,7 +145,7 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
         field_limit=description.field_limit,
         site=description.place,
         raster=(description.raster, description.edge),
-        description="" if description.name in shipped() else with_origins(description.text, every),
+        description="" if description.name in shipped() else with_origins(description.text, all_elements),
         wavelength=description.wavelength or REFERENCE_WAVELENGTH,
         source=description.source if description.source != NO_SOURCE else "",
     )
@@ -221,8 +221,8 @@ def _check(instrument: Instrument, read: Reader) -> None:
             if isinstance(element, Analyser | Polariser):
                 where = "ends its arm" if isinstance(element, Analyser) else "stands ahead of the arms"
                 raise read.fault(f"arms.{arm.name}.elements.{element.name}", f"a {element.kind} {where}")
-    parts = itertools.chain(instrument.sources, instrument.elements, instrument.arms)
-    for name, count in Counter([*(part.name for part in parts), *TAKEN]).items():
+    components = itertools.chain(instrument.sources, instrument.elements, instrument.arms)
+    for name, count in Counter([*(component.name for component in components), *TAKEN]).items():
         if count > 1:
             raise read.fault(name, "more than one part of the instrument has this name; give it another one")
     for name, count in Counter(parameter.name for parameter in leaves(instrument)).items():

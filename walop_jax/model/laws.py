@@ -81,11 +81,11 @@ class Law:
             raise ValueError(f"per = {list(self.per)}: only one of {', '.join(BASES)} may hold")
         if "interval" in self.per and "step" in self.per:
             raise ValueError("per: interval and step would both use the dates of at; name one")
-        for key, wanted in _NEEDS.items():
-            given, used = getattr(self, key) not in (None, ()), set(self.per) & set(wanted.split(" or "))
-            if given and not used:
-                raise ValueError(f"{key} is used with per = {wanted} only")
-            if used and not given and key != "spread":
+        for key, required in _NEEDS.items():
+            present, used = getattr(self, key) not in (None, ()), set(self.per) & set(required.split(" or "))
+            if present and not used:
+                raise ValueError(f"{key} is used with per = {required} only")
+            if used and not present and key != "spread":
                 raise ValueError(f"per = {sorted(used)[0]!r} needs {key}")
         for key in ("spread", "rate"):
             value = getattr(self, key)
@@ -142,8 +142,8 @@ class Law:
 
     def document(self) -> dict[str, Any]:
         """The entry of a model file, as plain data."""
-        given = {key: value for key, value in vars(self).items() if value not in (None, ())}
-        return given | {"per": list(self.per)}
+        entries = {key: value for key, value in vars(self).items() if value not in (None, ())}
+        return entries | {"per": list(self.per)}
 
 
 SHARED = Law()
@@ -152,7 +152,7 @@ Laws = Mapping[str, Law]
 
 def laws_of(tables: Mapping[str, Any]) -> dict[str, Law]:
     """The laws of the [law] tables of a model file. Raises ValueError naming the table and key that is wrong."""
-    found, read, hints = {}, Reader(""), typing.get_type_hints(Law)
+    laws, read, hints = {}, Reader(""), typing.get_type_hints(Law)
     for name, entry in tables.items():
         place = f'law."{name}"'
         if not isinstance(entry, Mapping):
@@ -160,10 +160,10 @@ def laws_of(tables: Mapping[str, Any]) -> dict[str, Law]:
         alone = {key: (entry[key],) for key in ("per", "at") if isinstance(entry.get(key), str | int | float)}
         values = read.values(hints, {**entry, **alone}, place)
         try:
-            found[name] = Law(**values)
+            laws[name] = Law(**values)
         except ValueError as error:
             raise read.fault(place, str(error)) from None
-    return found
+    return laws
 
 
 def resolved(
@@ -175,13 +175,13 @@ def resolved(
 
     Raises ValueError for a name or group that nothing bears.
     """
-    found: dict[str, Law | None] = dict.fromkeys(names, SHARED) | dict.fromkeys(candidates, None)
+    assigned: dict[str, Law | None] = dict.fromkeys(names, SHARED) | dict.fromkeys(candidates, None)
     for exact in (False, True):
         for key, law in laws.items():
-            if (key in found) != exact:
+            if (key in assigned) != exact:
                 continue
-            some = [key] if exact else [n for n in fnmatch.filter(found, key) if n not in alone]
-            if not some:
-                raise ValueError(f"[law]: there is no parameter {key!r}; {nearest(key, found)}")
-            found |= dict.fromkeys(some, law)
-    return tuple(found.values())
+            matches = [key] if exact else [n for n in fnmatch.filter(assigned, key) if n not in alone]
+            if not matches:
+                raise ValueError(f"[law]: there is no parameter {key!r}; {nearest(key, assigned)}")
+            assigned |= dict.fromkeys(matches, law)
+    return tuple(assigned.values())

@@ -162,14 +162,14 @@ def integrated(
     """Sums over the nodes of every band, each in its own state."""
     sizes = {last - first for _, first, last in plan.settings}
     if len(sizes) == 1 and len(plan.settings) > FEW_SETTINGS:
-        own = weights.reshape(len(plan.settings), *sizes, -1)
-        bands = jnp.einsum("cbn,...cnrs->...cbrs", own, rows)
+        grouped = weights.reshape(len(plan.settings), *sizes, -1)
+        bands = jnp.einsum("cbn,...cnrs->...cbrs", grouped, rows)
         return bands.reshape(*rows.shape[:-4], len(weights), *rows.shape[-2:])
-    parts = [
+    sums = [
         jnp.einsum("bn,...nrs->...brs", weights[first:last], rows[..., i, :, :, :])
         for i, (_, first, last) in enumerate(plan.settings)
     ]
-    return jnp.concatenate(parts, axis=-3)
+    return jnp.concatenate(sums, axis=-3)
 
 
 def in_bands(
@@ -179,9 +179,9 @@ def in_bands(
     analysers = [arm.analyser for arm in instrument.arms]
     if all(analyser.balance is None and analyser.loss is None for analyser in analysers):
         return bands
-    parts = jnp.split(bands, bands.shape[1] // Analyser.rows, axis=1)
+    blocks = jnp.split(bands, bands.shape[1] // Analyser.rows, axis=1)
     return jnp.concatenate(
-        [analysers[i % len(analysers)].in_band(part, mean) for i, part in enumerate(parts)], axis=1
+        [analysers[i % len(analysers)].in_band(block, mean) for i, block in enumerate(blocks)], axis=1
     )
 
 
@@ -189,8 +189,8 @@ def with_dispersion(instrument: LightPath, rows: Callable[[Array], Any], wavelen
     """Rows at wavelengths, or trees of them, with λ ∂/∂λ behind where the beams of an analyser differ in wavelength."""
     if not is_dispersed(instrument):
         return rows(wavelength)
-    both = jax.jvp(rows, (wavelength,), (wavelength,))
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-2), *both)
+    pair = jax.jvp(rows, (wavelength,), (wavelength,))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-2), *pair)
 
 
 def is_dispersed(instrument: LightPath) -> bool:
@@ -216,26 +216,26 @@ def camera_vectors(
 ) -> Float[Array, "b k 4"]:
     """Analysis vectors (band, camera, Stokes): counts = vector · Stokes for light of unit flux."""
     instrument = instrument.patched()
-    seen = beams(instrument, rows) @ upstream(instrument, x, y)
-    return behind_throughput(instrument, seen, throughput, x, y)
+    beam_vectors = beams(instrument, rows) @ upstream(instrument, x, y)
+    return behind_throughput(instrument, beam_vectors, throughput, x, y)
 
 
 def beams(instrument: LightPath, rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
     """Rows of the cameras: what each beam takes of the rows of its analyser."""
     index, shares = _beams(instrument)
-    taken = (shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
-    return functools.reduce(jnp.add, taken)
+    contributions = (shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
+    return functools.reduce(jnp.add, contributions)
 
 
 def behind_throughput(
     instrument: LightPath, beams: Float[Array, "b k 4"], throughput: Float[Array, " k"], x: Scalar, y: Scalar
 ) -> Float[Array, "b k 4"]:
     """Analysis vectors from the beams of an instrument without effects (`patched`): throughput, and what mixes them."""
-    for part in instrument.cameras.transmission:
-        throughput = throughput * part.factors(x, y)
+    for component in instrument.cameras.transmission:
+        throughput = throughput * component.factors(x, y)
     vectors = throughput[:, None] * beams
-    for part in instrument.cameras.mixing:
-        vectors = part.vectors(vectors, x, y)
+    for component in instrument.cameras.mixing:
+        vectors = component.vectors(vectors, x, y)
     return vectors
 
 
@@ -269,12 +269,12 @@ def stokes(instrument: LightPath, sight: Sight) -> Float[Array, "e 4"]:
     instrument = instrument.patched()
     exposures, x, y = sight.exposures, sight.x, sight.y
     sight = _turned(instrument, sight)
-    taken = jnp.zeros(exposures.kind.shape, bool)
-    qu = jnp.zeros((*taken.shape, 2))
-    for one in instrument.sources:
-        if type(one).polarisation is not Source.polarisation:
-            seen = one.shines(sight) & ~taken
-            qu, taken = jnp.where(seen[:, None], one.polarisation(sight), qu), taken | seen
+    assigned = jnp.zeros(exposures.kind.shape, bool)
+    qu = jnp.zeros((*assigned.shape, 2))
+    for source in instrument.sources:
+        if type(source).polarisation is not Source.polarisation:
+            shining = source.shines(sight) & ~assigned
+            qu, assigned = jnp.where(shining[:, None], source.polarisation(sight), qu), assigned | shining
     light = _at_polariser(instrument, sight, jnp.ones_like(exposures.clp_angle), qu)
     polariser = instrument.polariser
     if polariser is None:
@@ -342,9 +342,9 @@ def counts(
     if exposures.slope_band is not None:
         slopes = stokes_slopes(instrument, sight)
         result = result + jnp.einsum("eks,es->ek", vectors[exposures.slope_band], slopes)
-    for part in instrument.cameras.exposures:
-        result = result * part.factors(exposures, x, y)
-        result = result + vectors[band, :, 0] * part.share(exposures, x, y)
+    for gain in instrument.cameras.exposures:
+        result = result * gain.factors(exposures, x, y)
+        result = result + vectors[band, :, 0] * gain.share(exposures, x, y)
     return result
 
 
@@ -360,8 +360,8 @@ def with_ghosts(
     source: Int[Array, " e"],
 ) -> Float[Array, "e k"]:
     """Counts for light of unit flux with what the cameras see of the opposite field point, `opposite`."""
-    for part in instrument.patched().cameras.ghosts:
-        counts = counts + part.seen(source < 0, opposite)
+    for ghost in instrument.patched().cameras.ghosts:
+        counts = counts + ghost.seen(source < 0, opposite)
     return counts
 
 
@@ -374,8 +374,8 @@ def detected(
     instrument: LightPath, exposures: ExposureArrays, counts: Float[Array, "e k"]
 ) -> Float[Array, "e k"]:
     """Counts that the detectors report for counts in electrons: the one stage that is not linear in the light."""
-    for part in instrument.patched().cameras.detectors:
-        counts = part.reported(counts, exposures)
+    for detector in instrument.patched().cameras.detectors:
+        counts = detector.reported(counts, exposures)
     return counts
 
 

@@ -108,9 +108,9 @@ class LightPath(Component):
     @property
     def standard(self) -> Standards:
         """The standard stars."""
-        found = _member(self.sources, Standards.name, "source")
-        assert isinstance(found, Standards)
-        return found
+        source = _member(self.sources, Standards.name, "source")
+        assert isinstance(source, Standards)
+        return source
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -135,9 +135,11 @@ class LightPath(Component):
 
     def moving(self) -> tuple[str, ...]:
         """Prefixes of the columns of the moving elements behind the polariser, common train first."""
-        parts = [*self.train(), *(element for arm in self.arms for element in arm.train())]
-        found = [element.moves for element in parts if element.moves and not isinstance(element, Polariser)]
-        return tuple(dict.fromkeys(found))
+        elements = [*self.train(), *(element for arm in self.arms for element in arm.train())]
+        prefixes = [
+            element.moves for element in elements if element.moves and not isinstance(element, Polariser)
+        ]
+        return tuple(dict.fromkeys(prefixes))
 
     @property
     def plates(self) -> str | None:
@@ -179,7 +181,7 @@ class LightPath(Component):
             if arm is None:
                 raise NoSuchPlaceError(f"the instrument has no arm {where!r}")
             holder = _inserted(arm, element, neighbour, bool(after))
-            arms = tuple(holder if one.name == where else one for one in self.arms)
+            arms = tuple(holder if candidate.name == where else candidate for candidate in self.arms)
             return dataclasses.replace(self, arms=arms)
         return _inserted(self, element, neighbour, bool(after))
 
@@ -193,11 +195,12 @@ class LightPath(Component):
 
     def with_source(self, source: Source) -> Self:
         """The instrument with a source of one more KIND, or with one of its sources replaced."""
-        others = tuple(one for one in self.sources if one.name != source.name)
-        if len(others) == len(self.sources):
+        remaining = tuple(present for present in self.sources if present.name != source.name)
+        if len(remaining) == len(self.sources):
             return dataclasses.replace(self, sources=(*self.sources, source))
         return dataclasses.replace(
-            self, sources=tuple(source if one.name == source.name else one for one in self.sources)
+            self,
+            sources=tuple(source if present.name == source.name else present for present in self.sources),
         )
 
 
@@ -221,25 +224,25 @@ def _name(member: Any) -> str:
     return member.name
 
 
-def _changed(part: AnyPart, rest: list[str], fields: dict[str, Any], place: str) -> AnyPart:
-    if not rest:
-        known = [field.name for field in dataclasses.fields(part)]
-        check_names(f"field of {place or 'the instrument'}", fields, known)
+def _changed(part: AnyPart, path: list[str], fields: dict[str, Any], place: str) -> AnyPart:
+    if not path:
+        names = [field.name for field in dataclasses.fields(part)]
+        check_names(f"field of {place or 'the instrument'}", fields, names)
         new = {
             name: value(getattr(part, name)) if callable(value) else value for name, value in fields.items()
         }
         return dataclasses.replace(part, **new)
-    known = []
+    names = []
     for field in dataclasses.fields(part):
         members = getattr(part, field.name)
         if field.metadata.get("static", False) or not isinstance(members, tuple):
             continue
-        known += [_name(member) for member in members if isinstance(member, Element | Arm)]
+        names += [_name(member) for member in members if isinstance(member, Element | Arm)]
         for i, member in enumerate(members):
-            if isinstance(member, Component) and _name(member) == rest[0]:
-                new = (*members[:i], _changed(member, rest[1:], fields, place), *members[i + 1 :])
+            if isinstance(member, Component) and _name(member) == path[0]:
+                new = (*members[:i], _changed(member, path[1:], fields, place), *members[i + 1 :])
                 return dataclasses.replace(part, **{field.name: new})
-    raise NoSuchPlaceError(f"the instrument has no part {place!r}; {nearest(rest[0], known)}")
+    raise NoSuchPlaceError(f"the instrument has no part {place!r}; {nearest(path[0], names)}")
 
 
 def _inserted(holder: Any, element: Element, neighbour: str, after: bool) -> Any:

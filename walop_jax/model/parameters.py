@@ -86,8 +86,8 @@ class Parameter:
         if not _finite(self.start):
             raise ValueError(f"parameter {self.name}: start = {self.start!r} must be a finite number")
         if self.prior is not None:
-            both = isinstance(self.prior, tuple) and len(self.prior) == 2 and all(map(_finite, self.prior))
-            if not both or self.prior[1] <= 0:
+            is_pair = isinstance(self.prior, tuple) and len(self.prior) == 2 and all(map(_finite, self.prior))
+            if not is_pair or self.prior[1] <= 0:
                 raise ValueError(
                     f"parameter {self.name}: prior = {self.prior!r} must be None, or the tuple (mean, standard "
                     "deviation), finite and the second above 0"
@@ -175,18 +175,18 @@ def _arrays(
     for field in dataclasses.fields(component):
         if field.metadata.get("static", False):
             continue
-        value, here = getattr(component, field.name), (*path, field.name)
+        value, holder = getattr(component, field.name), (*path, field.name)
         if field.name in declared:
-            yield here, _named(component, field.name, declared[field.name], value, part)
+            yield holder, _named(component, field.name, declared[field.name], value, part)
         elif isinstance(value, dict):
             for name in (name for name in declared if name in value):
-                yield (*here, name), _named(component, name, declared[name], value[name], part)
+                yield (*holder, name), _named(component, name, declared[name], value[name], part)
         elif isinstance(value, tuple):
             for i, child in enumerate(value):
                 if isinstance(child, Component) and hasattr(child, "name"):
-                    yield from _arrays(child, f"{part}.{_name(child)}".strip("."), (*here, str(i)))
+                    yield from _arrays(child, f"{part}.{_name(child)}".strip("."), (*holder, str(i)))
         elif isinstance(value, Component):
-            yield from _arrays(value, f"{part}.{field.name}".strip("."), here)
+            yield from _arrays(value, f"{part}.{field.name}".strip("."), holder)
 
 
 def _named(
@@ -237,7 +237,7 @@ def _places(structure: Any, shapes: Shapes) -> tuple[tuple[int, int], ...]:
     component = of_shapes(structure, shapes)
     flat, _ = jax.tree_util.tree_flatten_with_path(component)
     position = {tuple(_key(entry) for entry in path): i for i, (path, _) in enumerate(flat)}
-    return tuple((position[here], len(array)) for here, array in _arrays(component) if array)
+    return tuple((position[holder], len(array)) for holder, array in _arrays(component) if array)
 
 
 def _key(entry: Any) -> str:
@@ -278,8 +278,8 @@ def with_values(component: AnyComponent) -> Callable[[Vector | np.ndarray], AnyC
 
     def replaced(values: Vector | np.ndarray) -> AnyComponent:
         filled, split = list(arrays), np.split if isinstance(values, np.ndarray) else jnp.split
-        for i, part, shape in zip(places, split(values, ends), shapes, strict=True) if places else ():
-            filled[i] = array(part.reshape(shape))
+        for i, segment, shape in zip(places, split(values, ends), shapes, strict=True) if places else ():
+            filled[i] = array(segment.reshape(shape))
         return jax.tree_util.tree_unflatten(structure, filled)
 
     return replaced

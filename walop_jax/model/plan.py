@@ -55,19 +55,19 @@ def blank_exposures(instrument: LightPath, count: int) -> ExposureArrays:
     )  # fmt: skip
 
 
-def blank_plan(instrument: LightPath, asked: Collection[str] = (), median: bool = False) -> Plan:
+def blank_plan(instrument: LightPath, quantities: Collection[str] = (), median: bool = False) -> Plan:
     """A plan with every moving element in the beam, one node, one band: for shapes and derivatives."""
-    patched, one = instrument.patched(), jnp.ones(1)
-    count = max((part.exposures_known or 1 for part in patched.cameras.exposures), default=1)
+    patched, ones = instrument.patched(), jnp.ones(1)
+    count = max((gain.exposures_known or 1 for gain in patched.cameras.exposures), default=1)
     exposures = blank_exposures(instrument, count)
     if median:
         exposures = dataclasses.replace(exposures, median_counts=jnp.ones((count, len(instrument.cameras))))
     moving = patched.moving()
     return Plan(
-        wavelength=0.62 * one,
-        conditions=Conditions(band_width=0.1 * one, planned=dict.fromkeys(asked, one)),
+        wavelength=0.62 * ones,
+        conditions=Conditions(band_width=0.1 * ones, planned=dict.fromkeys(quantities, ones)),
         node_weight=jnp.ones((1, 1)),
-        teff=5000.0 * one,
+        teff=5000.0 * ones,
         exposures=exposures,
         band_of=np.zeros((count, 1 + len(instrument.standard.names)), int),
         settings=((tuple(30.0 for _ in moving), 0, 1),),
@@ -79,9 +79,9 @@ def with_numbers(
     plan: Plan, teff: Float[Array, ""], temperature: Float[Array, ""], hour_angle: Float[Array, ""]
 ) -> Plan:
     """The plan of a single setting with other numbers; `teff` is 0 for a flat spectrum."""
-    own = {"temperature": temperature, "hour_angle": hour_angle}
+    conditions = {"temperature": temperature, "hour_angle": hour_angle}
     planned = {
-        name: jnp.broadcast_to(own[name], plan.wavelength.shape) if name in own else value
+        name: jnp.broadcast_to(conditions[name], plan.wavelength.shape) if name in conditions else value
         for name, value in plan.conditions.planned.items()
     }
     changed = (jnp.broadcast_to(teff, plan.teff.shape), Conditions(plan.conditions.band_width, planned))

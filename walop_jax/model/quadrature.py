@@ -106,10 +106,10 @@ def gauss_rules(node: Vector, weight: Vector, counts: range) -> Iterator[Rule]:
     """Gauss rules of growing numbers of nodes, fewer than the measure has; its weights sum to 1."""
     centre, half = 0.5 * (node[0] + node[-1]), 0.5 * (node[-1] - node[0])
     rows = _recurrence((node - centre) / half, weight)
-    known: list[tuple[float, float]] = []
+    coefficients: list[tuple[float, float]] = []
     for count in counts:
-        known += itertools.islice(rows, count - len(known))
-        alpha, beta = np.array(known).T
+        coefficients += itertools.islice(rows, count - len(coefficients))
+        alpha, beta = np.array(coefficients).T
         value, columns = np.linalg.eigh(np.diag(alpha) + np.diag(beta[:-1], 1) + np.diag(beta[:-1], -1))
         yield centre + half * value, columns[0] ** 2
 

@@ -227,12 +227,12 @@ class Standards(Source):
         lmax: float = LMAX,
     ) -> Standards:
         """Standards that follow the law of interstellar polarisation from band to band."""
-        each = len(set(stars))
+        count = len(set(stars))
         numbers: dict[str, Any] = {
             "q": qu[0],
             "u": qu[1],
-            "lmax": np.full(each, lmax),
-            "turn": np.zeros(each),
+            "lmax": np.full(count, lmax),
+            "turn": np.zeros(count),
             "wavelength": [bands[i][0] for i in unknown],
         }
         return cls(
@@ -254,15 +254,15 @@ class Standards(Source):
 
     def shines(self, sight: Sight) -> Bool[Array, " e"]:
         """Whatever has a star as its source."""
-        seen = sight.source >= 0
-        return seen if self.names else jnp.zeros_like(seen)
+        has_star = sight.source >= 0
+        return has_star if self.names else jnp.zeros_like(has_star)
 
     def values(self, source: Int[Any, "*p e"], colour: Float[Any, "e s 2"] | None) -> Int[Any, "*p e"]:
         """The value that each exposure of a source goes by: that of its star whose band is the nearest; −1 for none."""
         if colour is None or len(set(self.stars)) == len(self.names):
             return source
-        seen = colour[jnp.arange(source.shape[-1]), source, 0]
-        distance = jnp.abs(seen[..., None] - jnp.array([wavelength for wavelength, _ in self.bands]))
+        observed = colour[jnp.arange(source.shape[-1]), source, 0]
+        distance = jnp.abs(observed[..., None] - jnp.array([wavelength for wavelength, _ in self.bands]))
         nearest = jnp.argmin(
             jnp.where(jnp.array(self.stars) == source[..., None], distance, jnp.inf), axis=-1
         )
@@ -283,25 +283,25 @@ class Standards(Source):
         colour = sight.exposures.colour
         row = jnp.maximum(self.values(sight.source, colour), 0)
         qu, rotator = jnp.stack([self.q[row], self.u[row]], axis=-1), sight.exposures.rotator
-        for one in self.changes:
-            qu = qu.at[:, one.axis].add(
-                jnp.where(row == one.value, one.size * one.factor(sight.exposures), 0.0)
+        for change in self.changes:
+            qu = qu.at[:, change.axis].add(
+                jnp.where(row == change.value, change.size * change.factor(sight.exposures), 0.0)
             )
         if self.angle is not None:
             rotator = rotator - jnp.deg2rad(self.angle)
         if colour is None or not self.bands:
             return turned(qu, rotator), jnp.zeros_like(qu)
         first, number = np.unique(self.stars, return_inverse=True)
-        here = colour[jnp.arange(len(row)), jnp.asarray(first[number])[row]]
-        there = jnp.array(self.bands).at[np.array(self.unknown, int), 0].set(self.wavelength)[row]
+        band = colour[jnp.arange(len(row)), jnp.asarray(first[number])[row]]
+        catalogue_band = jnp.array(self.bands).at[np.array(self.unknown, int), 0].set(self.wavelength)[row]
         star = jnp.asarray(number)[row]
         lmax, turn = jnp.maximum(self.lmax[star], SHORTEST), jnp.deg2rad(self.turn[star])
-        degree = mean_over_band(lmax, here) / mean_over_band(lmax, there)
-        seen = turned(degree[:, None] * qu, rotator - turn * (here[:, 0] - there[:, 0]))
+        degree = mean_over_band(lmax, band) / mean_over_band(lmax, catalogue_band)
+        observed = turned(degree[:, None] * qu, rotator - turn * (band[:, 0] - catalogue_band[:, 0]))
         # d/dλ of p exp(2i angle), relative to it
-        rising = 2.0 * width_of_law(lmax) * jnp.log(lmax / here[:, 0]) / here[:, 0]
-        across = jnp.stack([-seen[:, 1], seen[:, 0]], axis=-1)
-        return seen, rising[:, None] * seen + 2.0 * turn[:, None] * across
+        rising = 2.0 * width_of_law(lmax) * jnp.log(lmax / band[:, 0]) / band[:, 0]
+        across = jnp.stack([-observed[:, 1], observed[:, 0]], axis=-1)
+        return observed, rising[:, None] * observed + 2.0 * turn[:, None] * across
 
 
 def width_of_law(lmax: Array) -> Array:

@@ -114,8 +114,8 @@ class Model(Displayed):
 
     def positions(self, component: str) -> Int[np.ndarray, " _"]:
         """Positions of the parameters of a part or an effect, in tree order; none where the model has none."""
-        parts = (f"{p.part}." for p in self.parameters)
-        return np.array([i for i, part in enumerate(parts) if part.startswith(f"{component}.")], int)
+        owners = (f"{p.part}." for p in self.parameters)
+        return np.array([i for i, owner in enumerate(owners) if owner.startswith(f"{component}.")], int)
 
     def change(self, name: str, **changes: Any) -> Model:
         """The model with fields of one parameter replaced. Raises ValueError for values that mean nothing."""
@@ -182,8 +182,8 @@ class Model(Displayed):
         def moves_one(position: int) -> bool:
             marked = self.start
             marked[position] = np.nan
-            there = _wave_plates(self.instrument(marked[self.masters]).patched())
-            return any(bool(np.isnan(gap.gap)) for _, plate in there for gap in plate.air_gaps)
+            plates = _wave_plates(self.instrument(marked[self.masters]).patched())
+            return any(bool(np.isnan(gap.gap)) for _, plate in plates for gap in plate.air_gaps)
 
         of_effects = {i for name in self.effect_names for i in self.positions(name).tolist()}
         return tuple(i for i in self.free.tolist() if i in of_effects and moves_one(i))
@@ -271,36 +271,36 @@ def with_effects(model: Model, effects: Sequence[str | EffectKind | Effect], con
         if not isinstance(effect, Effect):
             kind = effect_by_name(effect, model.catalogue) if isinstance(effect, str) else effect
             effect = next((group[0] for group in kind.probes(context)), kind.neutral(context))
-        if effect.name in (other.name for other in active):
+        if effect.name in (present.name for present in active):
             raise ValueError(f"effect {effect.name!r} is in the model already")
         active.append(effect)
         neutral = effect.at_neutral(context)
         names = [f"{effect.name}.{leaf.name}" for leaf in leaves(effect)]
         values = zip(np.asarray(values_of(effect)), np.asarray(values_of(neutral)), strict=True)
         starts |= dict(zip(names, values, strict=True))
-    told = {text for effect in active if isinstance(effect, Described) for text in effect.sentences}
+    sentences = {text for effect in active if isinstance(effect, Described) for text in effect.sentences}
     for effect in active:
-        for text in told.intersection(effect.stated):
+        for text in sentences.intersection(effect.stated):
             raise ValueError(
                 f"effect {effect.name!r} is the number that {text!r} adds to: leave one of them out"
             )
     instrument = dataclasses.replace(model.template, effects=in_order(active))
     jax.eval_shape(lambda i: i.patched(), instrument)  # whatever does not fit the instrument is an error here
-    known = {p.name: p for p in model.parameters}
+    by_name = {p.name: p for p in model.parameters}
     parameters = []
     for p in make_model(model.name, instrument).parameters:
         if p.name in starts:
             start, neutral = map(float, starts[p.name])
             prior = None if p.prior is None else (neutral, p.prior[1])
-            known[p.name] = dataclasses.replace(p, start=start, prior=prior)
-        parameters.append(known[p.name])
+            by_name[p.name] = dataclasses.replace(p, start=start, prior=prior)
+        parameters.append(by_name[p.name])
     return dataclasses.replace(model, template=jax.tree.map(array, instrument), parameters=tuple(parameters))
 
 
 def model_without(model: Model, name: str) -> Model:
     """The model with one effect taken out."""
-    rest = tuple(effect for effect in model.template.effects if effect.name != name)
-    own = model.positions(name)
-    parameters = tuple(p for i, p in enumerate(model.parameters) if i not in own)
-    template = dataclasses.replace(model.template, effects=rest)
+    effects = tuple(effect for effect in model.template.effects if effect.name != name)
+    removed = model.positions(name)
+    parameters = tuple(p for i, p in enumerate(model.parameters) if i not in removed)
+    template = dataclasses.replace(model.template, effects=effects)
     return dataclasses.replace(model, template=template, parameters=parameters)

@@ -95,7 +95,8 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
         if matrix is not None or element.moves:
             stages.append(_one(element.name, _about(element, plan), weight @ nodes))
     of_arms = [
-        weight @ functools.reduce(lambda one, matrix: _through(matrix, one), arm, nodes) for arm in inside
+        weight @ functools.reduce(lambda vector, matrix: _through(matrix, vector), arm, nodes)
+        for arm in inside
     ]
     names = tuple(arm.name for arm in instrument.arms)
     stages.append(LightStage("arms", "ahead of the analysers", names, STOKES, np.asarray(of_arms)))
@@ -103,14 +104,14 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
     # From there as in every fit: the rows that the analysers see, times the light.
     rows, throughput = light.band_rows(instrument, plan, x, y), instrument.throughput.at(x, y)
     unmixed = dataclasses.replace(instrument, cameras=dataclasses.replace(instrument.cameras, mixing=()))
-    for name, about, seen in (
+    for name, about, vectors in (
         ("analysers", "share of the light in each beam of its arm",
          light.beams(instrument, rows) @ light.upstream(instrument, x, y)),
         ("cameras", "behind lenses, filter and detector of each camera",
          light.camera_vectors(unmixed, rows, throughput, x, y)),
         ("counts", "electrons per electron of flux", light.camera_vectors(instrument, rows, throughput, x, y)),
     ):  # fmt: skip
-        stages.append(LightStage(name, about, ("",), instrument.cameras.names, np.asarray(seen @ beam)))
+        stages.append(LightStage(name, about, ("",), instrument.cameras.names, np.asarray(vectors @ beam)))
     return tuple(stages)
 
 

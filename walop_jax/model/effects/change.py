@@ -167,7 +167,7 @@ class Change:
     @property
     def grows_with(self) -> tuple[Factor, ...]:
         """Its factors that have a text."""
-        return tuple(factor(one) for one in self.factors if isinstance(one, str))
+        return tuple(factor(item) for item in self.factors if isinstance(item, str))
 
     def counted_in(self, units: Units) -> Change:
         """The change of an instrument with its scales."""

@@ -122,10 +122,10 @@ class Entry:
         """The effect with values that change nothing; choices are the first there are."""
         count = {"camera": (len(context.cameras),), "moon exposure": (len(context.moon),)}
         values = {
-            one.name: as_number(
-                np.full(count.get(one.each, ()), context.extinction if one.absolute else one.neutral)
+            member.name: as_number(
+                np.full(count.get(member.each, ()), context.extinction if member.absolute else member.neutral)
             )
-            for one in self.members
+            for member in self.members
         }
         first = {"cameras": 0, "stars": next(iter(context.sources), "")}
         chosen = tuple((name, first[of] if isinstance(of, str) else of[0]) for name, of in self.choices)

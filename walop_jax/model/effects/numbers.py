@@ -70,7 +70,7 @@ def _of_plate(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
             instrument = instrument.changed(change.place, **{change.kind: add(size)})
             continue
         grown = Grown(size, jnp.zeros(()), change)
-        instrument = instrument.changed(change.place, grown=lambda there, one=grown: (*there, one))
+        instrument = instrument.changed(change.place, grown=lambda old, new=grown: (*old, new))
     return instrument
 
 
@@ -80,8 +80,8 @@ def _of_instrument(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
         places = PLACES[change.kind]
         if change.place not in places:
             raise unknown_name(f"place of {change.kind}", change.place, places)
-        part, field = places[change.place]
-        instrument = instrument.changed(part, **{field: add(size)})
+        holder, field = places[change.place]
+        instrument = instrument.changed(holder, **{field: add(size)})
     return instrument
 
 
@@ -103,9 +103,7 @@ def _polarised(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
         at = positions.index(item.number)
         components[item.kind[-1]][at] = components[item.kind[-1]][at] + value
     patches = MoonPatches(jnp.stack(components["q"]), jnp.stack(components["u"]), positions)
-    return instrument.changed(
-        "sky", patches=lambda there: patches if there is None else there.joined(patches)
-    )
+    return instrument.changed("sky", patches=lambda old: patches if old is None else old.joined(patches))
 
 
 def _of_patch(instrument: Instrument, change: Change) -> Grows:
@@ -127,8 +125,8 @@ def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
             raise NoSuchPlaceError(str(what))
         at = names.index(change.place)
         if change.factors:
-            one = GrownStandard(size, at, "qu".index(axis), change)
-            instrument = instrument.changed("standard", changes=lambda there, one=one: (*there, one))
+            grown = GrownStandard(size, at, "qu".index(axis), change)
+            instrument = instrument.changed("standard", changes=lambda old, grown=grown: (*old, grown))
             continue
         instrument = instrument.changed(
             "standard", **{axis: lambda value, at=at, size=size: value.at[at].add(size)}

@@ -94,8 +94,8 @@ def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
     )
     if any(name.startswith("depolarisation") for name in sums):
         lost = [jnp.asarray(sums.get(f"depolarisation {axis}", 0.0)) for axis in "quv"]
-        kept = 1.0 - jnp.stack(jnp.broadcast_arrays(jnp.zeros(()), *lost), axis=-1)[..., None]
-        matrix = kept * (jnp.eye(4) if matrix is None else matrix)
+        remaining = 1.0 - jnp.stack(jnp.broadcast_arrays(jnp.zeros(()), *lost), axis=-1)[..., None]
+        matrix = remaining * (jnp.eye(4) if matrix is None else matrix)
     assert matrix is not None
     return matrix
 
@@ -220,8 +220,8 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     if _is_ahead(instrument, change):
         return Grows((FIELD, EXPOSURE), None, (always, Combinations(along=(*SINGLE, "kind")), _ANYTHING))
     if change.where != "of":
-        more = Combinations(over, ("colour",)), Combinations(among=("all",)), _ANYTHING
-        return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=(always, *more))
+        further = Combinations(over, ("colour",)), Combinations(among=("all",)), _ANYTHING
+        return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=(always, *further))
     if polariser is not None and change.place == polariser.name:
         film = always, Combinations(over, ("harmonics to 2",)), Combinations(along=(*SINGLE, "side"))
         as_a_turn = {"turn": _TURN, "retardance v": ()}

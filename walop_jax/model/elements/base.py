@@ -102,6 +102,6 @@ def _turned_copies(cases: Sequence[tuple[Any, Ray]]) -> list[list[int]]:
     """Positions of the cases that are one element at different angles, met by the same ray."""
     groups: dict[tuple[int, ...], list[int]] = {}
     for i, (element, ray) in enumerate(cases):
-        parts = [getattr(element, f.name) for f in dataclasses.fields(element) if f.name != "axis"]
-        groups.setdefault((*map(id, parts), id(ray)), []).append(i)
+        values = [getattr(element, f.name) for f in dataclasses.fields(element) if f.name != "axis"]
+        groups.setdefault((*map(id, values), id(ray)), []).append(i)
     return list(groups.values())

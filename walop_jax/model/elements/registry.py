@@ -46,13 +46,13 @@ ELEMENTS: tuple[type[Element], ...] = (
 
 def defined_elements() -> tuple[type[Element], ...]:
     """The kinds of elements that this process has defined beside those of the package, the latest of a kind."""
-    found, waiting = {}, [Element]
+    kinds, waiting = {}, [Element]
     while waiting:
         for kind in waiting.pop(0).__subclasses__():
             waiting.append(kind)
             if vars(kind).get("kind") and not kind.__module__.startswith("walop_jax.model."):
-                found[kind.kind] = kind
-    return tuple(found.values())
+                kinds[kind.kind] = kind
+    return tuple(kinds.values())
 
 
 def load_elements(given: str | os.PathLike[str] | Sequence[type]) -> None:

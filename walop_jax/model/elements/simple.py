@@ -96,8 +96,8 @@ class Depolariser(Element):
 
     def mueller(self, ray: Ray) -> Mueller:
         """The depolariser."""
-        kept = 1.0 - self.linear
-        return jnp.diag(jnp.stack([jnp.ones_like(kept), kept, kept, 1.0 - self.circular]))
+        remaining = 1.0 - self.linear
+        return jnp.diag(jnp.stack([jnp.ones_like(remaining), remaining, remaining, 1.0 - self.circular]))
 
 
 class AddedPolarisation(Element):
@@ -158,7 +158,7 @@ class AnalysisVector(Element):
 
     def labels(self, field: str) -> Sequence[str]:
         """Those of a change are named by what they are a response to."""
-        return tuple(f"{field}.{one}" for one in "iquv") if field in FOLLOWING else (field,)
+        return tuple(f"{field}.{component}" for component in "iquv") if field in FOLLOWING else (field,)
 
 
 # -------------------------------------------------------------------------------------------- the calibration polariser
@@ -307,21 +307,21 @@ class Analyser(WithCurves):
 
     def in_band(self, rows: Float[Array, "b r 4"], wavelength: Float[Array, " b"]) -> Float[Array, "b r 4"]:
         """Band-integrated rows of `seen` (or of their slopes) with balance and loss, at mean wavelengths (µm)."""
-        whole, analysed = rows[:, 0], rows[:, 1]
+        total, analysed = rows[:, 0], rows[:, 1]
         if self.loss is not None:
             analysed = (1.0 - self.curve("loss", wavelength))[:, None] * analysed
         if self.balance is not None:
             g = self.curve("balance", wavelength)[:, None]
-            whole, analysed = whole + g * analysed, analysed + g * whole
-        return jnp.stack([whole, analysed], axis=1)
+            total, analysed = total + g * analysed, analysed + g * total
+        return jnp.stack([total, analysed], axis=1)
 
     def shares(self) -> Float[Array, "k 2"]:
         """Share of `seen` that each beam takes: that of the second camera only where there is one."""
         half = 0.5 * jnp.ones_like(self.efficiency)
         extra = jnp.zeros_like(half) if self.contrast is None else 0.5 * self.contrast
         along = 0.5 * self.efficiency
-        both = jnp.stack([jnp.stack([half, along + extra]), jnp.stack([half, extra - along])])
-        return both[: len(self.cameras)] if self.cameras else both
+        beams = jnp.stack([jnp.stack([half, along + extra]), jnp.stack([half, extra - along])])
+        return beams[: len(self.cameras)] if self.cameras else beams
 
     def shares_of_slopes(self) -> Float[Array, "k 2"]:
         """Share of λ ∂/∂λ of `seen` that each beam takes."""

@@ -91,11 +91,11 @@ def spline(knots: Sequence[float], values: Curve, at: Float[Array, " n"]) -> Flo
 def _bends(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
     """Matrix that gives the second derivatives at the knots from the values: de Boor's tridiagonal system."""
     n, h = len(x), np.diff(x)
-    left, right = np.eye(n), np.zeros((n, n))
+    system, differences = np.eye(n), np.zeros((n, n))
     for i in range(1, n - 1):
-        left[i, i - 1 : i + 2] = h[i - 1] / 6.0, (h[i - 1] + h[i]) / 3.0, h[i] / 6.0
-        right[i, i - 1 : i + 2] = 1.0 / h[i - 1], -1.0 / h[i - 1] - 1.0 / h[i], 1.0 / h[i]
-    return np.linalg.solve(left, right)
+        system[i, i - 1 : i + 2] = h[i - 1] / 6.0, (h[i - 1] + h[i]) / 3.0, h[i] / 6.0
+        differences[i, i - 1 : i + 2] = 1.0 / h[i - 1], -1.0 / h[i - 1] - 1.0 / h[i], 1.0 / h[i]
+    return np.linalg.solve(system, differences)
 
 
 class SpectralElement(WithCurves):
@@ -140,17 +140,19 @@ class SpectralElement(WithCurves):
         if self.delta is not None:
             yield mueller.retarder(self.curve("delta", ray.wavelength), axis)
         if self.spread is not None:
-            kept, one = 1.0 - self.curve("spread", ray.wavelength), jnp.ones_like(ray.wavelength)
-            own = jnp.stack([one, one, kept, kept], axis=-1)[:, :, None] * jnp.eye(4)
-            yield mueller.rotation(-axis) @ own @ mueller.rotation(axis)
+            remaining, ones = 1.0 - self.curve("spread", ray.wavelength), jnp.ones_like(ray.wavelength)
+            matrix = jnp.stack([ones, ones, remaining, remaining], axis=-1)[:, :, None] * jnp.eye(4)
+            yield mueller.rotation(-axis) @ matrix @ mueller.rotation(axis)
         if self.diattenuation is not None:
             d = self.curve("diattenuation", ray.wavelength)
             yield mueller.diattenuator(d * jnp.cos(2.0 * axis), d * jnp.sin(2.0 * axis))
         if self.rotation is not None:
             yield mueller.rotation(-jnp.deg2rad(self.curve("rotation", ray.wavelength)))
         if self.loss is not None:
-            kept = 1.0 - self.curve("loss", ray.wavelength)
-            yield jnp.stack([jnp.ones_like(kept), kept, kept, kept], axis=-1)[:, :, None] * jnp.eye(4)
+            remaining = 1.0 - self.curve("loss", ray.wavelength)
+            yield jnp.stack([jnp.ones_like(remaining), remaining, remaining, remaining], axis=-1)[
+                :, :, None
+            ] * jnp.eye(4)
 
 
 class FieldDiattenuator(Element):
@@ -193,14 +195,14 @@ class FieldDiattenuator(Element):
         if self.none_at > 0.0:
             gap = sum(knot < self.none_at for knot in knots)
             knots = (*knots[:gap], self.none_at, *knots[gap:])
-        parts = [
+        contributions = [
             terms[..., n] * spline(knots, _with_zero(values, gap, len(knots)), ray.wavelength)
             for name, n in FIELD_TERMS.items()
             if (values := getattr(self, name)) is not None
         ]
-        if not parts:
+        if not contributions:
             return None
-        d, twice = sum(parts[1:], parts[0]), 2.0 * jnp.deg2rad(self.axis)
+        d, twice = sum(contributions[1:], contributions[0]), 2.0 * jnp.deg2rad(self.axis)
         return mueller.diattenuator(d * jnp.cos(twice), d * jnp.sin(twice))
 
 
@@ -246,6 +248,6 @@ class Mirror(WithCurves):
         s = (cos - inside) / (cos + inside)
         p = (index**2 * cos - inside) / (index**2 * cos + inside)
         nothing = jnp.zeros_like(p)
-        own = mueller.from_jones(mueller.Matrix2(p, nothing, nothing, s))
+        matrix = mueller.from_jones(mueller.Matrix2(p, nothing, nothing, s))
         axis = jnp.deg2rad(self.axis)
-        return mueller.rotation(-axis) @ (own / own[..., :1, :1]) @ mueller.rotation(axis)
+        return mueller.rotation(-axis) @ (matrix / matrix[..., :1, :1]) @ mueller.rotation(axis)

@@ -111,7 +111,7 @@ class WavePlate(Element):
     def turned(self, angle: float) -> Self:
         """The plate turned, and with it the readings that its numbers grow with."""
         plate = super().turned(angle)
-        if not any(part.grown for part in (self, *self.layers)):
+        if not any(component.grown for component in (self, *self.layers)):
             return plate
         layers = tuple(dataclasses.replace(layer, grown=_read_at(layer, angle)) for layer in self.layers)
         return dataclasses.replace(plate, grown=_read_at(self, angle), layers=layers)
@@ -141,17 +141,17 @@ class WavePlate(Element):
         sum_of_all = np.sum(waves, axis=0)
         return np.abs(sign @ np.array(waves)) if (away < CROSSED).all() else sum_of_all, sum_of_all
 
-    def crystals(self, ray: Ray, known: Known | None = None) -> tuple[plates.Plate, ...]:
+    def crystals(self, ray: Ray, indices: Known | None = None) -> tuple[plates.Plate, ...]:
         """The layers at the wavelengths of a ray; `known` keeps indices of refraction from plate to plate."""
-        made, known = [], {} if known is None else known
+        crystals, indices = [], {} if indices is None else indices
         for layer in self.layers:
             crystal, case = materials.CRYSTALS[layer.material], (layer.material, id(ray.wavelength))
-            if case not in known:
-                known[case] = (
+            if case not in indices:
+                indices[case] = (
                     crystal.ordinary.refractive_index(ray.wavelength),
                     crystal.extraordinary.refractive_index(ray.wavelength),
                 )
-            ordinary, extraordinary = known[case]
+            ordinary, extraordinary = indices[case]
             changes = (layer.slope, layer.bend, layer.twist)
             if any(change is not None for change in changes):
                 u = ray.wavelength - REFERENCE_WAVELENGTH
@@ -164,8 +164,10 @@ class WavePlate(Element):
             axis = jnp.deg2rad(_number(self, "axis", ray) + _number(layer, "axis", ray))
             cut = _number(layer, "cut", ray)
             cut = None if cut is None else jnp.deg2rad(cut)
-            made.append(plates.Plate(_number(layer, "thickness", ray), ordinary, extraordinary, axis, cut))
-        return tuple(made)
+            crystals.append(
+                plates.Plate(_number(layer, "thickness", ray), ordinary, extraordinary, axis, cut)
+            )
+        return tuple(crystals)
 
     def mueller(self, ray: Ray) -> Mueller | None:
         """The plate with the air gap ahead of it."""
@@ -216,15 +218,15 @@ class WavePlate(Element):
 def _number(part: WavePlate | Layer, name: str, ray: Ray) -> Any:
     """A number of a plate or a layer for a ray; None where it has none."""
     value = getattr(part, name)
-    for one in part.grown:
-        if one.change.kind == name:
-            by = one.size * one.change.in_train(ray, one.reading)
+    for term in part.grown:
+        if term.change.kind == name:
+            by = term.size * term.change.in_train(ray, term.reading)
             value = by if value is None else value + by
     return value
 
 
 def _read_at(part: WavePlate | Layer, angle: float) -> tuple[Grown, ...]:
-    return tuple(dataclasses.replace(one, reading=one.reading + angle) for one in part.grown)
+    return tuple(dataclasses.replace(term, reading=term.reading + angle) for term in part.grown)
 
 
 def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Float[Array, "c n 4 4"]:
@@ -237,8 +239,8 @@ def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Floa
         shape = nodes if any(jnp.ndim(value) for value in values) else (1,)
         return jnp.stack([jnp.broadcast_to(value, shape) for value in values])
 
-    known: Known = {}
-    stacks = [plate.crystals(ray, known) for plate, ray in cases]
+    indices: Known = {}
+    stacks = [plate.crystals(ray, indices) for plate, ray in cases]
     if any(crystal.cut is not None for stack in stacks for crystal in stack):
         stacks = [
             tuple(c if c.cut is not None else c._replace(cut=jnp.zeros(())) for c in stack)
