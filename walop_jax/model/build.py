@@ -1,4 +1,4 @@
-"""From the description of an instrument to its parts: every element that a file names is made and checked here."""
+"""From the description of an instrument to its parts: construction and checks of all elements of a file."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ from walop_jax.model.elements.simple import Analyser, Polariser
 from walop_jax.model.elements.wave_plate import Layer, WavePlate
 from walop_jax.model.parameters import Component, Parameter, is_row, numbers_of, unknown_name
 
-OWN = ("name", "moves", "declared", "model")  # what a file says otherwise, or not at all
+OWN = ("name", "moves", "declared", "model")  # under other keys in a file, or absent
 NUMBER_KEYS = ("value", "sigma", "unit", "source", "name", "scale", "loose", "tie")
 SERIES = "Legendre coefficient P_i(x/h) P_j(y/h)"
 FREE = "smooth vignetting and coatings: free"
 SHARES = ("efficiency", "extinction", "linear", "circular")
-PER_FIELD = re.compile(r"deg-(\d)")  # unit of what grows with a power of the distance from the centre
+PER_FIELD = re.compile(r"deg-(\d)")  # unit of coefficients of a power of the distance from the centre
 SURE = 3.0  # standard deviations within which an instrument is built
 LARGEST_ANGLE = 4.0 * np.pi  # rad, of a number without a unit: two waves
-NANOMETRES = 3000.0  # above, wavelengths are thought to be in Angstrom
+NANOMETRES = 3000.0  # above, wavelengths are taken for Angstrom
 
 Arm = tuple[str, tuple[Element, ...], tuple[str, ...]]
 Declared = tuple[tuple[str, Parameter], ...]
 
 
 def made_by(kind: str) -> str:
-    """The beginning of the line of a description that says where the class of a kind of one's own comes from."""
+    """The beginning of the line of a description on the origin of a user-defined kind of element."""
     return f"# element {kind}: "
 
 
 def with_origins(text: str, elements: Sequence[Element]) -> str:
-    """A description with a line for each kind of element of one's own: whoever reads it elsewhere needs the class."""
+    """A description with a line for each user-defined kind of element: other readers need the class."""
     lines = {}
     for element in elements:
         if not any(type(element) is kind for kind in ELEMENTS) and made_by(element.kind) not in text:
@@ -57,10 +57,10 @@ def with_origins(text: str, elements: Sequence[Element]) -> str:
 def parts(
     description: Description, elements: Sequence[type[Element]] = ()
 ) -> tuple[tuple[Element, ...], tuple[Arm, ...], Throughput, Cameras]:
-    """The parts of an instrument that a description describes, at the values that it gives.
+    """The parts of a described instrument, at the values of the description.
 
-    An arm is its name, its elements and their order. `elements` are further kinds of elements that it may name. Raises
-    `DataError`, naming table and key, for what is wrong.
+    An arm is its name, its elements and their order. `elements` are further kinds of elements for the description.
+    Raises `DataError`, with table and key, for invalid entries.
     """
     kinds = {kind.kind: kind for kind in (*ELEMENTS, *elements)}
     edge = (description.edge or description.field_scale) * (
@@ -105,7 +105,7 @@ class _Maker:
     farthest: float = 0.0
 
     def origin(self, kind: str) -> str:
-        """Advice on the class of a kind that is not there, which the description may name."""
+        """Advice on the missing class of a kind, with its origin where the description names it."""
         line = next((line for line in self.text.splitlines() if line.startswith(made_by(kind))), "")
         where = line.removeprefix(made_by(kind))
         return f"It is {where}: give --elements FILE.py" if where else "One of your own: --elements FILE.py"
@@ -159,7 +159,7 @@ class _Maker:
         return element
 
     def made(self, kind: type[Any], place: str, **fields: Any) -> Any:
-        """A component; what it says of its numbers is an error of the file."""
+        """A component; its complaints about numbers become errors of the file."""
         try:
             return kind(**fields)
         except ValueError as error:
@@ -183,7 +183,7 @@ class _Maker:
             raise self.read.fault(place, f"{what} changes the ray and cannot move")
 
     def check_edge(self, element: Element, place: str) -> None:
-        """Raise `DataError` for numbers that, as sure as they are, leave no possible light at the edge of the field."""
+        """Raise `DataError` for numbers that, within their errors, allow no light at the edge of the field."""
         mapping = isinstance(element, PupilMapping)  # r (1 + κ r²) must grow with r, and stay ahead of 90 deg
         r, share, limit = self.farthest, 0.0, 1.0 / 3.0 if mapping else 1.0
         for key, parameter in element.declarations().items():
@@ -216,7 +216,7 @@ class _Maker:
             yield self.made(Layer, location, name=name, declared=declared, **fields)
 
     def fields(self, kind: type[Component], table: Table, place: str) -> tuple[dict[str, Any], Declared]:
-        """Fields of a component from what a file says of it, and which of them are parameters."""
+        """Fields of a component from its table in a file, and the parameters among them."""
         numbers = numbers_of(kind)
         plain = {
             f.name: f.default
@@ -247,7 +247,7 @@ class _Maker:
     def number(
         self, entry: Any, declaration: Parameter, row: bool, key: str, place: str
     ) -> tuple[float | tuple[float, ...], Parameter | None]:
-        """The value of a number, or of a row of them; the parameter that it is where more is said than its value."""
+        """The value of a number, or of a row of them; the parameter for a table with more than a value."""
         several = self.read.numbers if row else self.read.number
         if not isinstance(entry, Mapping):
             value = several(entry, key, place)
@@ -282,7 +282,7 @@ class _Maker:
         return value, declared
 
     def check_angle(self, value: float | tuple[float, ...], unit: str, key: str, place: str) -> None:
-        """Raise `DataError` for an angle (rad) without a unit that looks like degrees."""
+        """Raise `DataError` for an angle (rad) without a unit, apparently in degrees."""
         largest = float(np.max(np.abs(value)))
         if unit == "rad" and largest > LARGEST_ANGLE:
             what = f"{key} = {largest:g} rad is {largest / (2.0 * np.pi):.1f} waves; in degrees? write "
@@ -290,7 +290,7 @@ class _Maker:
             raise self.read.fault(place, what)
 
     def check_wavelengths(self, value: float | tuple[float, ...], key: str, place: str) -> None:
-        """Raise `DataError` for wavelengths (µm) that no camera sees."""
+        """Raise `DataError` for wavelengths (µm) beyond those of cameras."""
         low, high = WAVELENGTHS
         for wavelength in np.atleast_1d(value).tolist():
             if not low <= wavelength <= high:
@@ -302,7 +302,7 @@ class _Maker:
                 raise self.read.fault(place, what)
 
     def choice(self, value: Any, default: Any, key: str, place: str) -> Any:
-        """A choice that is no parameter, of the type of its default."""
+        """A choice (no parameter), of the type of its default."""
         if isinstance(value, Mapping):
             raise self.read.fault(place, f"{key} cannot be a parameter")
         if isinstance(default, bool):
@@ -322,7 +322,7 @@ class _Maker:
 
 
 def _converted(given: Table, unit: str) -> str:
-    """Advice on numbers in another unit than theirs: what to write, where that can be told."""
+    """Advice on numbers in another unit: the converted ones where the conversion exists."""
     from walop_jax.data.units import Place, convert_unit
 
     try:

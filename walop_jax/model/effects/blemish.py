@@ -3,7 +3,7 @@
 Equation    throughput × (1 − depth · exp(−((X − x)² + (Y − y)²) / 2 size²)) in one camera
 Symbols     x, y centre and size (standard deviation) [deg]; depth, a share
 Source      dust near a focal plane, or a damaged coating.
-Neutral     depth = 0, wherever it is
+Neutral     depth = 0, at any position
 Revealed by a local zero offset of one half, the same in all exposures.
 """
 
@@ -46,14 +46,14 @@ class Spot(Transmission):
     cameras: int = eqx.field(static=True)
 
     def factors(self, x: Scalar, y: Scalar) -> Float[Array, " k"]:
-        """Share of the throughput that the spot leaves."""
+        """Share of the throughput behind the spot."""
         distance = _distance(self, x, y)
         return jnp.ones(self.cameras).at[self.camera].add(-self.depth * jnp.exp(-distance))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Pattern:
-    """The spot as a factor of a column."""
+    """The spot as a factor."""
 
     x: float
     y: float
@@ -102,7 +102,7 @@ class Blemish(Effect):
         )
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
-        """A gain of the camera that goes as the spot."""
+        """A gain of the camera with the pattern of the spot."""
         pattern = _Pattern(float(self.x), float(self.y), float(self.size))
         return (((-1.0, Change("gain", "of", instrument.cameras.names[self.camera], (pattern,))),),)
 

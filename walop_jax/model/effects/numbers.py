@@ -1,4 +1,4 @@
-"""Changes of a number that a part of the instrument has, or of what is looked at: what is found is added to it."""
+"""Changes of a number of the instrument, or of a source: the amplitude is added to it."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ PLACES = {
     "shift": {BAND: ("", "filter_shift")},
     "rotator": {SKY: ("", "rotator_zero"), Standards.name: (Standards.name, "angle")},
 }
-"""Places of numbers of the instrument as a whole: the part that holds them, and its field."""
+"""Places of numbers of the instrument as a whole: their part, and its field."""
 
 
 def _number(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    """Add to a number of the polariser; it has the name of the kind."""
+    """Add to a number of the polariser, which has the name of the kind."""
     for change, size in terms:
         instrument = instrument.changed(change.place, **{change.kind: add(size)})
     return instrument
@@ -50,7 +50,7 @@ _FIELD = ("even", "tilt", "r2")
 
 
 def _with_ray(instrument: Instrument, change: Change) -> Grows:
-    """Plates with what a ray knows, and with their own angle."""
+    """Plates: with the quantities of a ray, and with their own angle."""
     holders = [p for p in instrument.places(WavePlate) if f"{change.place}.".startswith(f"{p}.")]
     moves = instrument.element(holders[0]).moves if holders else None
     tried = (
@@ -64,7 +64,7 @@ def _with_ray(instrument: Instrument, change: Change) -> Grows:
 
 
 def _of_plate(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    """Add to a number of a wave plate, or of a layer of it, the same one for every ray or one that grows."""
+    """Add to a number of a wave plate, or of one of its layers: a constant, or an amplitude with factors."""
     for change, size in terms:
         if not change.factors:
             instrument = instrument.changed(change.place, **{change.kind: add(size)})
@@ -107,7 +107,7 @@ def _polarised(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 
 def _of_patch(instrument: Instrument, change: Change) -> Grows:
-    """Of one patch of the sky, which is an exposure; of a star what changes with time and from filter to filter."""
+    """Patches of the sky: single exposures; stars: changes with time and from filter to filter."""
     if change.place != SKY:
         return Grows((EXPOSURE, WAVELENGTH), tried=(Combinations(),))
     if change.kind == "polarisation":
@@ -135,7 +135,7 @@ def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 
 class GrownStandard(StandardChange):
-    """A change of a standard that grows with time, or from filter to filter."""
+    """A change of a standard with time, or from filter to filter."""
 
     change: Change = eqx.field(static=True)
 
@@ -145,7 +145,7 @@ class GrownStandard(StandardChange):
 
 
 def _slots_of_source(instrument: Instrument, change: Change) -> list[SlotTerm]:
-    """Of the light: q or u of a star has its number in the list."""
+    """Slots of the light: q or u of a star with its number in the list."""
     names = [name.replace(" ", "_") for name in instrument.standard.names]
     star = (names.index(change.place),) if change.place in names else ()
     place = instrument.standard.name if star else change.place
@@ -153,7 +153,7 @@ def _slots_of_source(instrument: Instrument, change: Change) -> list[SlotTerm]:
 
 
 NUMBERS = {"axis": "angle", "cut": "angle", "thickness": "length", "thermal": "number"}
-"""Kinds that are numbers of wave plates, of layers of them (µm, deg), and their amplitudes."""
+"""Numbers of wave plates and of their layers (µm, deg), with their amplitudes."""
 KINDS |= {
     name: Kind(amplitude, _of_plate, grows=_with_ray, slots=itself("number"))
     for name, amplitude in NUMBERS.items()
