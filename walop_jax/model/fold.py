@@ -1,13 +1,13 @@
 """The fold of the train: Mueller matrices of all elements at all their positions, multiplied into the analysers' rows.
 
-A *station* is an element with the ray that meets it; a *state* holds the positions of the moving elements in one
+A *station* is an element with its incident ray; a *state* holds the positions of the moving elements in one
 optical setting (an angle in degrees, None when out), in the order of their columns. Settings that agree in the
 elements nearest to the analysers share the products of these, so every product is made once. `solved` hands all
 elements of one class over together: the half-wave plates are one computation, compiled once.
 
-Turning     An element that turns evenly from a to b during an exposure acts by its mean matrix ∫ M(θ) dθ / (b − a),
+Turning     An element in uniform rotation from a to b during an exposure acts by its mean matrix ∫ M(θ) dθ / (b − a),
             since light adds up and no other element turns then: whole turns by the trapezoidal rule, which is exact for
-            the harmonics of a turn that `WHOLE` nodes follow, the rest by Gauss and Legendre's about its middle.
+            the harmonics of a turn resolved by `WHOLE` nodes, the remainder by that of Gauss and Legendre.
 Limits      b − a = 0: M(a). Of an ideal retarder cos 2θ, cos 4θ become cos(n (a + b)/2) sinc(n (b − a)/2).
 """
 
@@ -30,7 +30,7 @@ from walop_jax.model.ray import Ray
 Station = tuple[Element, Ray]
 Mueller = Float[Array, "... 4 4"]
 WHOLE = 64  # angles of a whole turn
-FEWEST, PER_RADIAN = 8, 12.0  # angles of a part of a turn, and how many more for each radian
+FEWEST, PER_RADIAN = 8, 12.0  # angles of a partial turn: the minimum, and more for each radian
 
 
 class Turning(NamedTuple):
@@ -40,7 +40,7 @@ class Turning(NamedTuple):
     turn: float
 
     def angles(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Angles (deg) of which the mean is taken, and their weights."""
+        """Angles (deg) of the mean, and their weights."""
         remainder = self.turn % 360.0
         full_turns = self.turn - remainder
         start = self.middle - self.turn / 2.0
@@ -56,7 +56,7 @@ class Turning(NamedTuple):
 Angle = float | Turning
 State = tuple[Angle | None, ...]
 Solved = dict[tuple[int, Angle | None], Mueller | None]
-"""Mueller matrices by number of the station and angle at which its element stands (None for one that does not move)."""
+"""Mueller matrices by number of the station and angle of its element (None: not moving)."""
 
 
 def stations(elements: Sequence[Element], ray: Ray) -> tuple[list[Station], Ray]:
@@ -69,7 +69,7 @@ def stations(elements: Sequence[Element], ray: Ray) -> tuple[list[Station], Ray]
 
 
 def positions(element: Element, moving: Sequence[str], states: Sequence[State]) -> list[Angle | None]:
-    """Angles (deg) of an element, state by state; None where it is out (or does not move: see `Solved`)."""
+    """Angles (deg) of an element, state by state; None where it is out, or not moving (see `Solved`)."""
     if element.moves is None:
         return [None] * len(states)
     places = [state[moving.index(element.moves)] for state in states]
@@ -77,7 +77,7 @@ def positions(element: Element, moving: Sequence[str], states: Sequence[State]) 
 
 
 def solved(all_stations: Sequence[Station], moving: Sequence[str], states: Sequence[State]) -> Solved:
-    """Mueller matrices of all stations at all the positions in which they occur."""
+    """Mueller matrices of all stations at all their positions."""
     cases: list[tuple[tuple[int, float | None], Element, Ray]] = []
     means: list[tuple[int, Turning]] = []
     for number, (element, ray) in enumerate(all_stations):
@@ -127,7 +127,7 @@ def backward(
     states: Sequence[State],
     nodes: int,
 ) -> Float[Array, "c n r 4"]:
-    """Rows that the analysers see in every state, of light ahead of the common train."""
+    """Rows of the analysers in every state, for light ahead of the common train."""
     in_arms = [element.moves for arm in arms for element, _ in arm if element.moves is not None]
     columns = {moving.index(prefix) for prefix in in_arms}
     keys = list(dict.fromkeys(_restricted(state, columns) for state in states))
@@ -162,7 +162,7 @@ def _branched(
     after: set[int],
     states: Sequence[State],
 ) -> tuple[Float[Array, "d n r 4"], list[State]]:
-    """The rows once for every position of one more moving element; `before` and `after` are the columns that count."""
+    """The rows once for every position of one more moving element; `before` and `after` are the relevant columns."""
     parents = {_restricted(state, after): _restricted(state, before) for state in states}
     order = [keys.index(parent) for parent in parents.values()]
     return (rows if order == list(range(len(keys))) else rows[np.array(order)]), list(parents)
@@ -177,8 +177,8 @@ def around(
     states: Sequence[State],
     nodes: int,
 ) -> list[list[tuple[Float[Array, "c n r 4"], Float[Array, "c n 4 4"]]]]:
-    """For every place of the common train and of the arms: rows that the analysers see of light there, in every state,
-    and the matrix of what is ahead of it.
+    """For every place of the common train and of the arms: rows of the analysers for light there, in every state,
+    and the matrix of all elements ahead of it.
 
     A change of the matrix of a station changes the rows by (rows behind it) × change × (matrix ahead of it).
     """
@@ -218,7 +218,7 @@ def stacked(
     keys: Sequence[State],
     out: Mueller | None = None,
 ) -> Mueller | None:
-    """Matrices of a station in every state, `out` (the identity) where it is out; None where it never acts."""
+    """Matrices of a station in every state, `out` (the identity) where it is out; None where it is always the identity."""
     if element.moves is None:
         return matrices[number, None]
     angles = positions(element, moving, keys)
@@ -243,7 +243,7 @@ def _multiplied(
     moving: Sequence[str],
     keys: Sequence[State],
 ) -> Float[Array, "c n r 4"]:
-    """Rows of the light ahead of a station; states in which it is out are left as they are."""
+    """Rows of the light ahead of a station; unchanged in states without it."""
     if element.moves is None:
         matrix = matrices[number, None]
         return rows if matrix is None else rows @ matrix

@@ -1,5 +1,5 @@
-"""Pages about single effects and elements, made of what their code says of them and of numbers kept beside the
-pages."""
+"""Pages about single effects and elements, from their docstrings and declarations and from the numbers in the folder of
+the pages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from walop_jax.model.parameters import numbers_of, unknown_name
 
 NUMBERS = "gallery.json"
 
-_UNSEEN = 3.0  # standard deviations below which one effect may be taken for another
+_UNSEEN = 3.0  # standard deviations below which two effects may be confused
 _NOTHING = 5e-4  # per cent of the matrix: not worth a number
 
 
@@ -31,7 +31,7 @@ TOPICS: Mapping[str, Mapping[str, Any]] = {
 def page(topic: str, name: str) -> str:
     """The page about an effect or a kind of element (`TOPICS`), as Markdown.
 
-    Raises ValueError where there is none, with the names that the words of `name` speak of, or the nearest ones.
+    Raises ValueError for an unknown name, with the names related to its words, or the nearest ones.
     """
     subjects = TOPICS[topic]
     if name not in subjects:
@@ -49,8 +49,8 @@ def listed(topic: str) -> str:
 
 
 def numbers() -> dict[str, Any]:
-    """The numbers of the pages: `plan` in words, and by effect what `diagnosis.detection_limits` finds for it, and
-    the rms change of the matrix (per cent) at its usual size."""
+    """The numbers of the pages: `plan` in words, and by effect the results of `diagnosis.detection_limits` and the rms
+    change of the matrix (per cent) at its usual size."""
     return json.loads((files("walop_jax") / "docs" / NUMBERS).read_text(encoding="utf-8"))
 
 
@@ -137,7 +137,7 @@ def _head_text(kind: type[Any]) -> str:
 
 
 def _indented(head: str) -> Iterator[str]:
-    """Equation and symbols, as they stand in the head of a file."""
+    """Equation and symbols, as in the head of a file."""
     if head:
         yield "\n".join(f"    {line}".rstrip() for line in head.splitlines())
 

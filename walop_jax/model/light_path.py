@@ -1,7 +1,7 @@
-"""The light path: sources, the train of elements, its arms, the cameras, and the effects that were added to it.
+"""The light path: sources, the train of elements, its arms, the cameras, and its effects.
 
-Nothing here computes light: `light.py` folds it. An effect is a patch: `patched` is the light path with what the
-effects change, and everything that asks for light asks the patched one.
+Nothing here computes light: `light.py` folds it. An effect is a patch: `patched` is the light path with the
+changes of the effects, and all computations of light use it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ AnyPart = TypeVar("AnyPart", bound=Component)
 
 
 class NoSuchPlaceError(ValueError):
-    """An effect asks for an element that this instrument does not have."""
+    """An effect on an element that this instrument does not have."""
 
 
 class Arm(Component):
@@ -48,7 +48,7 @@ class Arm(Component):
 
     @property
     def analyser(self) -> Analyser:
-        """The element that ends it."""
+        """Its last element."""
         last = _member(self.elements, self.path[-1], f"element of arm {self.name}")
         if not isinstance(last, Analyser):
             raise ValueError(f"arm {self.name}: its path must end with an analyser, not with {last.name!r}")
@@ -56,9 +56,9 @@ class Arm(Component):
 
 
 class LightPath(Component):
-    """Everything that light meets, and all that is fitted. `path` names the elements ahead of the arms in their order.
+    """All optics, sources and cameras of a fit. `path` names the elements ahead of the arms in their order.
 
-    `rotator_zero` (deg) is added to ROTATOR, `filter_shift` (µm) displaces broad bands; None: there is none.
+    `rotator_zero` (deg) is added to ROTATOR, `filter_shift` (µm) displaces broad bands; None: none.
     """
 
     name: str = eqx.field(static=True)
@@ -71,9 +71,9 @@ class LightPath(Component):
     effects: tuple[Any, ...] = ()  # patches: `effects.base.Effect`
     rotator_zero: Scalar | None = number(unit="deg", about="true ROTATOR minus the header's", default=None)
     filter_shift: Scalar | None = number(unit="um", about="displacement of broad bands", default=None)
-    sky_films: tuple[Any, ...] = ()  # what light from the sky meets in single exposures (`optics.SkyFilm`)
+    sky_films: tuple[Any, ...] = ()  # changes of light from the sky in single exposures (`optics.SkyFilm`)
 
-    # ------------------------------------------------------------------------------- asking for parts
+    # ------------------------------------------------------------------------------- parts
 
     def train(self) -> Iterator[Element]:
         """The elements ahead of the arms, in the order light meets them."""
@@ -86,9 +86,9 @@ class LightPath(Component):
         return next((element for element in self.train() if isinstance(element, Polariser)), None)
 
     def telescope(self) -> tuple[Element, ...]:
-        """The elements ahead of the polariser, which only light from the sky meets; none where there is no polariser.
+        """The elements ahead of the polariser, in light from the sky alone; none without a polariser.
 
-        Raises ValueError for one that moves, bends the ray or depends on the wavelength: that is not computed there.
+        Raises ValueError for one that moves, bends the ray or depends on wavelength or exposure.
         """
         if self.polariser is None:
             return ()
@@ -102,7 +102,7 @@ class LightPath(Component):
         return elements
 
     def behind_polariser(self) -> tuple[Element, ...]:
-        """The elements behind the polariser, all where there is none."""
+        """The elements behind the polariser; all elements without a polariser."""
         return tuple(self.train())[len(self.telescope()) + (self.polariser is not None) :]
 
     @property
@@ -114,7 +114,7 @@ class LightPath(Component):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """KINDs of exposures that it can look at."""
+        """KINDs of exposures of its sources."""
         return tuple(source.kind for source in self.sources)
 
     def element(self, place: str) -> Element:
@@ -157,7 +157,7 @@ class LightPath(Component):
     # ------------------------------------------------------------------------------- changing it
 
     def patched(self) -> Self:
-        """The instrument with what its effects change, and no effects any more."""
+        """The instrument with the changes of its effects, which are removed."""
         bare = dataclasses.replace(self, effects=())
         return functools.reduce(lambda instrument, effect: effect.patch(instrument), self.effects, bare)
 
@@ -165,7 +165,7 @@ class LightPath(Component):
         """The instrument with fields of one part replaced.
 
         `place` is a name with dots: an element, an arm's element ("half1.plate"), a layer of it
-        ("half1.plate.mgf2"), a source, or "" for the light path itself. A function is applied to what was there.
+        ("half1.plate.mgf2"), a source, or "" for the light path itself. A function is applied to the old value.
         Raises `NoSuchPlaceError` where the instrument has no such part.
         """
         return _changed(self, place.split(".") if place else [], fields, place)
@@ -173,7 +173,7 @@ class LightPath(Component):
     def inserted(self, element: Element, *, before: str = "", after: str = "") -> Self:
         """The instrument with one more element directly before or after another one ("half1.plate" in an arm).
 
-        A name that is taken gets a number. Raises `NoSuchPlaceError` where there is no such element.
+        A duplicate name gets a number. Raises `NoSuchPlaceError` where there is no such element.
         """
         where, _, neighbour = (before or after).rpartition(".")
         if where:

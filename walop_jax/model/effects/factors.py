@@ -1,8 +1,8 @@
 """Factors of changes: field, wavelength, time, temperature, counts, or the angle of an element.
 
-A factor has a `text` as typed, a `value`, `words`, the observation that would `test` it (empty: none of its own) and the
-quantity that it `depends_on`: FIELD, WAVELENGTH, EXPOSURE, COUNTS, or SHAPE (of the change itself). `factor` is the only
-reader of their texts.
+A factor has a `text` as typed, a `value`, `words`, the observation that would `test` it (empty: none of its own) and
+the quantity that it `depends_on`: FIELD, WAVELENGTH, EXPOSURE, COUNTS, or SHAPE (of the change itself). `factor` alone
+reads the texts.
 
 The argument of a value has x, y (deg), wavelength (µm), hours since the first exposure, hour_angle
 (h), temperature (Celsius), exposure time (s), the number of the exposure in its list, `of_kind(name)`, true for
