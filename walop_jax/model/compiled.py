@@ -73,8 +73,7 @@ def program(
     args: tuple[Any, ...],
     options: dict[str, Any] | None,
 ) -> Callable[..., Any] | None:
-    """Program of `function` for arguments like these, from the folder or new to it; None where it cannot be kept.
-    """
+    """Program of `function` for arguments like these, from the folder or new to it; None where it cannot be kept."""
     leaves, tree = jax.tree.flatten(args)
     try:
         key = _key(name, tree.unflatten(range(tree.num_leaves)), [kind(leaf) for leaf in leaves])

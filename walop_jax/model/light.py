@@ -332,9 +332,7 @@ def counts(
     exposures, x, y = sight.exposures, sight.x, sight.y
     vectors = camera_vectors(instrument, rows, throughput, x, y)
     light = stokes(instrument, sight)
-    if (
-        len(vectors) <= FEW_BANDS
-    ):  # a matrix product: indexing would copy the vectors for every exposure
+    if len(vectors) <= FEW_BANDS:  # a matrix product: indexing would copy the vectors for every exposure
         in_band = jax.nn.one_hot(band, len(vectors), dtype=light.dtype)
         result = jnp.einsum("bks,eb,es->ek", vectors, in_band, light)
     else:

@@ -52,7 +52,7 @@ def _matrix(*rows: tuple[Scalar, ...]) -> Float[Array, "... 4 4"]:
 
 
 def product(matrices: Iterable[Float[Array, "... 4 4"] | None]) -> Float[Array, "... 4 4"] | None:
-    """Product of Mueller matrices in the order light meets them; None: the identity."""
+    """Product of Mueller matrices in the order of the light path; None: the identity."""
     result = None
     for matrix in matrices:
         if matrix is not None:

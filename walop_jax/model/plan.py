@@ -29,8 +29,8 @@ class Plan(eqx.Module):
     sorted by positions of the moving elements; `moving` holds the prefixes of their columns and `settings`
     (positions, first band, one past the last), a position being an angle in degrees, `Turning`, or None when out.
     `band_of[e, s + 1]` is the band of exposure e for light of source s (s = −1: no source). Bands in which `slope` is
-    1 are weighted with the distance from their mean wavelength (µm); None: there are none. `work` counts the places
-    × exposures that are computed with it: programs for few of them are compiled without optimisation (`compiled`).
+    1 are weighted with the distance from their mean wavelength (µm); None: there are none. `work` counts places × exposures
+    of a computation: programs for few of them are compiled without optimisation (`compiled`).
     """
 
     wavelength: Float[Array, " n"]
@@ -46,7 +46,7 @@ class Plan(eqx.Module):
 
 
 def blank_exposures(instrument: LightPath, count: int) -> ExposureArrays:
-    """Exposures of which nothing is said but that they are there."""
+    """Exposures without any information but their number."""
     zero, off = array(np.zeros(count)), array(np.zeros(count, bool))
     return ExposureArrays(
         kind=array(np.zeros(count, int)), clp_in=off, clp_angle=zero, flux_known=off, rotator=zero, hours=zero,
@@ -89,7 +89,7 @@ def with_numbers(
 
 
 def with_median(plan: Plan, median: Float[np.ndarray, "e k"]) -> Plan:
-    """The plan with the median counts of every exposure and camera, which some detectors need."""
+    """The plan with the median counts of every exposure and camera, for some detectors."""
     return eqx.tree_at(
         lambda p: p.exposures.median_counts, plan, array(median), is_leaf=lambda leaf: leaf is None
     )

@@ -1,4 +1,4 @@
-"""Making a plan: nodes and bands of exposures or settings, as detailed as the instrument and its effects need them."""
+"""Making a plan: nodes and bands of exposures or settings, in the detail required by the instrument and its effects."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, moments, r
 from walop_jax.model.ray import CONDITIONS, Conditions
 from walop_jax.model.sources import ExposureArrays
 
-SAMPLES = 9  # wavelengths of a band between which a retardance goes one way
-ROOM = 1.03  # by which a thickness may grow in a fit, and a path when the ray is oblique, before nodes are too few
+SAMPLES = 9  # wavelengths of a band with a monotonic retardance between them
+ROOM = 1.03  # growth of a thickness in a fit, and of an oblique path, that the nodes allow
 
 
 def hours_of(exposures: Exposures) -> Float[np.ndarray, " e"]:
@@ -70,10 +70,10 @@ def plan_for(
     filters: Mapping[str, FilterCurve],
     sources: Sources | None = None,
 ) -> Plan:
-    """Lay out the nodes and bands of `exposures`, as detailed as the instrument and its effects need it.
+    """Lay out the nodes and bands of `exposures`, in the detail required by the instrument.
 
-    Standards that have a colour have the slopes of the bands as well. Raises KeyError for a filter that `filters` does
-    not hold and ValueError for a KIND without a source.
+    Standards with a colour have the slopes of the bands as well. Raises KeyError for a filter missing from `filters`
+    and ValueError for a KIND without a source.
     """
     exposure_settings = Settings.of(exposures, instrument.patched().moving())
     indices, stars = np.arange(len(exposures)), 0 if sources is None else len(sources)
@@ -92,7 +92,7 @@ def plan_for(
         table = np.empty((len(indices), 1 + stars), int)
         table[~of_stars] = band[~starlight, None]
         table[of_stars, 1:] = band[starlight].reshape(of_stars.sum(), stars)
-        table[of_stars, 0] = table[of_stars, -1]  # nothing is used of a standard without its star
+        table[of_stars, 0] = table[of_stars, -1]  # a standard without its star is not used
         return table
 
     unit_flux = [source.kind for source in instrument.sources if source.facts.flux_known]
@@ -118,7 +118,7 @@ def plan_for(
 
 
 def _typical(sources: Sources | None) -> float:
-    """Colour temperature that stands for those of all stars where a slope of second order is meant."""
+    """Colour temperature of a typical star, for slopes of second order."""
     temperatures = np.zeros(0) if sources is None else sources.teff[np.isfinite(sources.teff)]
     return float(np.median(temperatures)) if temperatures.size else np.nan
 
@@ -137,10 +137,10 @@ def colours(
 def _sharing(
     exposures: ExposureArrays, settings: Settings, steady: Bool[np.ndarray, " e"], *, split: bool
 ) -> ExposureArrays:
-    """Exposures that have a flux in common: steady light in each filter, and, `split`, light of known flux.
+    """Exposures with a common flux: steady light in each filter, and, `split`, light of known flux.
 
-    Such light is divided between the arms in unknown shares, the same ones in all exposures of a filter with everything
-    in the same place.
+    The shares of such light in the arms are unknown, and equal in all exposures of a filter with the same positions of
+    all elements.
     """
     flux_known = np.asarray(exposures.flux_known)
     group = np.arange(len(flux_known))
@@ -161,8 +161,8 @@ def _sharing(
 def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mapping[str, FilterCurve]) -> Plan:
     """Lay out the nodes and bands of `settings`, without any light: for analysis vectors.
 
-    The band of a row is `band_of[row, 0]`. Raises KeyError for a filter that `filters` does not hold and ValueError
-    for a moving element that the instrument does not have.
+    The band of a row is `band_of[row, 0]`. Raises KeyError for a filter missing from `filters` and ValueError for an
+    unknown moving element.
     """
     settings.check_moving(instrument.patched().moving())
     blank = blank_exposures(instrument, len(settings))
@@ -172,7 +172,7 @@ def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mappi
 
 @functools.lru_cache(maxsize=256)
 def _rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], *fringes: float) -> Rule:
-    """Nodes of a band and their weights; plans of one set are made for many models, most of which ask for the same."""
+    """Nodes of a band and their weights; cached, since the models of one set mostly share them."""
     path_difference, waves, faint = fringes
     return band_rule(
         np.array(wavelength), np.array(throughput), path_difference=path_difference, waves=waves, faint=faint
@@ -180,7 +180,7 @@ def _rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], *fringes
 
 
 def outgrown(planned: Instrument, instrument: Instrument, curves: Iterable[FilterCurve]) -> bool:
-    """True where retarders have become thicker than the nodes of a plan for `planned` follow in any of the bands."""
+    """True where retarders are too thick for the nodes of a plan for `planned` in any of the bands."""
     old, new = planned.patched(), instrument.patched()
     return any(
         waves > followed
@@ -190,9 +190,9 @@ def outgrown(planned: Instrument, instrument: Instrument, curves: Iterable[Filte
 
 
 def extrapolations(instrument: Instrument, curves: Iterable[FilterCurve]) -> tuple[str, ...]:
-    """Sentences on materials (patched instrument) that bands use beyond the wavelengths at which they were measured.
+    """Sentences on materials (patched instrument) in bands beyond their measured wavelengths.
 
-    Raises `DataError` where that is too far for the formulae.
+    Raises `DataError` beyond the validity of the formulae.
     """
     behind = (element for arm in instrument.arms for element in arm.train())
     names = dict.fromkeys(name for element in (*instrument.train(), *behind) for name in element.materials)
@@ -217,7 +217,7 @@ def extrapolations(instrument: Instrument, curves: Iterable[FilterCurve]) -> tup
 def _fringes(instrument: Instrument, curve: FilterCurve, room: float = ROOM) -> tuple[float, float]:
     """Waves of the fringes of an instrument (patched) in a band: at full strength, and of all layers of a plate.
 
-    Behind one another retarders interfere at the sum of their retardances. Nodes are made for `room` times as many.
+    Retarders in series interfere at the sum of their retardances. Nodes are made for `room` times as many.
     """
     wavelengths = curve.wavelength[curve.throughput > 0]
     at = np.linspace(wavelengths.min(), wavelengths.max(), SAMPLES) if wavelengths.size else curve.wavelength
@@ -248,9 +248,9 @@ def _plan(
     values = {"temperature": settings.temperature, "hour_angle": settings.hour_angle, "hours": hours}
     assert set(values) == set(CONDITIONS)
     # A band is (positions, filter, conditions, colour temperature, slope, KIND); sorting puts equal positions together.
-    # NaN (out, flat spectrum) becomes a sortable stand-in. KINDs of one colour are apart, so that a set in which one of
-    # them has another has a plan of the same shape, and the same programs.
-    # The angle of each element, and after all of them by how much each turns.
+    # NaN (out, flat spectrum) becomes a sortable stand-in. KINDs of one colour are separate, so that a set with another
+    # colour for one of them has a plan of the same shape, and the same programs.
+    # The angles of all elements, then their turns during the exposure.
     still = np.zeros(len(settings))
     places = [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving]
     turns = [settings.turns.get(prefix, still) for prefix in moving]

@@ -75,7 +75,7 @@ def _air(sx: Real, sy: Real) -> _Waves:
 
 
 def _anisotropy(plate: Plate) -> Real:
-    """n_e² − n_o², to the last digit: of squares that are subtracted 10⁻¹⁴ would be lost, 10⁻¹² rad of a thick plate.
+    """n_e² − n_o², to the last digit: a difference of squares would lose 10⁻¹⁴, 10⁻¹² rad of a thick plate.
 
     The phase follows without a cancellation from k_ze² − k_zo² = (n_e² − n_o²)(1 − (s·c)²/n_o²).
     """

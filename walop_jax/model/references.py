@@ -1,4 +1,4 @@
-"""Sources of the physics of a model, also as BibTeX: those that elements, sources, materials and effects name."""
+"""Sources of the physics of a model, also as BibTeX: those of elements, sources, materials and effects."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _OWN = "physics of this package; no outside source"
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """A piece of physics and the works that it rests on."""
+    """A piece of physics and its published works."""
 
     what: str
     source: str
 
 
 class References(tuple[Reference, ...]):
-    """Several of them, which print as a line each."""
+    """Several references, printed as a line each."""
 
     __slots__ = ()
 
@@ -52,9 +52,9 @@ def _optics(instrument: Instrument) -> Iterator[Reference]:
 
 
 def references(model: Model, filters: Iterable[str] = ()) -> tuple[Reference, ...]:
-    """The sources of the physics in a model, each once: the base in the order light meets it, then its effects.
+    """The sources of the physics in a model, each once: the base in the order of the light path, then its effects.
 
-    `filters` are the names of those that are used: built-in curves have a source.
+    `filters` are the names of the used ones: built-in curves have a source.
     """
     instrument = model.template
     entries = (
@@ -94,7 +94,7 @@ def _library() -> dict[str, str]:
 def bibtex(found: Sequence[Reference], version: str, *, sampled: bool = False) -> str:
     """BibTeX entries of this software, of all published works among the sources, and of the packages beneath.
 
-    `sampled`: those of the posterior as well. A work that `references.bib` lacks is an entry with what its source says.
+    `sampled`: those of the posterior as well. A work missing from `references.bib` becomes an entry from its source.
     """
     library = _library()
     entries = {"walop_jax": library["walop_jax"].replace("VERSION", version)}
@@ -118,7 +118,7 @@ def bibtex(found: Sequence[Reference], version: str, *, sampled: bool = False) -
 
 
 def _key(work: str) -> str:
-    """Family name of the first author and the year, that of the library where the work states none."""
+    """Family name of the first author and the year, that of the library for a work without one."""
     match = _YEAR.match(work)
     first = re.split(r",| et al\.| & | and ", match["who"] if match else work)[0]
     plain = unicodedata.normalize("NFKD", first).encode("ascii", "ignore").decode()

@@ -1,17 +1,17 @@
-"""Slots: places of the light path at which it may be otherwise, and what a little of it there does to the light.
+"""Slots: places of possible changes of the light path, and the derivatives of the light in these changes.
 
-A slot is a change without factors (`effects.change`), or a part of one; what a change is in slots, its kind says
-(`Kind.slots`). What multiplies a change, over the field or from exposure to exposure, multiplies its slot. Elements,
-fold, band integral and patches are those that light takes, differentiated where nothing is changed.
+A slot is a change without factors (`effects.change`), or a term of one; the kind of a change holds its slots
+(`Kind.slots`). The factors of a change, over the field or from exposure to exposure, multiply its slots. Elements,
+fold, band integral and patches are those of the forward model, differentiated at the unchanged instrument.
 
     inserted    generators (`optics.GENERATORS`) at every place between two elements, by themselves and × (λ/λ₀ − 1)
     number      axis and thermal change of every wave plate; thickness, axis and cut of each of its layers
-    whole       displacement of what the optics behind a mapping to the pupil see; shift of the bands
+    whole       displacement of the field for the optics behind a mapping to the pupil; shift of the bands
     throughput  of a camera, relative to itself; mixed: light of one camera in another
-    fringes     of air ahead of a wave plate, which take more wavelength nodes than all others
+    fringes     of air ahead of a wave plate, which need more wavelength nodes than all others
     light       of sources, ahead of the polariser and of it: Stokes vectors behind it
 
-Method      The rows that the analysers see are linear in the matrix M of every element: δrows = (rows behind it) δM
+Method      The rows of the analysers are linear in the matrix M of every element: δrows = (rows behind it) δM
             (matrix ahead of it), and δM of all elements in the same numbers come from one derivative.
 Symbols     s slots, g generators, t changes of numbers, b bands, k cameras, r rows, c states, n nodes
 Limits      first order.
@@ -63,7 +63,7 @@ def trains(instrument: Instrument) -> dict[str, tuple[Element, ...]]:
 
 
 def acts(element: Element) -> bool:
-    """True if an element does anything to polarisation."""
+    """True if an element has a Mueller matrix."""
     return _acts(*shapes_of(element))
 
 
@@ -80,7 +80,7 @@ def _acts(structure: Any, shapes: Any) -> bool:
 
 
 def _places(instrument: Instrument) -> list[list[int]]:
-    """Number of the place behind so many elements of each train: the same where nothing acts in between."""
+    """Numbers of the places ahead of, between and behind the elements of each train; equal without an action between."""
     number, places = -1, []
     for train, elements in enumerate(trains(instrument).values()):
         number += train == 0 or len(instrument.arms) > 1
@@ -111,7 +111,7 @@ def _whole(instrument: Instrument) -> list[Slot]:
 
 
 def fringe_places(instrument: Instrument) -> tuple[str, ...]:
-    """Places of the plates of an instrument (`patched`) ahead of which there may be air."""
+    """Places of the plates of an instrument (`patched`) with a possible air gap ahead of them."""
     return tuple(numbers[0][-1] for numbers in _numbers(instrument))
 
 
@@ -153,7 +153,7 @@ class VectorSlopes(NamedTuple):
 
 
 class _Banded(NamedTuple):
-    """Band sums of the rows that the analysers see, and slopes: of generators at places, of plates, all together."""
+    """Band sums of the rows of the analysers, and slopes: of generators at places, of plates, all together."""
 
     rows: Float[Array, "b r 4"]
     inserted: Float[Array, "m g h b r 4"]
@@ -201,7 +201,7 @@ def fringe_slopes(
     instrument = instrument.patched()
 
     def moved(sizes: Float[Array, " t"]) -> Instrument:
-        """Air without thickness: no fringes, and all else of it."""
+        """Air without thickness: no fringes, but all its other effects."""
         changed = instrument
         for place in fringe_places(instrument):
             changed = with_air_gap(changed, place, sizes[0], jnp.zeros(()))
@@ -257,7 +257,7 @@ def _summed(
     gaps: Float[Array, " g"],
     stretch: Scalar,
 ) -> _Banded:
-    """The same at wavelengths times a factor, without what differs between beams."""
+    """The same at wavelengths times a factor, without the differences between beams."""
     states, conditions = [state for state, _, _ in plan.settings], plan.conditions
     if "temperature" not in conditions.planned:  # the thermal change of one kelvin
         warm = jnp.full_like(plan.wavelength, REFERENCE_TEMPERATURE + 1.0)
@@ -357,8 +357,8 @@ def _generators() -> Float[Array, "g 4 4"]:
 class LightSlopes(NamedTuple):
     """Stokes vectors behind the place of the polariser, per exposure, and their slopes in `light_slots`.
 
-    Counts are the product of the analysis vectors with `taken`, what a camera takes of the light with everything that
-    the cameras do in single exposures; `factor` is that for a change of the light.
+    Counts are the product of the analysis vectors with `taken`, the light in a camera with all responses of the cameras
+    in single exposures; `factor` is the response to a change of the light.
     """
 
     stokes: Float[Array, "e 4"]

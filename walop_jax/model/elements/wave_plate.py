@@ -89,9 +89,7 @@ class AirGap(Component):
 
     contrast: Scalar = number(unit="", about="diattenuation at a maximum")
     gap: Scalar = number(unit="um", about="thickness of the air")
-    longest: float = eqx.field(
-        static=True, default=0.0
-    )  # µm: largest gap for the wavelength nodes
+    longest: float = eqx.field(static=True, default=0.0)  # µm: largest gap for the wavelength nodes
 
 
 class WavePlate(Element):
