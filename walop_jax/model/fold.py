@@ -218,7 +218,7 @@ def stacked(
     keys: Sequence[State],
     out: Mueller | None = None,
 ) -> Mueller | None:
-    """Matrices of a station in every state, `out` (the identity) where it is out; None where it is always the identity."""
+    """Matrices of a station in every state, `out` (the identity) where it is out; None: always the identity."""
     if element.moves is None:
         return matrices[number, None]
     angles = positions(element, moving, keys)

@@ -49,8 +49,8 @@ class Instrument(LightPath):
     """A light path with its place and its field.
 
     Field coordinates reach to ±`field_limit` (deg); `site` is telescope, latitude and longitude (deg, east positive),
-    elevation (m) and MJD of a full Moon, `raster` the arrangement of the points of a simulated run and its half
-    width (deg). `description` is the text of its description, empty for a shipped instrument, `source` the origin of its
+    elevation (m) and MJD of a full Moon, `raster` the arrangement of the points of a simulated run and its half width
+    (deg). `description` is the text of its description, empty for a shipped instrument, `source` the origin of its
     numbers; colours and fringes are relative to `wavelength` (µm).
 
     >>> walop.Instrument.read("WALOP-NORTH").cameras.names

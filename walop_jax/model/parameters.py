@@ -2,8 +2,8 @@
 
 `Parameter` is the only record of a number. A component declares its numbers in two ways. `param` declares a permanent
 parameter of every instance. `number` declares a number that an instrument may keep fixed; its description lists the
-parameters among them, with prior and source (`Element.declared`). There is no second list of names: they follow from the
-tree. The value in the tree has the unit of the declaration (e.g. um or deg), conversions are part of the equations.
+parameters among them, with prior and source (`Element.declared`). There is no second list of names: they follow from
+the tree. The value in the tree has the unit of the declaration (e.g. um or deg), conversions are part of the equations.
 """
 
 from __future__ import annotations
@@ -41,11 +41,12 @@ class Parameter:
     """One number of an instrument: name, prior knowledge, freedom.
 
     `prior` is (mean, standard deviation) or None, `scale` the natural step of a solver, `loose` the width of a very
-    weak pull toward `start`, which bounds poorly determined combinations and is no prior knowledge; `tie` is the name of
-    the parameter that sets its value. `part` is the place of its component, as for `Instrument.changed`: "half1.plate", "throughput", "sky", or the name of an effect.
+    weak pull toward `start`, which bounds poorly determined combinations and is no prior knowledge; `tie` is the name
+    of the parameter that sets its value. `part` is the place of its component, as for `Instrument.changed`:
+    "half1.plate", "throughput", "sky", or the name of an effect.
 
-    Before a number has a value (`declared`), the mean of its prior is relative to that value, the step may be 0 (then it
-    follows from the prior or the value), and a name replaces that of the tree.
+    Before a number has a value (`declared`), the mean of its prior is relative to that value, the step may be 0 (then
+    it follows from the prior or the value), and a name replaces that of the tree.
     """
 
     name: str
@@ -129,7 +130,7 @@ def number(*, unit: str, about: str, default: float | None = 0.0, several: bool 
 
 
 def as_number(value: Any) -> Any:
-    """A value as a float64 array; None stays. The explicit type avoids weak types, which would be compiled anew beside arrays."""
+    """A value as a float64 array; None stays. Explicit, as weak types would be compiled anew beside arrays."""
     with float64():
         return None if value is None else jnp.asarray(value, float)
 

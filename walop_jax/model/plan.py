@@ -25,12 +25,12 @@ from walop_jax.model.sources import ExposureArrays
 class Plan(eqx.Module):
     """Static layout of a computation.
 
-    Nodes: `wavelength` (µm) and the `conditions` at which the optics are solved. Bands: rows of `node_weight`,
-    sorted by positions of the moving elements; `moving` holds the prefixes of their columns and `settings`
-    (positions, first band, one past the last), a position being an angle in degrees, `Turning`, or None when out.
-    `band_of[e, s + 1]` is the band of exposure e for light of source s (s = −1: no source). Bands in which `slope` is
-    1 are weighted with the distance from their mean wavelength (µm); None: there are none. `work` counts places × exposures
-    of a computation: programs for few of them are compiled without optimisation (`compiled`).
+    Nodes: `wavelength` (µm) and the `conditions` at which the optics are solved. Bands: rows of `node_weight`, sorted
+    by positions of the moving elements; `moving` holds the prefixes of their columns and `settings` (positions, first
+    band, one past the last), a position being an angle in degrees, `Turning`, or None when out. `band_of[e, s + 1]` is
+    the band of exposure e for light of source s (s = −1: no source). Bands in which `slope` is 1 are weighted with the
+    distance from their mean wavelength (µm); None: there are none. `work` counts places × exposures of a computation:
+    programs for few of them are compiled without optimisation (`compiled`).
     """
 
     wavelength: Float[Array, " n"]

@@ -80,7 +80,7 @@ def _acts(structure: Any, shapes: Any) -> bool:
 
 
 def _places(instrument: Instrument) -> list[list[int]]:
-    """Numbers of the places ahead of, between and behind the elements of each train; equal without an action between."""
+    """Numbers of the places between the elements of each train, equal on both sides of an inactive element."""
     number, places = -1, []
     for train, elements in enumerate(trains(instrument).values()):
         number += train == 0 or len(instrument.arms) > 1

@@ -42,10 +42,11 @@ class ExposureArrays(eqx.Module):
     """Exposures in the arrays of the light path, one element each; `median` only where needed.
 
     `kind` counts the kinds of `kinds`. Angles in radians; `clp_angle` is 0 when the polariser is out, `rotator` where
-    it has no meaning; `shared` is 1 for an exposure of a group with common fluxes, None: no such groups. `moving` holds angles of elements that move behind the polariser (NaN: out). `hours` since the first
-    exposure, temperature in Celsius, hour angle in h, exposure time in s. Where standards have a colour, `colour` holds
-    mean wavelength and rms width (µm) of the photons of each of them behind the filter, `slope_band` the band that is
-    weighted with the distance from its mean wavelength (`Plan.slope`).
+    it has no meaning; `shared` is 1 for an exposure of a group with common fluxes, None: no such groups. `moving` holds
+    angles of elements that move behind the polariser (NaN: out). `hours` since the first exposure, temperature in
+    Celsius, hour angle in h, exposure time in s. Where standards have a colour, `colour` holds mean wavelength and rms
+    width (µm) of the photons of each of them behind the filter, `slope_band` the band that is weighted with the
+    distance from its mean wavelength (`Plan.slope`).
     """
 
     kind: Int[Array, " e"]

@@ -34,8 +34,8 @@ THROUGHPUT = "throughput"
 class Model(Displayed):
     """An instrument with its parameters. Immutable: every change returns a new model.
 
-    `catalogue` are the effects available by name, `laws` the changes of parameters from night to night: the [law] tables
-    of a model file (`model.laws`), unused in a fit of one set.
+    `catalogue` are the effects available by name, `laws` the changes of parameters from night to night: the [law]
+    tables of a model file (`model.laws`), unused in a fit of one set.
 
     >>> model = walop.base_model(calset)
     >>> model.names[:2]

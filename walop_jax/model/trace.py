@@ -45,8 +45,8 @@ class Sightline:
     """A source and its path through the instrument; angles and field coordinates in degrees.
 
     `q`, `u` are those of the source in the instrument frame (taken as catalogue values at ROTATOR 0); `clp_angle` is
-    NaN where the polariser is out; `setting` is a single row: the colour of the source, and the positions of the optics.
-    Raises ValueError for a degree of polarisation above 1, and for several settings.
+    NaN where the polariser is out; `setting` is a single row: the colour of the source, and the positions of the
+    optics. Raises ValueError for a degree of polarisation above 1, and for several settings.
     """
 
     x: float = 0.0

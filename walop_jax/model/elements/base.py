@@ -41,7 +41,7 @@ class Element(Component):
         return ray
 
     def mueller(self, ray: Ray) -> Mueller | None:
-        """Mueller matrix for an entering ray, with a leading axis where it depends on wavelength; None: the identity."""
+        """Mueller matrix for an entering ray, with a leading axis if it depends on wavelength; None: the identity."""
         return None
 
     @classmethod
