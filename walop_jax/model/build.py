@@ -92,7 +92,7 @@ def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:
         beams.append(tuple(map(names.index, analyser.cameras)))
     cameras = [camera for beam in beams for camera in beam]
     if sorted(cameras) != list(range(len(names))):
-        raise fault("cameras", f"every camera must stand behind one analyser: {', '.join(names)}")
+        raise fault("cameras", f"every camera must be behind exactly one analyser: {', '.join(names)}")
     return Cameras(names=names, arms=tuple(beams), split=description.split, floor=description.floor)
 
 
@@ -132,7 +132,7 @@ class _Maker:
         for name, content in table.items():
             location = f"{place}.{self.read.name(name, place)}"
             if name not in path:
-                raise self.read.fault(location, "is described but does not stand in the path")
+                raise self.read.fault(location, "is described but missing from the path")
             yield self.element(name, self.read.table(content, location), location)
 
     def element(self, name: str, table: Table, place: str) -> Element:
@@ -141,7 +141,7 @@ class _Maker:
         kind = self.kinds.get(self.read.text(table["kind"], "kind", place))
         if kind is None:
             what = f"there is no kind of element {table['kind']!r}; {nearest(table['kind'], self.kinds)} "
-            what += f"Kinds are {', '.join(self.kinds)}; walop-jax docs element says what each is. "
+            what += f"Kinds are {', '.join(self.kinds)}; walop-jax docs element describes each. "
             what += f"{self.origin(table['kind'])}, in Python elements=[CLASS] or a FILE.py"
             raise self.read.fault(place, what)
         moves, layers = table.get("moves"), table.get("layers", [])
@@ -286,7 +286,7 @@ class _Maker:
         largest = float(np.max(np.abs(value)))
         if unit == "rad" and largest > LARGEST_ANGLE:
             what = f"{key} = {largest:g} rad is {largest / (2.0 * np.pi):.1f} waves; in degrees? write "
-            what += f'{np.deg2rad(largest):g}, or say unit = "rad"'
+            what += f'{np.deg2rad(largest):g}, or set unit = "rad"'
             raise self.read.fault(place, what)
 
     def check_wavelengths(self, value: float | tuple[float, ...], key: str, place: str) -> None:

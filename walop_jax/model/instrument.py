@@ -219,7 +219,7 @@ def _check(instrument: Instrument, read: Reader) -> None:
     for arm in instrument.arms:
         for element in arm.train():
             if isinstance(element, Analyser | Polariser):
-                where = "ends its arm" if isinstance(element, Analyser) else "stands ahead of the arms"
+                where = "ends its arm" if isinstance(element, Analyser) else "must be ahead of the arms"
                 raise read.fault(f"arms.{arm.name}.elements.{element.name}", f"a {element.kind} {where}")
     components = itertools.chain(instrument.sources, instrument.elements, instrument.arms)
     for name, count in Counter([*(component.name for component in components), *TAKEN]).items():

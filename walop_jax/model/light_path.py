@@ -96,7 +96,7 @@ class LightPath(Component):
         for element in elements:
             if element.moves or type(element).ray is not Element.ray or not _is_achromatic(element):
                 raise ValueError(
-                    f"element {element.name!r} stands ahead of the polariser, where nothing may move, bend the ray "
+                    f"element {element.name!r} is ahead of the polariser, where nothing may move, bend the ray "
                     "or depend on wavelength or exposure; put it behind the polariser"
                 )
         return elements

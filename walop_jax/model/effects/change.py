@@ -188,18 +188,18 @@ class Change:
     @property
     def number(self) -> int:
         """Number of its exposure. Raises ValueError for a change without a single one."""
-        return int(self._only("exposure", "of which exposure", "exposure 7"))
+        return int(self._only("exposure", "the exposure", "exposure 7"))
 
     @property
     def gap(self) -> float:
         """Thickness (µm) of the air of its fringes. Raises ValueError for a change without one."""
-        return float(self._only("gap", "of which gap (µm)", "gap 10"))
+        return float(self._only("gap", "the gap (µm)", "gap 10"))
 
     def _only(self, form: str, what: str, example: str) -> str:
         """Value given in the only factor of a form."""
         matches = [item.given[0] for item in self.grows_with if item.form == form]
         if len(matches) != 1:
-            raise ValueError(f"{self.text!r}: say {what}, as in '{self.kind} of {self.place} * {example}'")
+            raise ValueError(f"{self.text!r}: state {what}, as in '{self.kind} of {self.place} * {example}'")
         return matches[0]
 
     def factor(self, at: Any) -> Any:
