@@ -49,12 +49,7 @@ class Etalon(Effect):
         unit="", about="diattenuation at a maximum", source=SOURCE, width=0.003, default=0.0
     )
     gap: Scalar = param(
-        unit="um",
-        about="thickness of the air gap",
-        source=SOURCE,
-        scale=0.05,
-        loose=5.0,
-        default=10.0,
+        unit="um", about="thickness of the air gap", source=SOURCE, scale=0.05, loose=5.0, default=10.0
     )
 
     name: ClassVar[str] = "etalon"
