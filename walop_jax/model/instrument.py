@@ -179,8 +179,7 @@ def adapted(
     coefficients = np.zeros((len(instrument.cameras), len(legendre.terms(degree))))
     coefficients[:, 0] = level
     return dataclasses.replace(
-        instrument,
-        throughput=dataclasses.replace(series, degree=degree, coefficients=array(coefficients)),
+        instrument, throughput=dataclasses.replace(series, degree=degree, coefficients=array(coefficients))
     )
 
 

@@ -96,10 +96,7 @@ CRYSTALS = {
     ),
     "mgf2": Crystal(MGF2_O, MGF2_E, MGF2_THERMAL, (0.2, 7.0), f"Dodge 1984, Appl. Opt. 23, 1980; {_ETZEL}"),
 }
-OTHER_CURVES = {
-    "quartz": {"quartz_1951": "Radhakrishnan 1951"},
-    "mgf2": {"mgf2_1980": "Li 1980"},
-}
+OTHER_CURVES = {"quartz": {"quartz_1951": "Radhakrishnan 1951"}, "mgf2": {"mgf2_1980": "Li 1980"}}
 """Crystals under the same everyday name with another published dispersion: possible meanings of a description."""
 CRYSTALS |= {
     "quartz_1951": Crystal(

@@ -157,9 +157,7 @@ def _face_both_ways(before: _BothWays, after: _BothWays) -> Matrix2:
 
 
 def _stack(
-    media: list[_Waves] | list[_BothWays],
-    phases: list[Real],
-    face: Callable[[Any, Any], Matrix2],
+    media: list[_Waves] | list[_BothWays], phases: list[Real], face: Callable[[Any, Any], Matrix2]
 ) -> Matrix2:
     jones = face(media[0], media[1])
     for before, after, phase in zip(media[1:-1], media[2:], phases, strict=True):
