@@ -1,5 +1,4 @@
-"""Pages about single effects and elements, from their docstrings and declarations and from the numbers in the folder of
-the pages."""
+"""Pages about single effects and elements, from their docstrings, declarations and stored numbers."""
 
 from __future__ import annotations
 

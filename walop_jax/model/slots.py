@@ -122,9 +122,7 @@ def vector_slots(instrument: Instrument) -> dict[Slot, int]:
     for (train, elements), numbers in zip(trains(instrument).items(), places, strict=True):
         for element, (ahead, behind) in zip(elements, itertools.pairwise(numbers), strict=True):
             where = {"ahead of": ahead, "behind": behind, "of": behind}
-            names |= {
-                (preposition, f"{train}{element.name}"): number for preposition, number in where.items()
-            }
+            names |= {(side, f"{train}{element.name}"): number for side, number in where.items()}
     for arm, numbers in zip(instrument.arms, places[1:], strict=True):
         names["ahead of", f"{arm.name}.{arm.analyser.name}"] = numbers[-1]
     positions: dict[Slot, int] = {}
