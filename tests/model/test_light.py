@@ -211,7 +211,7 @@ def test_what_cannot_stand_ahead_of_the_polariser_is_refused(element):
     path = ["polariser", "collimator", "pupil", "chwp", "late"]
     path.insert(0, path.pop(path.index(element)))
     text = f'name = "X"\nlike = "WALOP-SOUTH"\npath = {path}\n[elements.late]\nkind = "retarder"\nwavelength = 0.6\n'
-    with pytest.raises(DataError, match=f"element '{element}' stands ahead of the polariser.*put it behind"):
+    with pytest.raises(DataError, match=f"element '{element}' is ahead of the polariser.*put it behind"):
         build(parsed(text, "a test"))
 
 

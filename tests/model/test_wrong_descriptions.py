@@ -61,7 +61,7 @@ WRONG = {
     ),
     "degrees for radians": (
         ('value = 0.1, sigma = 0.02, unit = "rad",', "value = 180.0,"),
-        r"\[elements\.window\] delta = 180 rad is 28\.6 waves; in degrees\? write 3\.14159, or say unit",
+        r"\[elements\.window\] delta = 180 rad is 28\.6 waves; in degrees\? write 3\.14159, or set unit",
     ),
     "a unit that can be converted": (
         ('value = 0.1, sigma = 0.02, unit = "rad",', 'value = 180.0, sigma = 9, unit = "deg",'),
@@ -127,7 +127,7 @@ WRONG = {
     ),
     "one camera of two": (
         ('cameras = ["right", "left"]\n', 'cameras = ["right"]\n'),
-        r"\[cameras\] every camera must stand behind one analyser",
+        r"\[cameras\] every camera must be behind exactly one analyser",
     ),
     "no cameras": (('cameras = ["right", "left"]\n', ""), r"\[arms\.main\] .* two cameras"),
     "cameras as text": (
@@ -172,7 +172,7 @@ WRONG = {
             '["plate", "analyser"]',
             '["pol", "plate", "analyser"]\n[arms.main.elements.pol]\nkind = "polariser"\n',
         ),
-        r"\[arms\.main\.elements\.pol\] a polariser stands ahead of the arms",
+        r"\[arms\.main\.elements\.pol\] a polariser must be ahead of the arms",
     ),
     "names of two parameters": (
         ('name = "eta"', 'name = "window.delta"'),

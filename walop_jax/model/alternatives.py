@@ -1,8 +1,8 @@
 """Other descriptions of an instrument: elements in another order or turned, left out, of another published dispersion.
 
-A change is a sentence and a function of the instrument. The sentences name places as `Instrument.changed` does. What is
-listed are mistakes that are made when an instrument is described, or built: nothing has a size, everything is so or
-otherwise. Changes that make no difference to the light (plates that commute) are listed too: data tell.
+A change is a sentence and a function of the instrument. The sentences name places as `Instrument.changed` does. The
+list holds mistakes in the description, or in the assembly, of an instrument: none of them has a size. Changes without
+effect on the light (of plates that commute) are listed too: the data decide.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ JOINED = "; "
 
 
 def alternatives(instrument: Instrument) -> dict[str, Rearrangement]:
-    """All changes of a description that an instrument has places for, by what they say."""
+    """All changes of a description that an instrument has places for, by their sentences."""
     return dict(
         itertools.chain(
             _layers(instrument),
@@ -45,19 +45,19 @@ def alternatives(instrument: Instrument) -> dict[str, Rearrangement]:
 
 
 def other_curves(instrument: Instrument) -> tuple[str, ...]:
-    """Those of the changes that are another dispersion."""
+    """Sentences of the changes to another dispersion."""
     return tuple(sentence for sentence, _ in _dispersion(instrument))
 
 
 def changed(instrument: Instrument, sentence: str) -> Instrument:
-    """The instrument with the changes that a sentence names, one after the other; as it is for an empty one.
+    """The instrument with the changes of a sentence, one after the other; unchanged for an empty sentence.
 
-    Raises ValueError, with the nearest sentences, for one that the instrument has no place for.
+    Raises ValueError, with the nearest sentences, for a change that the instrument has no place for.
     """
-    for part in sentence.split(JOINED) if sentence else ():
-        known = alternatives(instrument)
-        check_names(f"change of {instrument.name}", [part], known)
-        instrument = known[part](instrument)
+    for name in sentence.split(JOINED) if sentence else ():
+        available = alternatives(instrument)
+        check_names(f"change of {instrument.name}", [name], available)
+        instrument = available[name](instrument)
     return instrument
 
 
@@ -78,13 +78,13 @@ def _each_and_all(
 
 
 def _used(instrument: Instrument, kind: type[Element]) -> dict[str, Any]:
-    """The elements of a class that light meets, by place."""
+    """Elements of a class in the light path, by place."""
     used = {*instrument.path, *(f"{arm.name}.{name}" for arm in instrument.arms for name in arm.path)}
     return {place: instrument.element(place) for place in instrument.places(kind) if place in used}
 
 
 def _paths(instrument: Instrument) -> Iterator[tuple[str, str, tuple[str, ...]]]:
-    """Of the common train and of every arm: its name, what its places begin with, its elements ahead of an analyser."""
+    """Name, prefix of places and elements ahead of the analyser, of the common train and of every arm."""
     yield "", "", instrument.path
     yield from ((arm.name, f"{arm.name}.", arm.path[:-1]) for arm in instrument.arms)
 
@@ -93,7 +93,7 @@ def _layers(instrument: Instrument) -> Iterator[Named]:
     yield from _each_and_all(
         [place for place, plate in _used(instrument, WavePlate).items() if len(plate.layers) > 1],
         "with layers in the other order",
-        lambda i, place: i.changed(place, layers=lambda own: own[::-1]),
+        lambda i, place: i.changed(place, layers=lambda layers: layers[::-1]),
     )
 
 
@@ -124,19 +124,19 @@ def _beams(instrument: Instrument) -> Iterator[Named]:
         "with exchanged beams",
         lambda i, place: _with_cameras(i, {place: _used(i, Analyser)[place].cameras[::-1]}),
     )
-    for one, other in itertools.combinations(arms, 2):
-        places = [f"{arm.name}.{arm.analyser.name}" for arm in (one, other)]
-        seen = dict(zip(places, (other.analyser.cameras, one.analyser.cameras), strict=True))
-        what = f"{one.name} and {other.name} with exchanged cameras"
-        yield what, lambda i, seen=seen: _with_cameras(i, seen)
+    for first, second in itertools.combinations(arms, 2):
+        places = [f"{arm.name}.{arm.analyser.name}" for arm in (first, second)]
+        cameras = dict(zip(places, (second.analyser.cameras, first.analyser.cameras), strict=True))
+        what = f"{first.name} and {second.name} with exchanged cameras"
+        yield what, lambda i, cameras=cameras: _with_cameras(i, cameras)
 
 
 def _with_cameras(instrument: Instrument, names: dict[str, tuple[str, ...]]) -> Instrument:
     """The instrument with other cameras behind the analysers at some places."""
     for place, cameras in names.items():
         instrument = instrument.changed(place, cameras=cameras)
-    known = instrument.cameras.names
-    arms = tuple(tuple(map(known.index, arm.analyser.cameras)) for arm in instrument.arms)
+    order = instrument.cameras.names
+    arms = tuple(tuple(map(order.index, arm.analyser.cameras)) for arm in instrument.arms)
     return dataclasses.replace(instrument, cameras=dataclasses.replace(instrument.cameras, arms=arms))
 
 
@@ -149,8 +149,8 @@ def _order(instrument: Instrument) -> Iterator[Named]:
             def exchanged(
                 instrument: Instrument, holder: str = holder, first: str = first, second: str = second
             ) -> Instrument:
-                other = {first: second, second: first}
-                return instrument.changed(holder, path=lambda way: tuple(other.get(n, n) for n in way))
+                swapped = {first: second, second: first}
+                return instrument.changed(holder, path=lambda way: tuple(swapped.get(n, n) for n in way))
 
             yield f"{prefix}{first} behind {prefix}{second}", exchanged
 
@@ -170,7 +170,7 @@ def _in_or_out(instrument: Instrument) -> Iterator[Named]:
     for holder, prefix, path in _paths(instrument):
         for name in path:
             element = instrument.element(prefix + name)
-            bends = type(element).ray is not Element.ray  # without it everything behind would be elsewhere
+            bends = type(element).ray is not Element.ray  # without it all elements behind would be displaced
             if isinstance(element, Polariser | Analyser) or element.moves or bends:
                 continue
 
@@ -181,15 +181,15 @@ def _in_or_out(instrument: Instrument) -> Iterator[Named]:
 
 
 def _dispersion(instrument: Instrument) -> Iterator[Named]:
-    """Every plate of a crystal with another published curve of it."""
+    """All plates of a crystal with another published dispersion."""
     plates = _used(instrument, WavePlate)
     used = {layer.material for plate in plates.values() for layer in plate.layers}
-    for crystal, others in materials.OTHER_CURVES.items():
-        family = (crystal, *others)
+    for crystal, curves in materials.OTHER_CURVES.items():
+        family = (crystal, *curves)
         for material in family:
             if material in used or not used & set(family):
                 continue
-            source = others.get(material) or materials.CRYSTALS[material].source.split(",")[0]
+            source = curves.get(material) or materials.CRYSTALS[material].source.split(",")[0]
 
             def changed_curve(
                 instrument: Instrument, material: str = material, family: tuple[str, ...] = family

@@ -1,15 +1,15 @@
-"""The cameras: throughput over the field, what mixes them, ghosts, and what the detectors make of the electrons.
+"""The cameras: throughput over the field, cross-talk, ghosts, and the response of the detectors to electrons.
 
 Everything here but the throughput is empty in the base model; an effect or a description adds parts. A part acts at one
-stage, and the class says at which:
+stage, that of its class:
 
     Transmission    factors of the throughput at a field point
     Mixing          analysis vectors behind the throughput: part of the instrument, linear in the light
-    GhostPart       light of the opposite field point: needs to know what is there
-    ExposurePart    linear in the flux, but known only exposure by exposure
+    GhostPart       light of the opposite field point
+    ExposurePart    linear in the flux, but specific to each exposure
     DetectorPart    acts on electrons; not linear in the light
 
-What of this can be carried over to other exposures, `dependence.left_behind` says.
+`dependence.left_behind` lists the effects that do not carry over to other exposures.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Throughput(Component):
     scale: float = eqx.field(static=True, default=FIELD_SCALE)  # h, degrees
 
     def declarations(self) -> Mapping[str, Parameter]:
-        """The series is a parameter of every instrument."""
+        """The series, a parameter of every instrument."""
         return {"coefficients": self.declared}
 
     def labels(self, field: str) -> Sequence[str]:
@@ -83,7 +83,7 @@ class ExposurePart(Component):
 
     @property
     def exposures_known(self) -> int | None:
-        """Number of exposures that it has values for; None: any number."""
+        """Number of exposures with values; None: any number."""
         return None
 
     def factors(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"] | float:
@@ -100,14 +100,14 @@ class DetectorPart(Component):
 
     @abc.abstractmethod
     def reported(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
-        """Counts reported for counts (electrons) that arrive."""
+        """Reported counts for arriving counts (electrons)."""
 
 
 class Cameras(Component):
-    """Names of the cameras, which of them each arm has (`arms`), and what is known beyond their throughput.
+    """Names of the cameras, those of each arm (`arms`), and their parts beyond the throughput.
 
-    `split`: the share of the light that an arm gets is not smooth over the field and unknown, so that every arm has a
-    flux of its own (`likelihood.flux`). `floor`: no error is smaller than this share of the mean counts of a row.
+    `split`: the shares of the light in the arms are unknown and not smooth over the field, so that every arm has a flux
+    of its own (`likelihood.flux`). `floor`: no error is smaller than this share of the mean counts of a row.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -125,12 +125,12 @@ class Cameras(Component):
 
     @property
     def fluxes(self) -> int:
-        """Number of fluxes of a row, where they are unknown."""
+        """Number of unknown fluxes of a row."""
         return len(self.arms) if self.split else 1
 
     @property
     def units(self) -> tuple[int, ...]:
-        """The cameras that others are compared with where only ratios can be known: of `split` arms, of a pair."""
+        """Reference cameras where only ratios can be measured: of `split` arms, of a single pair."""
         alone = len(self.arms) == 1 and len(self.names) == 2
         return tuple(arm[0] for arm in self.arms) if self.split or alone else ()
 
@@ -141,21 +141,21 @@ class Cameras(Component):
 
     @property
     def together(self) -> Float[np.ndarray, "k k"] | None:
-        """1 where two cameras have a flux in common; None: all have."""
+        """1 for two cameras with a common flux; None: one flux for all."""
         if not self.split:
             return None
         arm = np.zeros(len(self.names), int)
-        for number, own in enumerate(self.arms):
-            arm[list(own)] = number
+        for number, members in enumerate(self.arms):
+            arm[list(members)] = number
         return (arm[:, None] == arm).astype(float)
 
     @property
     def orthogonal(self) -> tuple[int, ...]:
-        """For each camera the one that sees the other beam of its analyser."""
-        other = list(range(len(self)))
+        """For each camera the one in the other beam of its analyser."""
+        partners = list(range(len(self)))
         for a, b in self.pairs:
-            other[a], other[b] = b, a
-        return tuple(other)
+            partners[a], partners[b] = b, a
+        return tuple(partners)
 
 
 def with_floor(

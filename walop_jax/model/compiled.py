@@ -1,19 +1,19 @@
-"""Compilation with the options that this code needs, and traced programs kept on disk.
+"""Compilation with the options of this package, and traced programs kept on disk.
 
-JAX keeps compiled code between processes, under the text of the program; but to have the text Python must trace the
-optics with all their derivatives, which takes longer than most fits. So the text (StableHLO, `jax.export`) is kept as
-well, under what it depends on: the name of the function, the structure of its arguments with everything in it that is
-not a number (elements, effects, choices), shapes and types, the source of this package and the versions of what traces
-it. Whatever else an argument holds (a class of a user, a closure) is not kept, and neither is what cannot be exported.
+JAX keeps compiled code between processes, under the text of the program; but for the text Python must trace the optics
+with all their derivatives, which takes longer than most fits. So the text (StableHLO, `jax.export`) is kept as well,
+under a key of its dependences: the name of the function, the structure of its arguments with all non-numbers (elements,
+effects, choices), shapes and types, the source of this package and the versions of the tracing packages. Programs with
+other arguments (a class of a user, a closure) are not kept, nor are programs that cannot be exported.
 
-Programs are kept where JAX's cache folder has a folder `programs`, which the command line makes; like compiled code
-they are code: the folder must be the user's own. A file that is damaged is made again.
+Programs are kept where JAX's cache folder has a folder `programs`, which the command line makes; like compiled
+code they are executed: the folder must be the user's own. A damaged file is written anew.
 
 On CPU the fusion emitters of XLA compute shared sub-expressions over and over when a derivative of the plates is
 compiled (measured with jax 0.10.2: a first fit takes 18 s of CPU instead of 11 s, later calls as long; plates solved
 one by one took 9.6 s a call instead of 0.08 s), so they are switched off there where XLA has the option (that of jax
 0.12 has not).
-`tests/model/test_compiled.py` keeps an eye on it. What is called once or twice is not worth optimising.
+`tests/model/test_compiled.py` guards this. Programs of one or two calls are not worth optimising.
 
 Without optimisation, these change the time of compilation by −10 to +17 %, with jax 0.10.2 and 0.12, less than single
 runs scatter, and are left as they are: `xla_cpu_opt_preset` (FAST_COMPILE), `xla_llvm_disable_expensive_passes`,
@@ -52,45 +52,46 @@ _PACKAGES = ("jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy")
 _KNOWN = ("walop_jax", "builtins", "types", "functools", "operator", "_operator", *_PACKAGES)
 _MOST = 500  # programs that are kept, those used last
 _STARTED = time.time()
-"""A source file that is younger is not the code that runs."""
+"""A younger source file is not the running code."""
 
 
 class _NotKept(Exception):
-    """A program that depends on more than its key could say."""
+    """A program with dependences beyond its key."""
 
 
 def folder() -> Path | None:
-    """Folder in which programs are kept; None where they are not."""
+    """Folder of kept programs; None without one."""
     cache = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    here = Path(cache) / FOLDER if cache else None
-    return here if here is not None and here.is_dir() else None
+    path = Path(cache) / FOLDER if cache else None
+    return path if path is not None and path.is_dir() else None
 
 
 def program(
-    here: Path, name: str, function: Callable[..., Any], args: tuple[Any, ...], options: dict[str, Any] | None
+    directory: Path,
+    name: str,
+    function: Callable[..., Any],
+    args: tuple[Any, ...],
+    options: dict[str, Any] | None,
 ) -> Callable[..., Any] | None:
-    """Program that runs `function` on arguments like these: a kept one, or one that is kept from now on.
-
-    None where it cannot be kept.
-    """
+    """Program of `function` for arguments like these, from the folder or new to it; None where it cannot be kept."""
     leaves, tree = jax.tree.flatten(args)
     try:
         key = _key(name, tree.unflatten(range(tree.num_leaves)), [kind(leaf) for leaf in leaves])
-        kept = _read(here / key)
-        if kept is None:
-            kept = _traced(function, tree, leaves)
-            _write(here / key, kept)
-        structure, exported = kept[0], export.deserialize(bytearray(kept[1]))
-    except Exception:  # whatever stands in the way: the call itself shows it, if it matters
+        stored = _read(directory / key)
+        if stored is None:
+            stored = _traced(function, tree, leaves)
+            _write(directory / key, stored)
+        structure, exported = stored[0], export.deserialize(bytearray(stored[1]))
+    except Exception:  # the call itself raises the error, if it matters
         return None
     run, shape = jax.jit(exported.call, compiler_options=options), jax.tree.structure(structure)
     return lambda *args: shape.unflatten(run(*jax.tree.leaves(args)))
 
 
 def kind(leaf: Any) -> tuple[Any, ...]:
-    """Kind of a number, as far as a program depends on it."""
-    seen = leaf.aval if isinstance(leaf, jax.Array) else jax.typeof(leaf)
-    return seen.shape, seen.dtype, bool(seen.weak_type)
+    """Kind of a number: shape, type and weakness of the type."""
+    aval = leaf.aval if isinstance(leaf, jax.Array) else jax.typeof(leaf)
+    return aval.shape, aval.dtype, bool(aval.weak_type)
 
 
 def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> tuple[Any, bytes]:
@@ -98,9 +99,9 @@ def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> t
     shapes: list[Any] = []
 
     def flat(*leaves: Any) -> list[Any]:
-        found, shape = jax.tree.flatten(function(*tree.unflatten(leaves)))
+        results, shape = jax.tree.flatten(function(*tree.unflatten(leaves)))
         shapes.append(shape)
-        return found
+        return results
 
     exported = export.export(jax.jit(flat))(*leaves)
     return shapes[-1].unflatten(range(shapes[-1].num_leaves)), bytes(exported.serialize())
@@ -109,12 +110,12 @@ def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> t
 def _key(name: str, structure: Any, kinds: Sequence[Any]) -> str:
     flags = os.environ.get("XLA_FLAGS", "")
     double = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-    said = repr((name, kinds, jax.default_backend(), double, flags)) + json.dumps(_plain(structure))
-    return hashlib.sha256(_source() + said.encode()).hexdigest()
+    description = repr((name, kinds, jax.default_backend(), double, flags)) + json.dumps(_plain(structure))
+    return hashlib.sha256(_source() + description.encode()).hexdigest()
 
 
 def _plain(value: Any) -> Any:
-    """A structure as JSON has it, equal for equal ones: collections and objects are lists that begin with their kind.
+    """A structure in the types of JSON, equal for equal structures: collections are lists that begin with their kind.
 
     Raises `_NotKept` for classes and functions that are not of this package and its libraries, and for other objects.
     """
@@ -140,7 +141,7 @@ def _plain(value: Any) -> Any:
 
 
 def _name(value: Any) -> str:
-    """Module and name of a class or function. Raises `_NotKept` unless it is found there."""
+    """Module and name of a class or function. Raises `_NotKept` unless the name leads to it."""
     module, name = value.__module__ or "", value.__qualname__
     if module.partition(".")[0] not in _KNOWN or _found(f"{module}:{name}") is not value:
         raise _NotKept(name)
@@ -156,27 +157,27 @@ def _found(name: str) -> Any:
 
 
 def _made(plain: Any) -> Any:
-    """The structure that `_plain` was given; a set as a frozen one, a mapping as a dict."""
+    """Inverse of `_plain`; sets become frozen sets, mappings dicts."""
     if not isinstance(plain, list):
         return plain
-    kind, *rest = plain
+    kind, *entries = plain
     if kind == "array":
-        return np.frombuffer(bytes.fromhex(rest[2]), rest[0]).reshape(rest[1])
+        return np.frombuffer(bytes.fromhex(entries[2]), entries[0]).reshape(entries[1])
     if kind == "dict":
-        return {_made(key): _made(entry) for key, entry in rest}
+        return {_made(key): _made(entry) for key, entry in entries}
     if kind == "object":
-        made = object.__new__(_found(rest[0]))
-        for name, value in rest[1].items():
-            object.__setattr__(made, name, _made(value))
-        return made
+        instance = object.__new__(_found(entries[0]))
+        for name, value in entries[1].items():
+            object.__setattr__(instance, name, _made(value))
+        return instance
     if kind in ("name", "named"):
-        return _found(rest[0]) if kind == "name" else _found(rest[0])._make(map(_made, rest[1:]))
-    return {"tuple": tuple, "list": list, "frozenset": frozenset}[kind](map(_made, rest))
+        return _found(entries[0]) if kind == "name" else _found(entries[0])._make(map(_made, entries[1:]))
+    return {"tuple": tuple, "list": list, "frozenset": frozenset}[kind](map(_made, entries))
 
 
 @functools.cache
 def _source() -> bytes:
-    """Digest of the source of this package and the versions of what traces it. Raises `_NotKept`."""
+    """Digest of the source of this package and of the versions of the tracing packages. Raises `_NotKept`."""
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256(sys.version.encode())
     for package in _PACKAGES:
@@ -189,18 +190,18 @@ def _source() -> bytes:
 
 
 def _read(path: Path) -> tuple[Any, bytes] | None:
-    """Structure and bytes kept under a name; None where there is nothing, or a damaged file."""
+    """Structure and bytes of a file; None for a missing or damaged one."""
     with contextlib.suppress(OSError):
         content = path.read_bytes()
         if hashlib.sha256(content[_DIGEST:]).digest() == content[:_DIGEST]:
             os.utime(path)
-            text, _, rest = content[_DIGEST:].partition(b"\n")
-            return _made(json.loads(text)), rest
+            text, _, payload = content[_DIGEST:].partition(b"\n")
+            return _made(json.loads(text)), payload
     return None
 
 
 def _write(path: Path, kept: tuple[Any, bytes]) -> None:
-    """Keep something, in one step, and no more than there is room for; quietly not where the disk does not take it."""
+    """Write a program in one step and remove the oldest beyond `_MOST`; failures of the disk are ignored."""
     content = json.dumps(_plain(kept[0])).encode() + b"\n" + kept[1]
     with contextlib.suppress(OSError):
         handle, name = tempfile.mkstemp(dir=path.parent)
@@ -225,7 +226,7 @@ EMITTERS = "xla_cpu_use_fusion_emitters"
 
 @functools.cache
 def knows(option: str) -> bool:
-    """True if this version of XLA has an option."""
+    """True for an option of this version of XLA."""
     try:
         jax.jit(lambda: 0, compiler_options={option: False}).lower().compile()
     except jax.errors.JaxRuntimeError:
@@ -238,9 +239,9 @@ def compiled(
 ) -> Callable[..., Result]:
     """`jax.jit` with this package's options; the back end is looked up at the first call, not at import.
 
-    Code for a `Plan` whose `work` is not above `optimised_above` is not optimised: sooner ready, slower to run. `fuse`
-    leaves the fusion emitters on, for a function without derivatives of the plates. `kept_as` is the name under which
-    the traced program is kept between processes (`program`), for a function that depends on nothing but its arguments.
+    Code for a `Plan` whose `work` is not above `optimised_above` is not optimised: faster to compile, slower to run.
+    `fuse` leaves the fusion emitters on, for a function without derivatives of the plates. `kept_as` names the traced
+    program between processes (`program`), for a function of its arguments alone.
     """
 
     def options(once: bool) -> dict[str, Any] | None:
@@ -257,14 +258,14 @@ def compiled(
     programs: dict[Any, Any] = {}
 
     def kept(args: tuple[Any, ...], once: bool) -> Any:
-        """The program for arguments like these, from disk where it is there; None where none is kept."""
-        here = folder()
-        if here is None:
+        """The kept program for arguments like these, from disk if possible; None where it cannot be kept."""
+        directory = folder()
+        if directory is None:
             return None
         leaves, tree = jax.tree.flatten(args)
         at = tree, tuple(kind(leaf) for leaf in leaves), once
         if at not in programs:
-            programs[at] = program(here, kept_as, function, args, options(once))
+            programs[at] = program(directory, kept_as, function, args, options(once))
         return programs[at]
 
     @functools.wraps(function)
@@ -279,7 +280,7 @@ def compiled(
 
 
 def array(values: Any, kind: Any = None) -> jax.Array:
-    """Known numbers as an array of JAX, for use outside of programs: `jnp.asarray` compiles one for each shape."""
+    """Numbers as an array of JAX, outside of programs: `jnp.asarray` would compile a program for each shape."""
     if isinstance(values, jax.Array):
         return values
     with float64():
@@ -293,12 +294,12 @@ def float64() -> contextlib.AbstractContextManager[Any]:
     """JAX computes in float64 in the block, by the calling thread alone; the rest of the session stays as it is."""
     if jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         return contextlib.nullcontext()
-    here = jax if hasattr(jax, "enable_x64") else importlib.import_module("jax.experimental")  # jax < 0.8
-    return here.enable_x64(True)
+    module = jax if hasattr(jax, "enable_x64") else importlib.import_module("jax.experimental")  # jax < 0.8
+    return module.enable_x64(True)
 
 
 def usual_threads() -> int:
-    """Number of pieces of work that are computed at a time by default."""
+    """Default number of simultaneous pieces of work."""
     devices = len(jax.local_devices())
     if devices > 1 or jax.default_backend() != "cpu":
         return 2 * devices  # one computes while the next one is read
@@ -306,7 +307,7 @@ def usual_threads() -> int:
 
 
 def cache_folder() -> Path | None:
-    """Folder of compiled code that is kept between runs; None when that is switched off or impossible.
+    """Folder of compiled code between runs; None when switched off or impossible.
 
     WALOP_JAX_CACHE names the folder ("off": none), otherwise it is walop-jax/xla in the user's cache folder.
     """
@@ -315,21 +316,21 @@ def cache_folder() -> Path | None:
         return None
     try:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        kept = Path(chosen) if chosen else Path(base) / "walop-jax" / "xla"
-        kept.mkdir(parents=True, exist_ok=True)
+        path = Path(chosen) if chosen else Path(base) / "walop-jax" / "xla"
+        path.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError):  # no home
         return None
-    return kept if os.access(kept, os.W_OK | os.X_OK) else None
+    return path if os.access(path, os.W_OK | os.X_OK) else None
 
 
 def switch_on() -> None:
     """Switch JAX on for a program: float64, and the cache of compiled code, which makes later runs start fast."""
     jax.config.update("jax_enable_x64", True)
-    kept = cache_folder()
-    if kept is not None:
+    path = cache_folder()
+    if path is not None:
         with contextlib.suppress(OSError):
-            (kept / FOLDER).mkdir(exist_ok=True)
-        jax.config.update("jax_compilation_cache_dir", str(kept))
+            (path / FOLDER).mkdir(exist_ok=True)
+        jax.config.update("jax_compilation_cache_dir", str(path))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
         jax.config.update("jax_raise_persistent_cache_errors", False)
@@ -343,12 +344,12 @@ def in_float64(function: Callable[..., Any], name: str) -> Callable[..., Any]:
         with float64():
             return function(*args, **kwargs)
 
-    run.__module__, run.__qualname__ = "walop_jax", name  # where it is found again, by pickle as well
+    run.__module__, run.__qualname__ = "walop_jax", name  # for look-ups by name, as of pickle
     return run
 
 
 def need_float64(what: str) -> None:
-    """Raise RuntimeError, with the remedy, where float64 is switched off for what the session itself compiles."""
+    """Raise RuntimeError, with the remedy, where the session compiles in float32."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise RuntimeError(
             f"{what} is computed in float64, which is switched off: call "
@@ -357,7 +358,7 @@ def need_float64(what: str) -> None:
 
 
 def _refuse_float32(args: tuple[Any, ...]) -> None:
-    """Raise RuntimeError, with the remedy, for numbers that were made in float32: they have lost their digits."""
+    """Raise RuntimeError, with the remedy, for numbers in float32: their digits are lost."""
     if jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         return
     if any(getattr(leaf, "dtype", None) == np.float32 for leaf in jax.tree.leaves(args)):

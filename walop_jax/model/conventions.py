@@ -15,12 +15,12 @@ Oblique     The Stokes parameters of a ray of direction k refer to the ICS axes 
 
 from typing import NamedTuple
 
-REFERENCE_WAVELENGTH = 0.62  # µm: where dispersions, colours and fringes are counted from
+REFERENCE_WAVELENGTH = 0.62  # µm: origin of dispersions, colours and fringes
 FIELD_SCALE = 0.3  # degrees: the unit of the field polynomials of WALOP
 
 
 class Units(NamedTuple):
-    """Scales of an instrument that changes over its field (deg) and its bands (µm) are counted in."""
+    """Scales of an instrument, units of changes over its field (deg) and its bands (µm)."""
 
     field: float = FIELD_SCALE
     wavelength: float = REFERENCE_WAVELENGTH

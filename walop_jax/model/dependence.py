@@ -1,13 +1,12 @@
-"""Dependences of a light path, found by running it on shapes alone: nothing of this is declared by hand.
+"""Dependences of a light path, from a run on shapes alone instead of declarations by hand.
 
-`needs` runs the path until it asks for nothing more that a plan would have to hold. `optical_reach` follows every
+`needs` runs the path until it asks for no further quantity of a plan. `optical_reach` follows every
 parameter through the operations of `light.band_rows`: those that reach the result enter before the band integral.
 
-Not all of an instrument holds for other exposures than those it was fitted to. The instrument matrix and the analysis
-of a catalogue know the optics and the cameras. Light of the opposite field point, shares of single exposures, optics
-that change with the time since the first exposure and detectors that need to know of their exposure do not go with
-them; a detector that asks for nothing but its own counts is undone. Which effects that concerns is found by patching,
-not declared.
+Not all of an instrument is valid for exposures other than the fitted ones. The instrument matrix and the analysis of a
+catalogue use the optics and the cameras. Light of the opposite field point, shares of single exposures, optics that
+change with the time since the first exposure and detectors that depend on their exposure do not carry over; the
+response of a detector to its own counts alone is inverted. Patching shows the effects concerned; they are not declared.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from walop_jax.model.ray import Conditions, NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays, Sight
 
 AT = 0.11, 0.07
-"""A field point off the axis and at an odd place: a dependence must not vanish by symmetry in what is written."""
+"""A field point off the axis and at an odd place: no dependence may vanish by symmetry."""
 
 
 class Needs(NamedTuple):
@@ -46,41 +45,44 @@ class Needs(NamedTuple):
 
 
 def needs(instrument: Instrument) -> Needs:
-    """Requirements of the light path of an instrument, effects included; found by running it on shapes alone."""
+    """Requirements of the light path of an instrument, effects included, from a run on shapes alone."""
     return _needs(*shapes_of(instrument))
 
 
 @functools.lru_cache(maxsize=256)
 def _needs(structure: Any, shapes: Shapes) -> Needs:
-    def run(asked: Set[str], instrument: Instrument) -> tuple[Instrument, Array]:
-        patched, plan = instrument.patched(), blank_plan(instrument, asked - {"median"}, "median" in asked)
+    def run(quantities: Set[str], instrument: Instrument) -> tuple[Instrument, Array]:
+        patched, plan = (
+            instrument.patched(),
+            blank_plan(instrument, quantities - {"median"}, "median" in quantities),
+        )
         x, y = map(jnp.asarray, AT)
         rows = light.band_rows(patched, plan, x, y)
-        each = jnp.zeros_like(plan.exposures.kind)
-        sight = Sight(plan.exposures, jnp.zeros((*each.shape, 2)), each - 1, x, y)
-        counts = light.counts(patched, rows, patched.throughput.at(x, y), sight, each)
+        zeros = jnp.zeros_like(plan.exposures.kind)
+        sight = Sight(plan.exposures, jnp.zeros((*zeros.shape, 2)), zeros - 1, x, y)
+        counts = light.counts(patched, rows, patched.throughput.at(x, y), sight, zeros)
         return patched, light.detected(patched, plan.exposures, counts)
 
-    (patched, _), asked = _asking(run, of_shapes(structure, shapes))
-    parts = [*patched.elements, *(element for arm in patched.arms for element in arm.elements)]
-    longest = max((part.path_difference for part in parts), default=0.0)
-    return Needs(asked - {"median"}, "median" in asked, longest)
+    (patched, _), quantities = _asking(run, of_shapes(structure, shapes))
+    elements = [*patched.elements, *(element for arm in patched.arms for element in arm.elements)]
+    longest = max((item.path_difference for item in elements), default=0.0)
+    return Needs(quantities - {"median"}, "median" in quantities, longest)
 
 
 def _asking(run: Callable[[Set[str], Any], Any], of: Any) -> tuple[Any, frozenset[str]]:
-    """Shapes of a computation for which all is there that it asks for, and what that is."""
-    asked: frozenset[str] = frozenset()
+    """Shapes of a computation with all quantities that it asks for, and their names."""
+    quantities: frozenset[str] = frozenset()
     while True:
         try:
-            return jax.eval_shape(functools.partial(run, asked), of), asked
+            return jax.eval_shape(functools.partial(run, quantities), of), quantities
         except NotPlannedError as missing:
-            if missing.quantity in asked:
+            if missing.quantity in quantities:
                 raise
-            asked |= {missing.quantity}
+            quantities |= {missing.quantity}
 
 
 def optical_indices(instrument: Instrument) -> Int[np.ndarray, " o"]:
-    """Positions of the parameters that enter before the band integral."""
+    """Positions of the parameters inside the band integral."""
     plan = blank_plan(instrument, needs(instrument).conditions)
     return np.flatnonzero(optical_reach(instrument, plan).any(axis=0))
 
@@ -94,7 +96,7 @@ def optical_reach(instrument: Instrument, plan: Plan) -> Bool[np.ndarray, "a n"]
 
 @functools.lru_cache(maxsize=256)
 def _reach(structure: Any, shapes: Shapes) -> tuple[tuple[bool, ...], ...]:
-    """For every arm the arrays of instrument and plan that reach its rows; inner programs use all they are given."""
+    """For every arm the arrays of instrument and plan that reach its rows; inner programs use all their arguments."""
 
     def reaching(number: int) -> tuple[bool, ...]:
         def run(*arrays: Array) -> Array:
@@ -114,7 +116,7 @@ def _reach(structure: Any, shapes: Shapes) -> tuple[tuple[bool, ...], ...]:
 
 
 def conditions_of_effect(bare: Instrument, effect: Effect) -> frozenset[str]:
-    """Conditions that the elements which an effect inserts or changes ask for, by names in `ray.CONDITIONS`."""
+    """Conditions of the elements that an effect inserts or changes, by names in `ray.CONDITIONS`."""
     return _conditions_of_effect(*shapes_of((bare, effect)))
 
 
@@ -137,30 +139,30 @@ def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
 
 @functools.lru_cache(maxsize=1024)
 def _conditions_asked(structure: Any, shapes: Shapes) -> frozenset[str]:
-    def run(asked: Set[str], element: Element) -> tuple[Any, Any]:
-        one, zero = jnp.ones(1), jnp.zeros(())
-        conditions = Conditions(band_width=0.1 * one, planned=dict.fromkeys(asked, one))
-        ray = Ray.entering(zero, zero, (0.62 * one, conditions))
+    def run(quantities: Set[str], element: Element) -> tuple[Any, Any]:
+        ones, zero = jnp.ones(1), jnp.zeros(())
+        conditions = Conditions(band_width=0.1 * ones, planned=dict.fromkeys(quantities, ones))
+        ray = Ray.entering(zero, zero, (0.62 * ones, conditions))
         return element.ray(ray), element.mueller(ray)
 
     return _asking(run, of_shapes(structure, shapes))[1]
 
 
-# --------------------------------------------------------------------------------------- what holds for other exposures
+# --------------------------------------------------------------------------------------- validity for other exposures
 
 KNOWN = frozenset({"temperature", "hour_angle"})
-"""Conditions of the optics that a table of points or a catalogue can say."""
+"""Conditions of the optics with columns in a table of points or a catalogue."""
 
 
 class _Unknown(ExposureArrays):
-    """Exposures of which nothing is known: whatever is asked of them is an error."""
+    """Exposures without any known quantity: every request is an error."""
 
     def __getattr__(self, name: str) -> Any:
         raise NotPlannedError(name)
 
 
 def is_undone(part: DetectorPart, cameras: int) -> bool:
-    """True if a detector asks for nothing but its own counts, so that a catalogue can be freed of it."""
+    """True for a detector that depends on its own counts alone, so that catalogues can be corrected for it."""
     try:
         jax.eval_shape(lambda p: p.reported(jnp.ones((1, cameras)), blank(_Unknown)), part)
     except NotPlannedError:
@@ -169,22 +171,22 @@ def is_undone(part: DetectorPart, cameras: int) -> bool:
 
 
 def left_behind(instrument: Instrument) -> tuple[str, ...]:
-    """Names of the effects of which a part cannot be carried over to other exposures."""
+    """Names of the effects that do not fully carry over to other exposures."""
     bare = dataclasses.replace(instrument, effects=())
     names = []
     for effect in instrument.effects:
-        there = effect.patch(bare)
-        cameras = there.cameras
-        kept = all(is_undone(part, len(cameras)) for part in cameras.detectors)
+        patched = effect.patch(bare)
+        cameras = patched.cameras
+        undone = all(is_undone(detector, len(cameras)) for detector in cameras.detectors)
         unknown = conditions_of_effect(bare, effect) - KNOWN
-        if cameras.ghosts or cameras.exposures or there.sky_films or not kept or unknown:
+        if cameras.ghosts or cameras.exposures or patched.sky_films or not undone or unknown:
             names.append(effect.name)
     return tuple(names)
 
 
 def reported(instrument: Instrument, counts: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """Counts that are reported for counts (electrons) by the detectors that can be undone."""
-    for part in instrument.patched().cameras.detectors:
-        if is_undone(part, len(instrument.cameras)):
-            counts = part.reported(counts, blank(_Unknown))
+    """Reported counts for counts (electrons), by the detectors with an inverse."""
+    for detector in instrument.patched().cameras.detectors:
+        if is_undone(detector, len(instrument.cameras)):
+            counts = detector.reported(counts, blank(_Unknown))
     return counts

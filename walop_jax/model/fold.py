@@ -1,13 +1,13 @@
 """The fold of the train: Mueller matrices of all elements at all their positions, multiplied into the analysers' rows.
 
-A *station* is an element with the ray that meets it; a *state* holds the positions of the moving elements in one
+A *station* is an element with its incident ray; a *state* holds the positions of the moving elements in one
 optical setting (an angle in degrees, None when out), in the order of their columns. Settings that agree in the
 elements nearest to the analysers share the products of these, so every product is made once. `solved` hands all
 elements of one class over together: the half-wave plates are one computation, compiled once.
 
-Turning     An element that turns evenly from a to b during an exposure acts by its mean matrix ∫ M(θ) dθ / (b − a),
+Turning     An element in uniform rotation from a to b during an exposure acts by its mean matrix ∫ M(θ) dθ / (b − a),
             since light adds up and no other element turns then: whole turns by the trapezoidal rule, which is exact for
-            the harmonics of a turn that `WHOLE` nodes follow, the rest by Gauss and Legendre's about its middle.
+            the harmonics of a turn resolved by `WHOLE` nodes, the remainder by that of Gauss and Legendre.
 Limits      b − a = 0: M(a). Of an ideal retarder cos 2θ, cos 4θ become cos(n (a + b)/2) sinc(n (b − a)/2).
 """
 
@@ -30,7 +30,7 @@ from walop_jax.model.ray import Ray
 Station = tuple[Element, Ray]
 Mueller = Float[Array, "... 4 4"]
 WHOLE = 64  # angles of a whole turn
-FEWEST, PER_RADIAN = 8, 12.0  # angles of a part of a turn, and how many more for each radian
+FEWEST, PER_RADIAN = 8, 12.0  # angles of a partial turn: the minimum, and more for each radian
 
 
 class Turning(NamedTuple):
@@ -40,66 +40,66 @@ class Turning(NamedTuple):
     turn: float
 
     def angles(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Angles (deg) of which the mean is taken, and their weights."""
-        rest = self.turn % 360.0
-        whole = self.turn - rest
+        """Angles (deg) of the mean, and their weights."""
+        remainder = self.turn % 360.0
+        full_turns = self.turn - remainder
         start = self.middle - self.turn / 2.0
-        at = start + 360.0 / WHOLE * np.arange(WHOLE) if whole else np.zeros(0)
-        weight = np.full(len(at), whole / self.turn / WHOLE)
-        if rest:
-            nodes, part = np.polynomial.legendre.leggauss(FEWEST + int(PER_RADIAN * np.deg2rad(rest)))
-            at = np.append(at, start + rest / 2.0 * (1.0 + nodes))
-            weight = np.append(weight, part * rest / self.turn / 2.0)
+        at = start + 360.0 / WHOLE * np.arange(WHOLE) if full_turns else np.zeros(0)
+        weight = np.full(len(at), full_turns / self.turn / WHOLE)
+        if remainder:
+            nodes, shares = np.polynomial.legendre.leggauss(FEWEST + int(PER_RADIAN * np.deg2rad(remainder)))
+            at = np.append(at, start + remainder / 2.0 * (1.0 + nodes))
+            weight = np.append(weight, shares * remainder / self.turn / 2.0)
         return at, weight
 
 
 Angle = float | Turning
 State = tuple[Angle | None, ...]
 Solved = dict[tuple[int, Angle | None], Mueller | None]
-"""Mueller matrices by number of the station and angle at which its element stands (None for one that does not move)."""
+"""Mueller matrices by number of the station and angle of its element (None: not moving)."""
 
 
 def stations(elements: Sequence[Element], ray: Ray) -> tuple[list[Station], Ray]:
     """Elements with their rays, and the ray behind the last."""
-    found = []
+    result = []
     for element in elements:
-        found.append((element, ray))
+        result.append((element, ray))
         ray = element.ray(ray)
-    return found, ray
+    return result, ray
 
 
 def positions(element: Element, moving: Sequence[str], states: Sequence[State]) -> list[Angle | None]:
-    """Angles (deg) of an element, state by state; None where it is out (or does not move: see `Solved`)."""
+    """Angles (deg) of an element, state by state; None where it is out, or not moving (see `Solved`)."""
     if element.moves is None:
         return [None] * len(states)
     places = [state[moving.index(element.moves)] for state in states]
     return [at if isinstance(at, Turning) else element.position(at) for at in places]
 
 
-def solved(every: Sequence[Station], moving: Sequence[str], states: Sequence[State]) -> Solved:
-    """Mueller matrices of all stations at all the positions in which they occur."""
+def solved(all_stations: Sequence[Station], moving: Sequence[str], states: Sequence[State]) -> Solved:
+    """Mueller matrices of all stations at all their positions."""
     cases: list[tuple[tuple[int, float | None], Element, Ray]] = []
     means: list[tuple[int, Turning]] = []
-    for number, (element, ray) in enumerate(every):
+    for number, (element, ray) in enumerate(all_stations):
         if element.moves is None:
             cases.append(((number, None), element, ray))
             continue
-        there = dict.fromkeys(angle for angle in positions(element, moving, states) if angle is not None)
-        turning = [at for at in there if isinstance(at, Turning)]
+        occurring = dict.fromkeys(angle for angle in positions(element, moving, states) if angle is not None)
+        turning = [at for at in occurring if isinstance(at, Turning)]
         means += [(number, at) for at in turning]
-        angles = {at for at in there if not isinstance(at, Turning)}.union(
+        angles = {at for at in occurring if not isinstance(at, Turning)}.union(
             *(at.angles()[0].tolist() for at in turning)
         )
         cases += [((number, angle), element.turned(angle), ray) for angle in sorted(angles)]
     result: Solved = {}
     for kind in dict.fromkeys(type(element) for _, element, _ in cases):
-        own = [case for case in cases if type(case[1]) is kind]
-        matrices = kind.solved([(element, ray) for _, element, ray in own])
-        result.update({key: matrix for (key, _, _), matrix in zip(own, matrices, strict=True)})
+        members = [case for case in cases if type(case[1]) is kind]
+        matrices = kind.solved([(element, ray) for _, element, ray in members])
+        result.update({key: matrix for (key, _, _), matrix in zip(members, matrices, strict=True)})
     for number, at in means:
         angles, weights = at.angles()
-        known = [matrix for angle in angles.tolist() if (matrix := result[number, angle]) is not None]
-        result[number, at] = jnp.tensordot(jnp.asarray(weights), jnp.stack(known), 1) if known else None
+        acting = [matrix for angle in angles.tolist() if (matrix := result[number, angle]) is not None]
+        result[number, at] = jnp.tensordot(jnp.asarray(weights), jnp.stack(acting), 1) if acting else None
     return result
 
 
@@ -127,32 +127,32 @@ def backward(
     states: Sequence[State],
     nodes: int,
 ) -> Float[Array, "c n r 4"]:
-    """Rows that the analysers see in every state, of light ahead of the common train."""
+    """Rows of the analysers in every state, for light ahead of the common train."""
     in_arms = [element.moves for arm in arms for element, _ in arm if element.moves is not None]
-    known = {moving.index(prefix) for prefix in in_arms}
-    keys = list(dict.fromkeys(_restricted(state, known) for state in states))
-    number, parts = len(common), []
+    columns = {moving.index(prefix) for prefix in in_arms}
+    keys = list(dict.fromkeys(_restricted(state, columns) for state in states))
+    number, blocks = len(common), []
     for arm, analyser in zip(arms, analysers, strict=True):
         matrix = product(
             stacked(matrices, number + i, element, moving, keys) for i, (element, _) in enumerate(arm)
         )
         number += len(arm)
-        seen = analyser.seen(jnp.eye(4) if matrix is None else matrix)
-        parts.append(jnp.broadcast_to(seen, (len(keys), nodes, *seen.shape[-2:])))
-    rows = jnp.concatenate(parts, axis=2)
+        analysed = analyser.seen(jnp.eye(4) if matrix is None else matrix)
+        blocks.append(jnp.broadcast_to(analysed, (len(keys), nodes, *analysed.shape[-2:])))
+    rows = jnp.concatenate(blocks, axis=2)
     for number in reversed(range(len(common))):
         element = common[number][0]
         if element.moves is not None:
-            more = known | {moving.index(element.moves)}
-            rows, keys = _branched(rows, keys, known, more, states)
-            known = more
+            extended = columns | {moving.index(element.moves)}
+            rows, keys = _branched(rows, keys, columns, extended, states)
+            columns = extended
         rows = _multiplied(rows, matrices, number, element, moving, keys)
-    order = [keys.index(_restricted(state, known)) for state in states]
+    order = [keys.index(_restricted(state, columns)) for state in states]
     return rows if order == list(range(len(keys))) else rows[np.array(order)]
 
 
-def _restricted(state: State, known: set[int]) -> State:
-    return tuple(position if i in known else None for i, position in enumerate(state))
+def _restricted(state: State, columns: set[int]) -> State:
+    return tuple(position if i in columns else None for i, position in enumerate(state))
 
 
 def _branched(
@@ -162,7 +162,7 @@ def _branched(
     after: set[int],
     states: Sequence[State],
 ) -> tuple[Float[Array, "d n r 4"], list[State]]:
-    """The rows once for every position of one more moving element; `before` and `after` are the columns that count."""
+    """The rows once for every position of one more moving element; `before` and `after` are the relevant columns."""
     parents = {_restricted(state, after): _restricted(state, before) for state in states}
     order = [keys.index(parent) for parent in parents.values()]
     return (rows if order == list(range(len(keys))) else rows[np.array(order)]), list(parents)
@@ -177,37 +177,37 @@ def around(
     states: Sequence[State],
     nodes: int,
 ) -> list[list[tuple[Float[Array, "c n r 4"], Float[Array, "c n 4 4"]]]]:
-    """For every place of the common train and of the arms: rows that the analysers see of light there, in every state,
-    and the matrix of what is ahead of it.
+    """For every place of the common train and of the arms: rows of the analysers for light there, in every state,
+    and the matrix of all elements ahead of it.
 
     A change of the matrix of a station changes the rows by (rows behind it) × change × (matrix ahead of it).
     """
-    every = [*common, *(station for arm in arms for station in arm)]
-    own = [stacked(matrices, i, element, moving, states) for i, (element, _) in enumerate(every)]
+    all_stations = [*common, *(station for arm in arms for station in arm)]
+    stack = [stacked(matrices, i, element, moving, states) for i, (element, _) in enumerate(all_stations)]
     start = jnp.broadcast_to(jnp.eye(4), (len(states), nodes, 4, 4))
-    seen = [analyser.seen(jnp.eye(4)) for analyser in analysers]
-    blank = jnp.zeros((len(states), nodes, sum(map(len, seen)), 4))
-    found, row, first, count = [], 0, len(common), len(common)
-    for arm, analysed in zip(arms, seen, strict=True):
-        path = [*own[:count], *own[first : first + len(arm)]]
+    analysed_rows = [analyser.seen(jnp.eye(4)) for analyser in analysers]
+    blank = jnp.zeros((len(states), nodes, sum(map(len, analysed_rows)), 4))
+    arm_places, row, first, count = [], 0, len(common), len(common)
+    for arm, analysed in zip(arms, analysed_rows, strict=True):
+        path = [*stack[:count], *stack[first : first + len(arm)]]
         last = blank.at[:, :, row : row + len(analysed)].set(analysed)
         row, first = row + len(analysed), first + len(arm)
         rows = [*itertools.accumulate(reversed(path), _ahead, initial=last)][::-1]
         places = [*zip(rows, itertools.accumulate(path, _behind, initial=start), strict=True)]
-        found.append((places[: count + 1], places[count:]))
+        arm_places.append((places[: count + 1], places[count:]))
     same = zip(
-        *(shared for shared, _ in found), strict=True
+        *(shared for shared, _ in arm_places), strict=True
     )  # of the common train, as each of the arms sees it
-    whole = [(functools.reduce(jnp.add, [rows for rows, _ in each]), each[0][1]) for each in same]
-    return [whole, *(arm for _, arm in found)]
+    common_places = [(functools.reduce(jnp.add, [rows for rows, _ in views]), views[0][1]) for views in same]
+    return [common_places, *(arm for _, arm in arm_places)]
 
 
-def _behind(matrix: Array, own: Mueller | None) -> Array:
-    return matrix if own is None else own @ matrix
+def _behind(matrix: Array, step: Mueller | None) -> Array:
+    return matrix if step is None else step @ matrix
 
 
-def _ahead(rows: Array, own: Mueller | None) -> Array:
-    return rows if own is None else rows @ own
+def _ahead(rows: Array, step: Mueller | None) -> Array:
+    return rows if step is None else rows @ step
 
 
 def stacked(
@@ -218,21 +218,21 @@ def stacked(
     keys: Sequence[State],
     out: Mueller | None = None,
 ) -> Mueller | None:
-    """Matrices of a station in every state, `out` (the identity) where it is out; None where it never acts."""
+    """Matrices of a station in every state, `out` (the identity) where it is out; None: always the identity."""
     if element.moves is None:
         return matrices[number, None]
     angles = positions(element, moving, keys)
     distinct = list(dict.fromkeys(angles))
-    own = [None if at is None else matrices[number, at] for at in distinct]
-    inside = [matrix for matrix in own if matrix is not None]
+    at_angles = [None if at is None else matrices[number, at] for at in distinct]
+    inside = [matrix for matrix in at_angles if matrix is not None]
     if not inside:
         return None
-    whole = np.broadcast_shapes(*(matrix.shape for matrix in inside))
-    gone = jnp.broadcast_to(jnp.eye(4) if out is None else out, whole)
-    stack = jnp.stack([gone if m is None else jnp.broadcast_to(m, whole) for m in own])
+    shape = np.broadcast_shapes(*(matrix.shape for matrix in inside))
+    gone = jnp.broadcast_to(jnp.eye(4) if out is None else out, shape)
+    stack = jnp.stack([gone if m is None else jnp.broadcast_to(m, shape) for m in at_angles])
     if len(distinct) < len(angles):
         stack = stack[np.array([distinct.index(at) for at in angles])]
-    return stack if len(whole) == 3 else stack[:, None]
+    return stack if len(shape) == 3 else stack[:, None]
 
 
 def _multiplied(
@@ -243,14 +243,14 @@ def _multiplied(
     moving: Sequence[str],
     keys: Sequence[State],
 ) -> Float[Array, "c n r 4"]:
-    """Rows of the light ahead of a station; states in which it is out are left as they are."""
+    """Rows of the light ahead of a station; unchanged in states without it."""
     if element.moves is None:
-        own = matrices[number, None]
-        return rows if own is None else rows @ own
+        matrix = matrices[number, None]
+        return rows if matrix is None else rows @ matrix
     inside = [i for i, at in enumerate(positions(element, moving, keys)) if at is not None]
-    own = stacked(matrices, number, element, moving, [keys[i] for i in inside]) if inside else None
-    if own is None:
+    matrix = stacked(matrices, number, element, moving, [keys[i] for i in inside]) if inside else None
+    if matrix is None:
         return rows
     if len(inside) == len(keys):
-        return rows @ own
-    return rows.at[np.array(inside)].set(rows[np.array(inside)] @ own)
+        return rows @ matrix
+    return rows.at[np.array(inside)].set(rows[np.array(inside)] @ matrix)

@@ -1,5 +1,4 @@
-"""Pages about single effects and elements, made of what their code says of them and of numbers kept beside the
-pages."""
+"""Pages about single effects and elements, from their docstrings, declarations and stored numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ from walop_jax.model.parameters import numbers_of, unknown_name
 
 NUMBERS = "gallery.json"
 
-_UNSEEN = 3.0  # standard deviations below which one effect may be taken for another
+_UNSEEN = 3.0  # standard deviations below which two effects may be confused
 _NOTHING = 5e-4  # per cent of the matrix: not worth a number
 
 
@@ -31,15 +30,15 @@ TOPICS: Mapping[str, Mapping[str, Any]] = {
 def page(topic: str, name: str) -> str:
     """The page about an effect or a kind of element (`TOPICS`), as Markdown.
 
-    Raises ValueError where there is none, with the names that the words of `name` speak of, or the nearest ones.
+    Raises ValueError for an unknown name, with the names related to its words, or the nearest ones.
     """
-    known = TOPICS[topic]
-    if name not in known:
-        every = f"walop-jax docs {topic} lists all"
-        meanings = {one: _about(kind) for one, kind in known.items()}
-        raise ValueError(f"{unknown_name(topic, name, meanings)} ({every})")
-    made = _effect(known[name]) if topic == "effect" else _element(known[name])
-    return "\n\n".join(made) + "\n"
+    subjects = TOPICS[topic]
+    if name not in subjects:
+        listing = f"walop-jax docs {topic} lists all"
+        meanings = {key: _about(kind) for key, kind in subjects.items()}
+        raise ValueError(f"{unknown_name(topic, name, meanings)} ({listing})")
+    paragraphs = _effect(subjects[name]) if topic == "effect" else _element(subjects[name])
+    return "\n\n".join(paragraphs) + "\n"
 
 
 def listed(topic: str) -> str:
@@ -49,8 +48,8 @@ def listed(topic: str) -> str:
 
 
 def numbers() -> dict[str, Any]:
-    """The numbers of the pages: `plan` in words, and by effect what `diagnosis.detection_limits` finds for it, and
-    the rms change of the matrix (per cent) at its usual size."""
+    """The numbers of the pages: `plan` in words, and by effect the results of `diagnosis.detection_limits` and the rms
+    change of the matrix (per cent) at its usual size."""
     return json.loads((files("walop_jax") / "docs" / NUMBERS).read_text(encoding="utf-8"))
 
 
@@ -68,52 +67,52 @@ def _effect(effect: EffectKind) -> Iterator[str]:
             for n, d in effect.numbers().items()
         ],
     )
-    said = f"\n{effect.head()}"
-    if effect.revealed_by and "\nRevealed" not in said:
+    head = f"\n{effect.head()}"
+    if effect.revealed_by and "\nRevealed" not in head:
         yield f"**Revealed by** {effect.revealed_by}."
-    found = numbers()
-    one = found["effects"].get(effect.name)
-    if one is not None:
-        yield from _maps(one)
+    gallery = numbers()
+    entry = gallery["effects"].get(effect.name)
+    if entry is not None:
+        yield from _maps(entry)
     yield "## How small it may be, and what it looks like"
-    if one is None:
-        yield f"The example ({found['plan']}) has no numbers of it: its exposures do not show it, or were not asked."
+    if entry is None:
+        yield f"The example ({gallery['plan']}) has no numbers of it: its exposures do not show it, or were not asked."
     else:
-        yield f"In a run of {found['plan']}:"
-        yield "\n".join(_sizes(one))
+        yield f"In a run of {gallery['plan']}:"
+        yield "\n".join(_sizes(entry))
     if effect.separated_by:
         yield f"**Told apart by** {effect.separated_by}."
-    if effect.reference and "\nSource" not in said:
+    if effect.reference and "\nSource" not in head:
         yield f"Source: {effect.reference}."
 
 
-def _maps(one: Mapping[str, Any]) -> Iterator[str]:
+def _maps(entry: Mapping[str, Any]) -> Iterator[str]:
     """Changes of the maps of the instrument matrix, at its usual size."""
     yield "## What it does to the maps"
-    size = f"{one['parameter']} = {one['usual']:g}{_unit(one)}"
-    if any(value >= _NOTHING for value in one["maps"].values()):
+    size = f"{entry['parameter']} = {entry['usual']:g}{_unit(entry)}"
+    if any(value >= _NOTHING for value in entry["maps"].values()):
         yield f"At {size} the elements of the instrument matrix change by (rms over the field, per cent)"
-        yield from _table(tuple(one["maps"]), [tuple(f"{value:.2g}" for value in one["maps"].values())])
+        yield from _table(tuple(entry["maps"]), [tuple(f"{value:.2g}" for value in entry["maps"].values())])
     else:
         yield f"Nothing: at {size} it disturbs the calibration data, not the light of the stars."
 
 
-def _sizes(one: Mapping[str, Any]) -> Iterator[str]:
-    least, most = one["found"]
-    seldom = f", {most:.2g} in the shape that shows least" if most > 1.05 * least else ""
-    yield f"- found, 99 times in 100, from {one['parameter']} = {least:.2g}{_unit(one)} on{seldom}"
-    named = one["named"]
-    if named is None or named > 1e3 * most:
+def _sizes(entry: Mapping[str, Any]) -> Iterator[str]:
+    smallest, largest = entry["found"]
+    seldom = f", {largest:.2g} in the shape that shows least" if largest > 1.05 * smallest else ""
+    yield f"- found, 99 times in 100, from {entry['parameter']} = {smallest:.2g}{_unit(entry)} on{seldom}"
+    named = entry["named"]
+    if named is None or named > 1e3 * largest:
         yield "- named alone at no size: the first effect below makes the same pattern there"
     else:
-        yield f"- named alone, 99 times in 100, from {named:.2g}{_unit(one)} on{', in every shape' if seldom else ''}"
-    for rival, separation in one["rivals"]:
+        yield f"- named alone, 99 times in 100, from {named:.2g}{_unit(entry)} on{', in every shape' if seldom else ''}"
+    for rival, separation in entry["rivals"]:
         verdict = "can be mistaken for" if separation < _UNSEEN else f"{separation:.1f} σ away from"
         yield f"- at the size from which it is found, {verdict} `{rival}`"
 
 
-def _unit(one: Mapping[str, Any]) -> str:
-    return f" {one['unit']}" if one["unit"] else ""
+def _unit(entry: Mapping[str, Any]) -> str:
+    return f" {entry['unit']}" if entry["unit"] else ""
 
 
 def _element(kind: type[Element]) -> Iterator[str]:
@@ -132,12 +131,12 @@ def _element(kind: type[Element]) -> Iterator[str]:
 
 def _head_text(kind: type[Any]) -> str:
     """The text with its equation: of the class, or of the head of its file."""
-    own = inspect.cleandoc(kind.__doc__ or "")
-    return own if "\nEquation " in own else inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "")
+    text = inspect.cleandoc(kind.__doc__ or "")
+    return text if "\nEquation " in text else inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "")
 
 
 def _indented(head: str) -> Iterator[str]:
-    """Equation and symbols, as they stand in the head of a file."""
+    """Equation and symbols, as in the head of a file."""
     if head:
         yield "\n".join(f"    {line}".rstrip() for line in head.splitlines())
 

@@ -1,4 +1,4 @@
-"""Instruments: a light path with its place and its field, and how one is made of a description."""
+"""Instruments: a light path with its place and its field, and its construction from a description."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ class Instrument(LightPath):
     """A light path with its place and its field.
 
     Field coordinates reach to ±`field_limit` (deg); `site` is telescope, latitude and longitude (deg, east positive),
-    elevation (m) and MJD of a full Moon, `raster` how the points of a simulated run lie, and how far out (deg).
-    `description` is the text it was described in, empty for an instrument that comes with the package, `source` where
-    its numbers are from; colours and fringes are counted from `wavelength` (µm).
+    elevation (m) and MJD of a full Moon, `raster` the arrangement of the points of a simulated run and its half width
+    (deg). `description` is the text of its description, empty for a shipped instrument, `source` the origin of its
+    numbers; colours and fringes are relative to `wavelength` (µm).
 
     >>> walop.Instrument.read("WALOP-NORTH").cameras.names
     ('O1', 'E1', 'O2', 'E2')
@@ -76,13 +76,13 @@ class Instrument(LightPath):
     def read(cls, source: str | os.PathLike[str], **options: Any) -> Instrument:
         """The instrument of a description file, or a shipped one by name; options as for `build`.
 
-        Raises `DataError`, naming file, table and key, for a file that is wrong.
+        Raises `DataError`, with file, table and key, for an invalid file.
         """
         return build(read_description(source), **options)
 
     @property
     def units(self) -> Units:
-        """Scales that changes over its field and its bands are counted in."""
+        """Scales of changes over its field and its bands."""
         return Units(self.throughput.scale, self.wavelength)
 
     def mueller(
@@ -97,9 +97,9 @@ class Instrument(LightPath):
 
         Differentiable in field position (deg), wavelength (µm) and the numbers of the instrument. `angles` (deg) are
         those of moving elements in the beam, by the prefix of their columns ({"CHWP": 45.0}); the others are out.
-        `conditions` are those of `ray.CONDITIONS` that the optics depend on (temperature in Celsius, hour_angle in h).
-        Raises ValueError for a moving element that the instrument does not have, and `NotPlannedError` for a condition
-        that is missing, RuntimeError when float64 is switched off.
+        `conditions` are the relevant ones of `ray.CONDITIONS` (temperature in Celsius, hour_angle in h).
+        Raises ValueError for an unknown moving element, `NotPlannedError` for a missing condition, and RuntimeError
+        when float64 is switched off.
         """
         need_float64("the Mueller matrix")
         instrument, angles = self.patched(), dict(angles or {})
@@ -116,9 +116,9 @@ class Instrument(LightPath):
         ahead, *inside = fold.in_state(common, arms, moving, state)
         of_arm = []
         for behind in inside:
-            whole = fold.product((*ahead, *behind))
-            whole = jnp.eye(4) if whole is None else whole
-            of_arm.append(jnp.broadcast_to(whole, (len(nodes), 4, 4)).reshape(*jnp.shape(wavelength), 4, 4))
+            matrix = fold.product((*ahead, *behind))
+            matrix = jnp.eye(4) if matrix is None else matrix
+            of_arm.append(jnp.broadcast_to(matrix, (len(nodes), 4, 4)).reshape(*jnp.shape(wavelength), 4, 4))
         place = {camera: i for i, arm in enumerate(instrument.arms) for camera in arm.analyser.cameras}
         return jnp.stack([of_arm[place[camera]] for camera in instrument.cameras.names])
 
@@ -127,13 +127,13 @@ class Instrument(LightPath):
 
 
 def build(description: Description, *, elements: Sequence[type[Element]] = (), **options: Any) -> Instrument:
-    """The instrument that a description describes, at the values that it gives; options as for `adapted`.
+    """The instrument of a description, at the values of the description; options as for `adapted`.
 
-    `elements` are further kinds of elements that the description may name. Raises `DataError`, naming table and key,
-    for what does not exist or would do nothing where it stands.
+    `elements` are further kinds of elements for the description. Raises `DataError`, with table and key, for unknown
+    elements and for elements without effect at their places.
     """
     common, arms, throughput, cameras = parts(description, elements)
-    every = (*common, *(element for _, inside, _ in arms for element in inside))
+    all_elements = (*common, *(element for _, inside, _ in arms for element in inside))
     instrument = Instrument(
         name=description.name,
         sources=sources(),
@@ -145,7 +145,7 @@ def build(description: Description, *, elements: Sequence[type[Element]] = (), *
         field_limit=description.field_limit,
         site=description.place,
         raster=(description.raster, description.edge),
-        description="" if description.name in shipped() else with_origins(description.text, every),
+        description="" if description.name in shipped() else with_origins(description.text, all_elements),
         wavelength=description.wavelength or REFERENCE_WAVELENGTH,
         source=description.source if description.source != NO_SOURCE else "",
     )
@@ -164,8 +164,8 @@ def adapted(
     """An instrument for the data at hand.
 
     `standards` are (name, q, u) in the equatorial frame, or the source itself; `plates` is the model of the wave
-    plates, `throughput_degree` that of the series, `throughput` the level of all cameras; None leaves what the
-    instrument says. Raises ValueError for an unknown plate model.
+    plates, `throughput_degree` that of the series, `throughput` the level of all cameras; None keeps those of the
+    instrument. Raises ValueError for an unknown plate model.
     """
     instrument = instrument.with_source(_standards(standards))
     if plates is not None:
@@ -179,8 +179,7 @@ def adapted(
     coefficients = np.zeros((len(instrument.cameras), len(legendre.terms(degree))))
     coefficients[:, 0] = level
     return dataclasses.replace(
-        instrument,
-        throughput=dataclasses.replace(series, degree=degree, coefficients=array(coefficients)),
+        instrument, throughput=dataclasses.replace(series, degree=degree, coefficients=array(coefficients))
     )
 
 
@@ -195,7 +194,7 @@ def nominal_instrument(name: str | None = None, **options: Any) -> Instrument:
 
 
 def sources() -> tuple[Source, ...]:
-    """The sources that every instrument can look at."""
+    """The sources of every instrument."""
     return tuple(_standards(()) if kind is Standards else kind() for kind in SOURCES)
 
 
@@ -207,7 +206,7 @@ def _standards(stars: Standards | Sequence[STAR]) -> Standards:
 
 
 def _check(instrument: Instrument, read: Reader) -> None:
-    """Raise `DataError` for a part that would do nothing where it stands, and for a name that is there twice."""
+    """Raise `DataError` for a part without effect at its place, and for a duplicate name."""
     for element in instrument.elements:
         if isinstance(element, Analyser):
             raise read.fault(
@@ -219,10 +218,10 @@ def _check(instrument: Instrument, read: Reader) -> None:
     for arm in instrument.arms:
         for element in arm.train():
             if isinstance(element, Analyser | Polariser):
-                where = "ends its arm" if isinstance(element, Analyser) else "stands ahead of the arms"
+                where = "ends its arm" if isinstance(element, Analyser) else "must be ahead of the arms"
                 raise read.fault(f"arms.{arm.name}.elements.{element.name}", f"a {element.kind} {where}")
-    parts = itertools.chain(instrument.sources, instrument.elements, instrument.arms)
-    for name, count in Counter([*(part.name for part in parts), *TAKEN]).items():
+    components = itertools.chain(instrument.sources, instrument.elements, instrument.arms)
+    for name, count in Counter([*(component.name for component in components), *TAKEN]).items():
         if count > 1:
             raise read.fault(name, "more than one part of the instrument has this name; give it another one")
     for name, count in Counter(parameter.name for parameter in leaves(instrument)).items():

@@ -1,19 +1,19 @@
-"""Laws of parameters: how a number of an instrument may change with time. Data; `algebra` computes with them.
+"""Laws of parameters: changes of the numbers of an instrument with time. Data; `algebra` computes with them.
 
-    shared      one value for all nights; what holds if nothing is said
+    shared      one value for all nights; the default
     night       a value for every night      } `spread`: standard deviation of the values about their mean;
     file        a value for every file       } without it every value has the prior of the parameter, if there is one
-    walk        a random walk: what it gains in Δt days has standard deviation `rate` √Δt
+    walk        a random walk: its increments over Δt days have standard deviation `rate` √Δt
     interval    a value up to the first date of `at`, another up to the second, …
     step        another value from every date of `at` on
     bad         another value between the two dates of every entry of `bad`: a night that differs
     linear      a drift, per year of 365.25 days
     annual      a cosine and a sine with that period
 
-In a model file a table [law.NAME] holds that of a parameter or, with * and ?, of a group of them (docs: nights).
+In a model file a table [law.NAME] holds the law of a parameter or, with * and ?, of a group of them (docs: nights).
 
-Dates are MJD (UTC); an interval holds its first moment and not its last. Steps, bad nights, drifts and annual terms are
-added to what holds otherwise. A candidate (an amplitude beyond the model) is absent unless it has a law; one with steps
+Dates are MJD (UTC); an interval contains its first moment and not its last. Steps, bad nights, drifts and annual terms
+are added to the other law. A candidate (an amplitude beyond the model) is absent unless it has a law; one with steps
 or bad nights alone is 0 before and after.
 """
 
@@ -64,7 +64,7 @@ ALWAYS = Form("window")
 class Law:
     """Allowed changes of a parameter. `per` are words of the table above, `rate` per √day, `at` and `bad` MJD.
 
-    Raises ValueError for words that do not go together and for numbers that are missing or of no use.
+    Raises ValueError for words that exclude each other and for numbers that are missing or unused.
     """
 
     per: tuple[str, ...] = ("shared",)
@@ -81,11 +81,11 @@ class Law:
             raise ValueError(f"per = {list(self.per)}: only one of {', '.join(BASES)} may hold")
         if "interval" in self.per and "step" in self.per:
             raise ValueError("per: interval and step would both use the dates of at; name one")
-        for key, wanted in _NEEDS.items():
-            given, used = getattr(self, key) not in (None, ()), set(self.per) & set(wanted.split(" or "))
-            if given and not used:
-                raise ValueError(f"{key} is used with per = {wanted} only")
-            if used and not given and key != "spread":
+        for key, required in _NEEDS.items():
+            present, used = getattr(self, key) not in (None, ()), set(self.per) & set(required.split(" or "))
+            if present and not used:
+                raise ValueError(f"{key} is used with per = {required} only")
+            if used and not present and key != "spread":
                 raise ValueError(f"per = {sorted(used)[0]!r} needs {key}")
         for key in ("spread", "rate"):
             value = getattr(self, key)
@@ -99,11 +99,11 @@ class Law:
 
     @property
     def base(self) -> str:
-        """The one of `BASES` that holds; "" where nothing but additions is named."""
+        """The base, one of `BASES`; "" for additions alone."""
         return next((word for word in self.per if word in BASES), "")
 
     def forms(self, mean: bool, middle: float) -> Iterator[tuple[Form, bool]]:
-        """Functions of time with one value each, and whether that value has the prior of the parameter.
+        """Functions of time with one value each; True for a value with the prior of the parameter.
 
         `mean`: the parameter has a value when nothing is added; drifts are counted from `middle` (MJD).
         """
@@ -135,15 +135,15 @@ class Law:
         return dataclasses.replace(self, per=tuple(dict.fromkeys((*self.per, word))), at=at, bad=bad)
 
     def seen_at(self, mjd: Any) -> Law:
-        """The law without bad nights that none of some times (MJD) lies in."""
+        """The law without bad nights that contain none of some times (MJD)."""
         bad = tuple((start, stop) for start, stop in self.bad if np.any((mjd >= start) & (mjd < stop)))
         per = self.per if bad or not self.bad else tuple(word for word in self.per if word != "bad")
         return dataclasses.replace(self, per=per, bad=bad)
 
     def document(self) -> dict[str, Any]:
         """The entry of a model file, as plain data."""
-        given = {key: value for key, value in vars(self).items() if value not in (None, ())}
-        return given | {"per": list(self.per)}
+        entries = {key: value for key, value in vars(self).items() if value not in (None, ())}
+        return entries | {"per": list(self.per)}
 
 
 SHARED = Law()
@@ -151,8 +151,8 @@ Laws = Mapping[str, Law]
 
 
 def laws_of(tables: Mapping[str, Any]) -> dict[str, Law]:
-    """The laws of the [law] tables of a model file. Raises ValueError naming the table and key that is wrong."""
-    found, read, hints = {}, Reader(""), typing.get_type_hints(Law)
+    """The laws of the [law] tables of a model file. Raises ValueError, with table and key, for invalid entries."""
+    laws, read, hints = {}, Reader(""), typing.get_type_hints(Law)
     for name, entry in tables.items():
         place = f'law."{name}"'
         if not isinstance(entry, Mapping):
@@ -160,10 +160,10 @@ def laws_of(tables: Mapping[str, Any]) -> dict[str, Law]:
         alone = {key: (entry[key],) for key in ("per", "at") if isinstance(entry.get(key), str | int | float)}
         values = read.values(hints, {**entry, **alone}, place)
         try:
-            found[name] = Law(**values)
+            laws[name] = Law(**values)
         except ValueError as error:
             raise read.fault(place, str(error)) from None
-    return found
+    return laws
 
 
 def resolved(
@@ -171,17 +171,17 @@ def resolved(
 ) -> tuple[Law | None, ...]:
     """A law for every parameter, then for every candidate (None: absent); an exact name wins over a group.
 
-    Candidates that stand `alone` are in no group.
+    Candidates in `alone` belong to no group.
 
-    Raises ValueError for a name or group that nothing bears.
+    Raises ValueError for a name or group without a parameter.
     """
-    found: dict[str, Law | None] = dict.fromkeys(names, SHARED) | dict.fromkeys(candidates, None)
+    assigned: dict[str, Law | None] = dict.fromkeys(names, SHARED) | dict.fromkeys(candidates, None)
     for exact in (False, True):
         for key, law in laws.items():
-            if (key in found) != exact:
+            if (key in assigned) != exact:
                 continue
-            some = [key] if exact else [n for n in fnmatch.filter(found, key) if n not in alone]
-            if not some:
-                raise ValueError(f"[law]: there is no parameter {key!r}; {nearest(key, found)}")
-            found |= dict.fromkeys(some, law)
-    return tuple(found.values())
+            matches = [key] if exact else [n for n in fnmatch.filter(assigned, key) if n not in alone]
+            if not matches:
+                raise ValueError(f"[law]: there is no parameter {key!r}; {nearest(key, assigned)}")
+            assigned |= dict.fromkeys(matches, law)
+    return tuple(assigned.values())

@@ -1,13 +1,13 @@
-"""The light path, from Stokes vector to counts: read this file to know what the package computes.
+"""The light path, from Stokes vector to counts: the forward model of the package.
 
     source → telescope → polariser → train of elements → arms → analysers → cameras → detectors
 
 Everything up to the detectors is linear, so the train is folded backwards, from the analysers to the polariser:
-each element multiplies the rows that the analysers see by its Mueller matrix. What stands directly behind the
-polariser and asks neither for wavelength nor for the exposure leaves the band integral by itself (`leading`) and is
-multiplied afterwards. `band_rows` is all the optics there is, once per field point; `camera_vectors` adds analysers
-and throughput, `counts` is a dot product per exposure. `trace.py` folds the same elements forwards. No effect is
-named here: effects patch the instrument, and the patched instrument is folded.
+each element multiplies the rows of the analysers by its Mueller matrix. Elements directly behind the polariser that
+depend neither on wavelength nor on the exposure are outside the band integral (`leading`) and are multiplied
+afterwards. `band_rows` is all of the optics, once per field point; `camera_vectors` adds analysers
+and throughput, `counts` is a dot product per exposure. `trace.py` folds the same elements forwards. No effect has a
+name here: effects patch the instrument, and the patched instrument is folded.
 
 Units       counts per unit of unpolarised light at unit throughput; angles rad; wavelengths µm; field deg.
 """
@@ -34,7 +34,7 @@ from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays, Sight, Source, turned
 
 FEW_BANDS = 3
-FEW_SETTINGS = 4  # up to which band integrals are done one by one
+FEW_SETTINGS = 4  # up to this number band integrals are computed one by one
 BROAD = 0.05  # µm: equivalent width from which a filter is displaced by `LightPath.filter_shift`
 
 
@@ -52,8 +52,8 @@ class Train(NamedTuple):
 def divided(instrument: LightPath) -> Train:
     """The parts of the common train.
 
-    Leading are the elements behind the polariser up to the first that moves, or that asks for the wavelength or for
-    anything else that differs between exposures; which those are is found by asking them.
+    Leading are the elements behind the polariser up to the first that moves, or that depends on the wavelength or on
+    another quantity of the exposures, as a run on shapes shows.
     """
     behind = instrument.behind_polariser()
     count = _leading(*shapes_of(behind))
@@ -62,7 +62,7 @@ def divided(instrument: LightPath) -> Train:
 
 @functools.lru_cache(maxsize=256)
 def _leading(structure: Any, shapes: Shapes) -> int:
-    """Number of elements that lead; asked once for all numbers that the elements may take."""
+    """Number of leading elements; one run for all values of their numbers."""
     count = 0
 
     def follow(elements: tuple[Element, ...]) -> None:
@@ -83,14 +83,14 @@ def _leading(structure: Any, shapes: Shapes) -> int:
 
 
 def _achromatic(elements: tuple[Element, ...], x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
-    """Mueller matrix of elements that do not ask for the wavelength."""
+    """Mueller matrix of elements independent of wavelength."""
     stations, _ = fold.stations(elements, Ray.entering(x, y))
     matrix = mueller.product(element.mueller(ray) for element, ray in stations)
     return jnp.eye(4) if matrix is None else matrix
 
 
 def telescope(instrument: LightPath, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
-    """Mueller matrix of what light from the sky, and no other, meets ahead of the polariser."""
+    """Mueller matrix of the elements ahead of the polariser, for light from the sky alone."""
     return _achromatic(instrument.patched().telescope(), x, y)
 
 
@@ -140,10 +140,10 @@ def mean_wavelengths(instrument: LightPath, plan: Plan) -> Float[Array, " b"]:
 
 
 def band_rows(instrument: LightPath, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b r 4"]:
-    """Band-integrated Mueller rows (band, row, Stokes): all the optics there is at a field point.
+    """Band-integrated Mueller rows (band, row, Stokes): all of the optics at a field point.
 
-    Rows are what the analysers see, arm by arm: S0, then what is analysed; where the beams of an analyser differ in
-    wavelength, λ ∂/∂λ of all of these behind them. Columns are the light behind the leading elements.
+    Rows are those of the analysers, arm by arm: S0, then the analysed component; where the beams of an analyser differ
+    in wavelength, followed by λ ∂/∂λ of all of these. Columns are the light behind the leading elements.
     """
     instrument = instrument.patched()
     wavelength = node_wavelengths(instrument, plan)
@@ -162,35 +162,35 @@ def integrated(
     """Sums over the nodes of every band, each in its own state."""
     sizes = {last - first for _, first, last in plan.settings}
     if len(sizes) == 1 and len(plan.settings) > FEW_SETTINGS:
-        own = weights.reshape(len(plan.settings), *sizes, -1)
-        bands = jnp.einsum("cbn,...cnrs->...cbrs", own, rows)
+        grouped = weights.reshape(len(plan.settings), *sizes, -1)
+        bands = jnp.einsum("cbn,...cnrs->...cbrs", grouped, rows)
         return bands.reshape(*rows.shape[:-4], len(weights), *rows.shape[-2:])
-    parts = [
+    sums = [
         jnp.einsum("bn,...nrs->...brs", weights[first:last], rows[..., i, :, :, :])
         for i, (_, first, last) in enumerate(plan.settings)
     ]
-    return jnp.concatenate(parts, axis=-3)
+    return jnp.concatenate(sums, axis=-3)
 
 
 def in_bands(
     instrument: LightPath, bands: Float[Array, "b r 4"], mean: Float[Array, " b"]
 ) -> Float[Array, "b r 4"]:
-    """Band-integrated rows with what the analysers do from band to band, at mean wavelengths (µm)."""
+    """Band-integrated rows with balance and loss of the analysers, at mean wavelengths (µm)."""
     analysers = [arm.analyser for arm in instrument.arms]
     if all(analyser.balance is None and analyser.loss is None for analyser in analysers):
         return bands
-    parts = jnp.split(bands, bands.shape[1] // Analyser.rows, axis=1)
+    blocks = jnp.split(bands, bands.shape[1] // Analyser.rows, axis=1)
     return jnp.concatenate(
-        [analysers[i % len(analysers)].in_band(part, mean) for i, part in enumerate(parts)], axis=1
+        [analysers[i % len(analysers)].in_band(block, mean) for i, block in enumerate(blocks)], axis=1
     )
 
 
 def with_dispersion(instrument: LightPath, rows: Callable[[Array], Any], wavelength: Array) -> Any:
-    """Rows at wavelengths, or trees of them, with λ ∂/∂λ behind where the beams of an analyser differ in wavelength."""
+    """Rows at wavelengths, or trees of them, followed by λ ∂/∂λ where the beams of an analyser differ in wavelength."""
     if not is_dispersed(instrument):
         return rows(wavelength)
-    both = jax.jvp(rows, (wavelength,), (wavelength,))
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-2), *both)
+    pair = jax.jvp(rows, (wavelength,), (wavelength,))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-2), *pair)
 
 
 def is_dispersed(instrument: LightPath) -> bool:
@@ -199,7 +199,7 @@ def is_dispersed(instrument: LightPath) -> bool:
 
 
 def _node_rows(instrument: LightPath, plan: Plan, ray: Ray) -> Float[Array, "c n r 4"]:
-    """Rows that the analysers see at every node, in every state."""
+    """Rows of the analysers at every node, in every state."""
     train = divided(instrument)
     for element in train.leading:
         ray = element.ray(ray)
@@ -216,31 +216,31 @@ def camera_vectors(
 ) -> Float[Array, "b k 4"]:
     """Analysis vectors (band, camera, Stokes): counts = vector · Stokes for light of unit flux."""
     instrument = instrument.patched()
-    seen = beams(instrument, rows) @ upstream(instrument, x, y)
-    return behind_throughput(instrument, seen, throughput, x, y)
+    beam_vectors = beams(instrument, rows) @ upstream(instrument, x, y)
+    return behind_throughput(instrument, beam_vectors, throughput, x, y)
 
 
 def beams(instrument: LightPath, rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
-    """Rows of the cameras: what each beam takes of the rows of its analyser."""
+    """Rows of the cameras: shares of each beam in the rows of its analyser."""
     index, shares = _beams(instrument)
-    taken = (shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
-    return functools.reduce(jnp.add, taken)
+    contributions = (shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
+    return functools.reduce(jnp.add, contributions)
 
 
 def behind_throughput(
     instrument: LightPath, beams: Float[Array, "b k 4"], throughput: Float[Array, " k"], x: Scalar, y: Scalar
 ) -> Float[Array, "b k 4"]:
-    """Analysis vectors from the beams of an instrument without effects (`patched`): throughput, and what mixes them."""
-    for part in instrument.cameras.transmission:
-        throughput = throughput * part.factors(x, y)
+    """Analysis vectors from the beams of an instrument without effects (`patched`): throughput, and mixing."""
+    for component in instrument.cameras.transmission:
+        throughput = throughput * component.factors(x, y)
     vectors = throughput[:, None] * beams
-    for part in instrument.cameras.mixing:
-        vectors = part.vectors(vectors, x, y)
+    for component in instrument.cameras.mixing:
+        vectors = component.vectors(vectors, x, y)
     return vectors
 
 
 def _beams(instrument: LightPath) -> tuple[Int[np.ndarray, "k j"], Float[Array, "k j"]]:
-    """For each camera the rows that its beam is made of, and what it takes of each."""
+    """For each camera the rows of its beam, and its share of each."""
     analysers = [arm.analyser for arm in instrument.arms]
     names = [name for analyser in analysers for name in analyser.cameras]
     order = np.array([names.index(name) for name in instrument.cameras.names])
@@ -264,17 +264,17 @@ def _beams(instrument: LightPath) -> tuple[Int[np.ndarray, "k j"], Float[Array, 
 def stokes(instrument: LightPath, sight: Sight) -> Float[Array, "e 4"]:
     """Stokes vectors behind the place of the polariser, one per exposure, at a field point.
 
-    Light through the polariser forgets its past; what does not come from the sky does not meet the telescope.
+    Light through the polariser keeps no memory of its source; only light from the sky passes the telescope.
     """
     instrument = instrument.patched()
     exposures, x, y = sight.exposures, sight.x, sight.y
     sight = _turned(instrument, sight)
-    taken = jnp.zeros(exposures.kind.shape, bool)
-    qu = jnp.zeros((*taken.shape, 2))
-    for one in instrument.sources:
-        if type(one).polarisation is not Source.polarisation:
-            seen = one.shines(sight) & ~taken
-            qu, taken = jnp.where(seen[:, None], one.polarisation(sight), qu), taken | seen
+    assigned = jnp.zeros(exposures.kind.shape, bool)
+    qu = jnp.zeros((*assigned.shape, 2))
+    for source in instrument.sources:
+        if type(source).polarisation is not Source.polarisation:
+            shining = source.shines(sight) & ~assigned
+            qu, assigned = jnp.where(shining[:, None], source.polarisation(sight), qu), assigned | shining
     light = _at_polariser(instrument, sight, jnp.ones_like(exposures.clp_angle), qu)
     polariser = instrument.polariser
     if polariser is None:
@@ -283,7 +283,7 @@ def stokes(instrument: LightPath, sight: Sight) -> Float[Array, "e 4"]:
 
 
 def stokes_slopes(instrument: LightPath, sight: Sight) -> Float[Array, "e 4"]:
-    """Change of the Stokes vectors with wavelength (per µm) inside a band: standards are of no single colour."""
+    """Change of the Stokes vectors with wavelength (per µm) inside a band, for the colours of standards."""
     instrument = instrument.patched()
     exposures, sight = sight.exposures, _turned(instrument, sight)
     dark = jnp.zeros_like(exposures.clp_angle)
@@ -294,7 +294,7 @@ def stokes_slopes(instrument: LightPath, sight: Sight) -> Float[Array, "e 4"]:
 def _at_polariser(
     instrument: LightPath, sight: Sight, intensity: Float[Array, " e"], qu: Float[Array, "e 2"]
 ) -> Float[Array, "e 4"]:
-    """Light of an intensity and polarisation behind what light from the sky meets ahead of the polariser."""
+    """Light of an intensity and polarisation behind the telescope and the films of light from the sky."""
     exposures, x, y = sight.exposures, sight.x, sight.y
     light = jnp.stack([intensity, qu[:, 0], qu[:, 1], jnp.zeros_like(intensity)], axis=-1)
     if instrument.telescope():
@@ -332,9 +332,7 @@ def counts(
     exposures, x, y = sight.exposures, sight.x, sight.y
     vectors = camera_vectors(instrument, rows, throughput, x, y)
     light = stokes(instrument, sight)
-    if (
-        len(vectors) <= FEW_BANDS
-    ):  # a product of matrices, where picking vectors would copy them for every exposure
+    if len(vectors) <= FEW_BANDS:  # a matrix product: indexing would copy the vectors for every exposure
         in_band = jax.nn.one_hot(band, len(vectors), dtype=light.dtype)
         result = jnp.einsum("bks,eb,es->ek", vectors, in_band, light)
     else:
@@ -342,9 +340,9 @@ def counts(
     if exposures.slope_band is not None:
         slopes = stokes_slopes(instrument, sight)
         result = result + jnp.einsum("eks,es->ek", vectors[exposures.slope_band], slopes)
-    for part in instrument.cameras.exposures:
-        result = result * part.factors(exposures, x, y)
-        result = result + vectors[band, :, 0] * part.share(exposures, x, y)
+    for gain in instrument.cameras.exposures:
+        result = result * gain.factors(exposures, x, y)
+        result = result + vectors[band, :, 0] * gain.share(exposures, x, y)
     return result
 
 
@@ -359,9 +357,9 @@ def with_ghosts(
     opposite: Float[Array, "e k"],
     source: Int[Array, " e"],
 ) -> Float[Array, "e k"]:
-    """Counts for light of unit flux with what the cameras see of the opposite field point, `opposite`."""
-    for part in instrument.patched().cameras.ghosts:
-        counts = counts + part.seen(source < 0, opposite)
+    """Counts for light of unit flux with ghosts of those at the opposite field point, `opposite`."""
+    for ghost in instrument.patched().cameras.ghosts:
+        counts = counts + ghost.seen(source < 0, opposite)
     return counts
 
 
@@ -373,13 +371,13 @@ def is_linear(instrument: LightPath) -> bool:
 def detected(
     instrument: LightPath, exposures: ExposureArrays, counts: Float[Array, "e k"]
 ) -> Float[Array, "e k"]:
-    """Counts that the detectors report for counts in electrons: the one stage that is not linear in the light."""
-    for part in instrument.patched().cameras.detectors:
-        counts = part.reported(counts, exposures)
+    """Counts reported by the detectors for counts in electrons: the only stage non-linear in the light."""
+    for detector in instrument.patched().cameras.detectors:
+        counts = detector.reported(counts, exposures)
     return counts
 
 
-# --------------------------------------------------------------------------------------- what users ask for
+# --------------------------------------------------------------------------------------- the instrument matrix
 
 
 def instrument_matrix(

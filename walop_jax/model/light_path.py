@@ -1,7 +1,7 @@
-"""The light path: sources, the train of elements, its arms, the cameras, and the effects that were added to it.
+"""The light path: sources, the train of elements, its arms, the cameras, and its effects.
 
-Nothing here computes light: `light.py` folds it. An effect is a patch: `patched` is the light path with what the
-effects change, and everything that asks for light asks the patched one.
+Nothing here computes light: `light.py` folds it. An effect is a patch: `patched` is the light path with the
+changes of the effects, and all computations of light use it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ AnyPart = TypeVar("AnyPart", bound=Component)
 
 
 class NoSuchPlaceError(ValueError):
-    """An effect asks for an element that this instrument does not have."""
+    """An effect on an element that this instrument does not have."""
 
 
 class Arm(Component):
@@ -48,7 +48,7 @@ class Arm(Component):
 
     @property
     def analyser(self) -> Analyser:
-        """The element that ends it."""
+        """Its last element."""
         last = _member(self.elements, self.path[-1], f"element of arm {self.name}")
         if not isinstance(last, Analyser):
             raise ValueError(f"arm {self.name}: its path must end with an analyser, not with {last.name!r}")
@@ -56,9 +56,9 @@ class Arm(Component):
 
 
 class LightPath(Component):
-    """Everything that light meets, and all that is fitted. `path` names the elements ahead of the arms in their order.
+    """All optics, sources and cameras of a fit. `path` names the elements ahead of the arms in their order.
 
-    `rotator_zero` (deg) is added to ROTATOR, `filter_shift` (µm) displaces broad bands; None: there is none.
+    `rotator_zero` (deg) is added to ROTATOR, `filter_shift` (µm) displaces broad bands; None: none.
     """
 
     name: str = eqx.field(static=True)
@@ -71,9 +71,9 @@ class LightPath(Component):
     effects: tuple[Any, ...] = ()  # patches: `effects.base.Effect`
     rotator_zero: Scalar | None = number(unit="deg", about="true ROTATOR minus the header's", default=None)
     filter_shift: Scalar | None = number(unit="um", about="displacement of broad bands", default=None)
-    sky_films: tuple[Any, ...] = ()  # what light from the sky meets in single exposures (`optics.SkyFilm`)
+    sky_films: tuple[Any, ...] = ()  # changes of light from the sky in single exposures (`optics.SkyFilm`)
 
-    # ------------------------------------------------------------------------------- asking for parts
+    # ------------------------------------------------------------------------------- parts
 
     def train(self) -> Iterator[Element]:
         """The elements ahead of the arms, in the order light meets them."""
@@ -86,9 +86,9 @@ class LightPath(Component):
         return next((element for element in self.train() if isinstance(element, Polariser)), None)
 
     def telescope(self) -> tuple[Element, ...]:
-        """The elements ahead of the polariser, which only light from the sky meets; none where there is no polariser.
+        """The elements ahead of the polariser, in light from the sky alone; none without a polariser.
 
-        Raises ValueError for one that moves, bends the ray or depends on the wavelength: that is not computed there.
+        Raises ValueError for one that moves, bends the ray or depends on wavelength or exposure.
         """
         if self.polariser is None:
             return ()
@@ -96,25 +96,25 @@ class LightPath(Component):
         for element in elements:
             if element.moves or type(element).ray is not Element.ray or not _is_achromatic(element):
                 raise ValueError(
-                    f"element {element.name!r} stands ahead of the polariser, where nothing may move, bend the ray "
+                    f"element {element.name!r} is ahead of the polariser, where nothing may move, bend the ray "
                     "or depend on wavelength or exposure; put it behind the polariser"
                 )
         return elements
 
     def behind_polariser(self) -> tuple[Element, ...]:
-        """The elements behind the polariser, all where there is none."""
+        """The elements behind the polariser; all elements without a polariser."""
         return tuple(self.train())[len(self.telescope()) + (self.polariser is not None) :]
 
     @property
     def standard(self) -> Standards:
         """The standard stars."""
-        found = _member(self.sources, Standards.name, "source")
-        assert isinstance(found, Standards)
-        return found
+        source = _member(self.sources, Standards.name, "source")
+        assert isinstance(source, Standards)
+        return source
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """KINDs of exposures that it can look at."""
+        """KINDs of exposures of its sources."""
         return tuple(source.kind for source in self.sources)
 
     def element(self, place: str) -> Element:
@@ -135,9 +135,11 @@ class LightPath(Component):
 
     def moving(self) -> tuple[str, ...]:
         """Prefixes of the columns of the moving elements behind the polariser, common train first."""
-        parts = [*self.train(), *(element for arm in self.arms for element in arm.train())]
-        found = [element.moves for element in parts if element.moves and not isinstance(element, Polariser)]
-        return tuple(dict.fromkeys(found))
+        elements = [*self.train(), *(element for arm in self.arms for element in arm.train())]
+        prefixes = [
+            element.moves for element in elements if element.moves and not isinstance(element, Polariser)
+        ]
+        return tuple(dict.fromkeys(prefixes))
 
     @property
     def plates(self) -> str | None:
@@ -155,7 +157,7 @@ class LightPath(Component):
     # ------------------------------------------------------------------------------- changing it
 
     def patched(self) -> Self:
-        """The instrument with what its effects change, and no effects any more."""
+        """The instrument with the changes of its effects, which are removed."""
         bare = dataclasses.replace(self, effects=())
         return functools.reduce(lambda instrument, effect: effect.patch(instrument), self.effects, bare)
 
@@ -163,7 +165,7 @@ class LightPath(Component):
         """The instrument with fields of one part replaced.
 
         `place` is a name with dots: an element, an arm's element ("half1.plate"), a layer of it
-        ("half1.plate.mgf2"), a source, or "" for the light path itself. A function is applied to what was there.
+        ("half1.plate.mgf2"), a source, or "" for the light path itself. A function is applied to the old value.
         Raises `NoSuchPlaceError` where the instrument has no such part.
         """
         return _changed(self, place.split(".") if place else [], fields, place)
@@ -171,7 +173,7 @@ class LightPath(Component):
     def inserted(self, element: Element, *, before: str = "", after: str = "") -> Self:
         """The instrument with one more element directly before or after another one ("half1.plate" in an arm).
 
-        A name that is taken gets a number. Raises `NoSuchPlaceError` where there is no such element.
+        A duplicate name gets a number. Raises `NoSuchPlaceError` where there is no such element.
         """
         where, _, neighbour = (before or after).rpartition(".")
         if where:
@@ -179,7 +181,7 @@ class LightPath(Component):
             if arm is None:
                 raise NoSuchPlaceError(f"the instrument has no arm {where!r}")
             holder = _inserted(arm, element, neighbour, bool(after))
-            arms = tuple(holder if one.name == where else one for one in self.arms)
+            arms = tuple(holder if candidate.name == where else candidate for candidate in self.arms)
             return dataclasses.replace(self, arms=arms)
         return _inserted(self, element, neighbour, bool(after))
 
@@ -193,11 +195,12 @@ class LightPath(Component):
 
     def with_source(self, source: Source) -> Self:
         """The instrument with a source of one more KIND, or with one of its sources replaced."""
-        others = tuple(one for one in self.sources if one.name != source.name)
-        if len(others) == len(self.sources):
+        remaining = tuple(present for present in self.sources if present.name != source.name)
+        if len(remaining) == len(self.sources):
             return dataclasses.replace(self, sources=(*self.sources, source))
         return dataclasses.replace(
-            self, sources=tuple(source if one.name == source.name else one for one in self.sources)
+            self,
+            sources=tuple(source if present.name == source.name else present for present in self.sources),
         )
 
 
@@ -221,25 +224,25 @@ def _name(member: Any) -> str:
     return member.name
 
 
-def _changed(part: AnyPart, rest: list[str], fields: dict[str, Any], place: str) -> AnyPart:
-    if not rest:
-        known = [field.name for field in dataclasses.fields(part)]
-        check_names(f"field of {place or 'the instrument'}", fields, known)
+def _changed(part: AnyPart, path: list[str], fields: dict[str, Any], place: str) -> AnyPart:
+    if not path:
+        names = [field.name for field in dataclasses.fields(part)]
+        check_names(f"field of {place or 'the instrument'}", fields, names)
         new = {
             name: value(getattr(part, name)) if callable(value) else value for name, value in fields.items()
         }
         return dataclasses.replace(part, **new)
-    known = []
+    names = []
     for field in dataclasses.fields(part):
         members = getattr(part, field.name)
         if field.metadata.get("static", False) or not isinstance(members, tuple):
             continue
-        known += [_name(member) for member in members if isinstance(member, Element | Arm)]
+        names += [_name(member) for member in members if isinstance(member, Element | Arm)]
         for i, member in enumerate(members):
-            if isinstance(member, Component) and _name(member) == rest[0]:
-                new = (*members[:i], _changed(member, rest[1:], fields, place), *members[i + 1 :])
+            if isinstance(member, Component) and _name(member) == path[0]:
+                new = (*members[:i], _changed(member, path[1:], fields, place), *members[i + 1 :])
                 return dataclasses.replace(part, **{field.name: new})
-    raise NoSuchPlaceError(f"the instrument has no part {place!r}; {nearest(rest[0], known)}")
+    raise NoSuchPlaceError(f"the instrument has no part {place!r}; {nearest(path[0], names)}")
 
 
 def _inserted(holder: Any, element: Element, neighbour: str, after: bool) -> Any:

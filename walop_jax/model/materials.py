@@ -1,13 +1,13 @@
 """Refractive indices of the glasses and crystals in the light path.
 
 Equations   Sellmeier formula 1, n² = 1 + Σ B λ²/(λ² − C²) (Dodge, Radhakrishnan; Li with a constant), and formula 2,
-            n² = A + Σ B λ²/(λ² − C) (Schott, Ghosh). Mixing the two up is the classic mistake; `_formula_1` says which
-            is which.
+            n² = A + Σ B λ²/(λ² − C) (Schott, Ghosh). Mixing the two up is the classic mistake; `_formula_1` marks
+            the first.
 Symbols     λ vacuum wavelength [µm]; n refractive index; A, B dimensionless; C [µm] in formula 1, [µm²] in 2.
 Sources     beside the numbers; the curves as transcribed in the refractiveindex.info database. They were measured at
             20 °C (N-BK7), 19 °C (MgF2), 18 °C (quartz_1951) and 20 °C (mgf2_1980), over the `measured` wavelengths.
-Limits      up to `EXTRAPOLATED` times beyond the measured wavelengths a fit remarks on it; farther away, toward the
-            poles of the formulae, no light path is computed.
+Limits      up to `EXTRAPOLATED` times beyond the measured wavelengths a fit adds a remark; farther away, toward the
+            poles of the formulae, light paths are refused.
 """
 
 from __future__ import annotations
@@ -96,11 +96,8 @@ CRYSTALS = {
     ),
     "mgf2": Crystal(MGF2_O, MGF2_E, MGF2_THERMAL, (0.2, 7.0), f"Dodge 1984, Appl. Opt. 23, 1980; {_ETZEL}"),
 }
-OTHER_CURVES = {
-    "quartz": {"quartz_1951": "Radhakrishnan 1951"},
-    "mgf2": {"mgf2_1980": "Li 1980"},
-}
-"""Crystals with the same name to a reader and another published dispersion: what a description may have meant."""
+OTHER_CURVES = {"quartz": {"quartz_1951": "Radhakrishnan 1951"}, "mgf2": {"mgf2_1980": "Li 1980"}}
+"""Crystals under the same everyday name with another published dispersion: possible meanings of a description."""
 CRYSTALS |= {
     "quartz_1951": Crystal(
         QUARTZ_O_1951,
@@ -119,4 +116,4 @@ CRYSTALS |= {
 }
 GLASSES = {"BK7": Glass(BK7, (0.3, 2.5), "Schott 2017, data sheet of N-BK7")}
 MATERIALS: Mapping[str, Crystal | Glass] = CRYSTALS | GLASSES
-"""Materials that a description file may name."""
+"""Materials of description files."""

@@ -52,12 +52,12 @@ def _matrix(*rows: tuple[Scalar, ...]) -> Float[Array, "... 4 4"]:
 
 
 def product(matrices: Iterable[Float[Array, "... 4 4"] | None]) -> Float[Array, "... 4 4"] | None:
-    """Product of Mueller matrices in the order light meets them; None: the identity."""
-    whole = None
+    """Product of Mueller matrices in the order of the light path; None: the identity."""
+    result = None
     for matrix in matrices:
         if matrix is not None:
-            whole = matrix if whole is None else matrix @ whole
-    return whole
+            result = matrix if result is None else matrix @ result
+    return result
 
 
 def from_jones(jones: Matrix2) -> Float[Array, "... 4 4"]:
@@ -91,9 +91,9 @@ def diattenuator(q: Scalar, u: Scalar, v: Scalar | float = 0.0) -> Float[Array, 
     """
     q, u, v = jnp.broadcast_arrays(q, u, v)
     root = jnp.sqrt(1.0 - q**2 - u**2 - v**2)
-    k, one = 1.0 / (1.0 + root), jnp.ones_like(root)
+    k, ones = 1.0 / (1.0 + root), jnp.ones_like(root)
     return _matrix(
-        (one, q, u, v),
+        (ones, q, u, v),
         (q, root + k * q**2, k * q * u, k * q * v),
         (u, k * q * u, root + k * u**2, k * u * v),
         (v, k * q * v, k * u * v, root + k * v**2),
@@ -108,21 +108,24 @@ def retarder(delta: Scalar, axis: Scalar) -> Float[Array, "... 4 4"]:
     delta, axis = jnp.broadcast_arrays(delta, axis)
     c2, s2 = jnp.cos(2 * axis), jnp.sin(2 * axis)
     cd, sd = jnp.cos(delta), jnp.sin(delta)
-    one, zero = jnp.ones_like(delta), jnp.zeros_like(delta)
+    ones, zeros = jnp.ones_like(delta), jnp.zeros_like(delta)
     return _matrix(
-        (one, zero, zero, zero),
-        (zero, c2**2 + s2**2 * cd, c2 * s2 * (1 - cd), -s2 * sd),
-        (zero, c2 * s2 * (1 - cd), c2**2 * cd + s2**2, c2 * sd),
-        (zero, s2 * sd, -c2 * sd, cd),
+        (ones, zeros, zeros, zeros),
+        (zeros, c2**2 + s2**2 * cd, c2 * s2 * (1 - cd), -s2 * sd),
+        (zeros, c2 * s2 * (1 - cd), c2**2 * cd + s2**2, c2 * sd),
+        (zeros, s2 * sd, -c2 * sd, cd),
     )
 
 
 def rotation(angle: Scalar) -> Float[Array, "... 4 4"]:
     """Stokes parameters referred to axes turned by `angle` (rad): the matrix M_rot(angle) of Paper II."""
     c2, s2 = jnp.cos(2 * angle), jnp.sin(2 * angle)
-    one, zero = jnp.ones_like(c2), jnp.zeros_like(c2)
+    ones, zeros = jnp.ones_like(c2), jnp.zeros_like(c2)
     return _matrix(
-        (one, zero, zero, zero), (zero, c2, s2, zero), (zero, -s2, c2, zero), (zero, zero, zero, one)
+        (ones, zeros, zeros, zeros),
+        (zeros, c2, s2, zeros),
+        (zeros, -s2, c2, zeros),
+        (zeros, zeros, zeros, ones),
     )
 
 
@@ -149,10 +152,10 @@ def general_retarder(q: Scalar, u: Scalar, v: Scalar | float = 0.0) -> Float[Arr
     s = jnp.where(small, 1.0 - square / 6.0 + square**2 / 120.0, jnp.sin(length) / length)
     half = jnp.sin(0.5 * length) / (0.5 * length)
     c = jnp.where(small, 0.5 - square / 24.0 + square**2 / 720.0, 0.5 * half**2)
-    one, zero = jnp.ones_like(square), jnp.zeros_like(square)
+    ones, zeros = jnp.ones_like(square), jnp.zeros_like(square)
     return _matrix(
-        (one, zero, zero, zero),
-        (zero, one - c * (u**2 + v**2), c * q * u + s * v, c * q * v - s * u),
-        (zero, c * q * u - s * v, one - c * (q**2 + v**2), c * u * v + s * q),
-        (zero, c * q * v + s * u, c * u * v - s * q, one - c * (q**2 + u**2)),
+        (ones, zeros, zeros, zeros),
+        (zeros, ones - c * (u**2 + v**2), c * q * u + s * v, c * q * v - s * u),
+        (zeros, c * q * u - s * v, ones - c * (q**2 + v**2), c * u * v + s * q),
+        (zeros, c * q * v + s * u, c * u * v - s * q, ones - c * (q**2 + u**2)),
     )

@@ -1,10 +1,9 @@
-"""Parameters that know their unit, meaning, source and prior; names derived from the tree that holds them.
+"""Parameters with unit, meaning, source and prior; their names follow from their tree.
 
-`Parameter` is the one record of a number. A component declares what it can be asked about in two ways. `param` declares
-a parameter for good: whoever holds the component has it. `number` declares a number that an instrument may leave fixed;
-which of them are parameters, with which prior and from which source, its description says (`Element.declared`). Nobody
-types a second list of names: they follow from the tree. The value in the tree carries the unit of the declaration (e.g.
-um or deg), conversions stand in the equations.
+`Parameter` is the only record of a number. A component declares its numbers in two ways. `param` declares a permanent
+parameter of every instance. `number` declares a number that an instrument may keep fixed; its description lists the
+parameters among them, with prior and source (`Element.declared`). There is no second list of names: they follow from
+the tree. The value in the tree has the unit of the declaration (e.g. um or deg), conversions are part of the equations.
 """
 
 from __future__ import annotations
@@ -32,22 +31,22 @@ SEVERAL = "walop_jax.several"
 Vector = Float[Array, " n"]
 Shapes = tuple[tuple[tuple[int, ...], str], ...]
 NAME = re.compile(r"[A-Za-z0-9_.+*-]+")
-"""The names that a parameter may have, in a model as in every file that is written or read."""
+"""Valid names of parameters, in models and in files."""
 
 AnyComponent = TypeVar("AnyComponent", bound="Component")
 
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """One number of an instrument: what it is called, what is known of it, whether it varies.
+    """One number of an instrument: name, prior knowledge, freedom.
 
-    `prior` is (mean, standard deviation) or None, `scale` the step that a solver should think in, `loose` the width of
-    a very weak pull toward `start`, which keeps combinations that the data hardly see from running away and is no prior
-    knowledge; `tie` is the name of the parameter whose value this one takes. `part` is the place of what holds it, as
-    for `Instrument.changed`: "half1.plate", "throughput", "sky", or the name of an effect.
+    `prior` is (mean, standard deviation) or None, `scale` the natural step of a solver, `loose` the width of a very
+    weak pull toward `start`, which bounds poorly determined combinations and is no prior knowledge; `tie` is the name
+    of the parameter that sets its value. `part` is the place of its component, as for `Instrument.changed`:
+    "half1.plate", "throughput", "sky", or the name of an effect.
 
-    Before a number has a value (`declared`), the mean of its prior is counted from that value, the step may be 0 (then
-    the prior or the value says it), and a name replaces the one that follows from the tree.
+    Before a number has a value (`declared`), the mean of its prior is relative to that value, the step may be 0 (then
+    it follows from the prior or the value), and a name replaces that of the tree.
     """
 
     name: str
@@ -73,21 +72,21 @@ class Parameter:
         return f"tied to {self.tie}" if self.tie is not None else "" if self.free else "fixed"
 
     def at(self, value: float, prior: tuple[float, float] | None = None) -> Parameter:
-        """A declared parameter at a value; `prior` replaces what is declared."""
+        """A declared parameter at a value; `prior` replaces the declared one."""
         if prior is None and self.prior is not None:
             prior = value + self.prior[0], self.prior[1]
         scale = prior[1] if prior is not None else self.scale or max(abs(value), 1e-3)
         return dataclasses.replace(self, start=value, prior=prior, scale=scale)
 
     def checked(self) -> Parameter:
-        """The parameter itself. Raises ValueError for a name that files cannot hold and for meaningless numbers."""
+        """The parameter itself. Raises ValueError for an invalid name and for meaningless numbers."""
         if not NAME.fullmatch(self.name):
             raise ValueError(f"parameter {self.name!r}: a name has letters, digits and _ . + - * only")
         if not _finite(self.start):
             raise ValueError(f"parameter {self.name}: start = {self.start!r} must be a finite number")
         if self.prior is not None:
-            both = isinstance(self.prior, tuple) and len(self.prior) == 2 and all(map(_finite, self.prior))
-            if not both or self.prior[1] <= 0:
+            is_pair = isinstance(self.prior, tuple) and len(self.prior) == 2 and all(map(_finite, self.prior))
+            if not is_pair or self.prior[1] <= 0:
                 raise ValueError(
                     f"parameter {self.name}: prior = {self.prior!r} must be None, or the tuple (mean, standard "
                     "deviation), finite and the second above 0"
@@ -122,34 +121,34 @@ def param(
 
 
 def number(*, unit: str, about: str, default: float | None = 0.0, several: bool = False) -> Any:
-    """Declare a number of an Equinox module that a description may make a parameter; `several`: a row of them.
+    """Declare a number of an Equinox module, optionally a parameter in a description; `several`: a row of them.
 
-    Values become float64 arrays, None stays: nothing of the kind.
+    Values become float64 arrays; None stays, for an absent number.
     """
     declared = Parameter("", unit, about, "")
     return eqx.field(metadata={NUMBER: declared, SEVERAL: several}, converter=as_number, default=default)
 
 
 def as_number(value: Any) -> Any:
-    """A value as a float64 array; None stays. With its type said: weak types would be compiled anew beside arrays."""
+    """A value as a float64 array; None stays. Explicit, as weak types would be compiled anew beside arrays."""
     with float64():
         return None if value is None else jnp.asarray(value, float)
 
 
 def unknown_name(what: str, name: str, known: Iterable[str]) -> ValueError:
-    """The error for a name that does not exist, with the nearest ones that do."""
+    """The error for an unknown name, with the nearest valid ones."""
     return ValueError(f"there is no {what} {name!r}; {nearest(name, known)}")
 
 
 def check_names(what: str, names: Iterable[str], known: Collection[str]) -> None:
-    """Raise ValueError, with the nearest names, for the first of some that does not exist."""
+    """Raise ValueError, with the nearest names, for the first unknown name."""
     for name in names:
         if name not in known:
             raise unknown_name(what, name, known)
 
 
 class Component(eqx.Module):
-    """A piece of the instrument; what it declares is what a fit may vary."""
+    """A piece of the instrument; a fit may vary its declared parameters."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return blank, (type(self),), self.__getstate__()
@@ -159,34 +158,34 @@ class Component(eqx.Module):
         return (field,)
 
     def declarations(self) -> Mapping[str, Parameter]:
-        """Its parameters, by field: those of the class and those that the instrument has `declared`."""
+        """Its parameters, by field: those of the class and those `declared` for the instrument."""
         return {**field_declarations(type(self)), **dict(getattr(self, "declared", ()))}
 
 
 Holder = tuple[str, ...]
-"""Fields and positions that lead to an array of the tree."""
+"""Path to an array of the tree: fields and positions."""
 
 
 def _arrays(
     component: Component, part: str = "", path: Holder = ()
 ) -> Iterator[tuple[Holder, tuple[Parameter, ...]]]:
-    """The parameters of every array of a tree, in the order in which it is flattened."""
+    """The parameters of every array of a tree, in the order of its flattening."""
     declared = component.declarations()
     for field in dataclasses.fields(component):
         if field.metadata.get("static", False):
             continue
-        value, here = getattr(component, field.name), (*path, field.name)
+        value, holder = getattr(component, field.name), (*path, field.name)
         if field.name in declared:
-            yield here, _named(component, field.name, declared[field.name], value, part)
+            yield holder, _named(component, field.name, declared[field.name], value, part)
         elif isinstance(value, dict):
             for name in (name for name in declared if name in value):
-                yield (*here, name), _named(component, name, declared[name], value[name], part)
+                yield (*holder, name), _named(component, name, declared[name], value[name], part)
         elif isinstance(value, tuple):
             for i, child in enumerate(value):
                 if isinstance(child, Component) and hasattr(child, "name"):
-                    yield from _arrays(child, f"{part}.{_name(child)}".strip("."), (*here, str(i)))
+                    yield from _arrays(child, f"{part}.{_name(child)}".strip("."), (*holder, str(i)))
         elif isinstance(value, Component):
-            yield from _arrays(value, f"{part}.{field.name}".strip("."), here)
+            yield from _arrays(value, f"{part}.{field.name}".strip("."), holder)
 
 
 def _named(
@@ -210,12 +209,12 @@ def leaves(component: Component) -> tuple[Parameter, ...]:
 
 
 def field_declarations(kind: type[Component]) -> dict[str, Parameter]:
-    """The parameters that a component class declares for good, by field name."""
+    """The permanent parameters of a component class, by field name."""
     return {f.name: f.metadata[PARAMETER] for f in dataclasses.fields(kind) if PARAMETER in f.metadata}
 
 
 def numbers_of(kind: type[Component]) -> dict[str, Parameter]:
-    """The numbers that a component class has, by field name."""
+    """The numbers of a component class, by field name."""
     return {f.name: f.metadata[NUMBER] for f in dataclasses.fields(kind) if NUMBER in f.metadata}
 
 
@@ -237,7 +236,7 @@ def _places(structure: Any, shapes: Shapes) -> tuple[tuple[int, int], ...]:
     component = of_shapes(structure, shapes)
     flat, _ = jax.tree_util.tree_flatten_with_path(component)
     position = {tuple(_key(entry) for entry in path): i for i, (path, _) in enumerate(flat)}
-    return tuple((position[here], len(array)) for here, array in _arrays(component) if array)
+    return tuple((position[holder], len(array)) for holder, array in _arrays(component) if array)
 
 
 def _key(entry: Any) -> str:
@@ -256,7 +255,7 @@ def values_of(component: Component) -> Vector:
 
 
 def shapes_of(tree: Any) -> tuple[Any, Shapes]:
-    """Structure of a tree and the shapes and types of its arrays: what two programs have in common."""
+    """Structure of a tree and the shapes and types of its arrays: common to all calls of a program."""
     arrays, structure = jax.tree_util.tree_flatten(tree)
     return structure, tuple((tuple(np.shape(a)), jnp.result_type(a).name) for a in arrays)
 
@@ -267,7 +266,7 @@ def of_shapes(structure: Any, shapes: Shapes) -> Any:
 
 
 def with_values(component: AnyComponent) -> Callable[[Vector | np.ndarray], AnyComponent]:
-    """The function that puts a vector of parameters in the place of those of a component.
+    """The function that replaces the parameters of a component by a vector.
 
     A vector of numpy is cut by numpy, without a program.
     """
@@ -278,8 +277,8 @@ def with_values(component: AnyComponent) -> Callable[[Vector | np.ndarray], AnyC
 
     def replaced(values: Vector | np.ndarray) -> AnyComponent:
         filled, split = list(arrays), np.split if isinstance(values, np.ndarray) else jnp.split
-        for i, part, shape in zip(places, split(values, ends), shapes, strict=True) if places else ():
-            filled[i] = array(part.reshape(shape))
+        for i, segment, shape in zip(places, split(values, ends), shapes, strict=True) if places else ():
+            filled[i] = array(segment.reshape(shape))
         return jax.tree_util.tree_unflatten(structure, filled)
 
     return replaced

@@ -25,12 +25,12 @@ from walop_jax.model.sources import ExposureArrays
 class Plan(eqx.Module):
     """Static layout of a computation.
 
-    Nodes: `wavelength` (µm) and the `conditions` at which the optics are solved. Bands: rows of `node_weight`,
-    sorted by positions of the moving elements; `moving` holds the prefixes of their columns and `settings`
-    (positions, first band, one past the last), a position being an angle in degrees, `Turning`, or None when out.
-    `band_of[e, s + 1]` is the band of exposure e for light of source s (s = −1: no source). Bands in which `slope` is
-    1 are weighted with the distance from their mean wavelength (µm); None: there are none. `work` counts the places
-    × exposures that are computed with it: programs for few of them are compiled without optimisation (`compiled`).
+    Nodes: `wavelength` (µm) and the `conditions` at which the optics are solved. Bands: rows of `node_weight`, sorted
+    by positions of the moving elements; `moving` holds the prefixes of their columns and `settings` (positions, first
+    band, one past the last), a position being an angle in degrees, `Turning`, or None when out. `band_of[e, s + 1]` is
+    the band of exposure e for light of source s (s = −1: no source). Bands in which `slope` is 1 are weighted with the
+    distance from their mean wavelength (µm); None: there are none. `work` counts places × exposures of a computation:
+    programs for few of them are compiled without optimisation (`compiled`).
     """
 
     wavelength: Float[Array, " n"]
@@ -46,7 +46,7 @@ class Plan(eqx.Module):
 
 
 def blank_exposures(instrument: LightPath, count: int) -> ExposureArrays:
-    """Exposures of which nothing is said but that they are there."""
+    """Exposures without any information but their number."""
     zero, off = array(np.zeros(count)), array(np.zeros(count, bool))
     return ExposureArrays(
         kind=array(np.zeros(count, int)), clp_in=off, clp_angle=zero, flux_known=off, rotator=zero, hours=zero,
@@ -55,19 +55,19 @@ def blank_exposures(instrument: LightPath, count: int) -> ExposureArrays:
     )  # fmt: skip
 
 
-def blank_plan(instrument: LightPath, asked: Collection[str] = (), median: bool = False) -> Plan:
+def blank_plan(instrument: LightPath, quantities: Collection[str] = (), median: bool = False) -> Plan:
     """A plan with every moving element in the beam, one node, one band: for shapes and derivatives."""
-    patched, one = instrument.patched(), jnp.ones(1)
-    count = max((part.exposures_known or 1 for part in patched.cameras.exposures), default=1)
+    patched, ones = instrument.patched(), jnp.ones(1)
+    count = max((gain.exposures_known or 1 for gain in patched.cameras.exposures), default=1)
     exposures = blank_exposures(instrument, count)
     if median:
         exposures = dataclasses.replace(exposures, median_counts=jnp.ones((count, len(instrument.cameras))))
     moving = patched.moving()
     return Plan(
-        wavelength=0.62 * one,
-        conditions=Conditions(band_width=0.1 * one, planned=dict.fromkeys(asked, one)),
+        wavelength=0.62 * ones,
+        conditions=Conditions(band_width=0.1 * ones, planned=dict.fromkeys(quantities, ones)),
         node_weight=jnp.ones((1, 1)),
-        teff=5000.0 * one,
+        teff=5000.0 * ones,
         exposures=exposures,
         band_of=np.zeros((count, 1 + len(instrument.standard.names)), int),
         settings=((tuple(30.0 for _ in moving), 0, 1),),
@@ -79,9 +79,9 @@ def with_numbers(
     plan: Plan, teff: Float[Array, ""], temperature: Float[Array, ""], hour_angle: Float[Array, ""]
 ) -> Plan:
     """The plan of a single setting with other numbers; `teff` is 0 for a flat spectrum."""
-    own = {"temperature": temperature, "hour_angle": hour_angle}
+    conditions = {"temperature": temperature, "hour_angle": hour_angle}
     planned = {
-        name: jnp.broadcast_to(own[name], plan.wavelength.shape) if name in own else value
+        name: jnp.broadcast_to(conditions[name], plan.wavelength.shape) if name in conditions else value
         for name, value in plan.conditions.planned.items()
     }
     changed = (jnp.broadcast_to(teff, plan.teff.shape), Conditions(plan.conditions.band_width, planned))
@@ -89,7 +89,7 @@ def with_numbers(
 
 
 def with_median(plan: Plan, median: Float[np.ndarray, "e k"]) -> Plan:
-    """The plan with the median counts of every exposure and camera, which some detectors need."""
+    """The plan with the median counts of every exposure and camera, for some detectors."""
     return eqx.tree_at(
         lambda p: p.exposures.median_counts, plan, array(median), is_leaf=lambda leaf: leaf is None
     )

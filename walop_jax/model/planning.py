@@ -1,4 +1,4 @@
-"""Making a plan: nodes and bands of exposures or settings, as detailed as the instrument and its effects need them."""
+"""Making a plan: nodes and bands of exposures or settings, in the detail required by the instrument and its effects."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, moments, r
 from walop_jax.model.ray import CONDITIONS, Conditions
 from walop_jax.model.sources import ExposureArrays
 
-SAMPLES = 9  # wavelengths of a band between which a retardance goes one way
-ROOM = 1.03  # by which a thickness may grow in a fit, and a path when the ray is oblique, before nodes are too few
+SAMPLES = 9  # wavelengths of a band with a monotonic retardance between them
+ROOM = 1.03  # growth of a thickness in a fit, and of an oblique path, that the nodes allow
 
 
 def hours_of(exposures: Exposures) -> Float[np.ndarray, " e"]:
@@ -41,12 +41,12 @@ def exposure_arrays(
 
     Raises ValueError for a KIND that is none of `kinds`.
     """
-    known = tuple(kinds)
-    unknown = sorted(set(exposures.kind.tolist()) - set(known))
+    order = tuple(kinds)
+    unknown = sorted(set(exposures.kind.tolist()) - set(order))
     if unknown:
-        raise ValueError(f"KIND {unknown[0]!r}: the instrument has no such source; it has {', '.join(known)}")
+        raise ValueError(f"KIND {unknown[0]!r}: the instrument has no such source; it has {', '.join(order)}")
     return ExposureArrays(
-        kind=array([known.index(kind) for kind in exposures.kind], int),
+        kind=array([order.index(kind) for kind in exposures.kind], int),
         clp_in=array(exposures.clp_in),
         clp_angle=array(np.deg2rad(np.where(exposures.clp_in, exposures.clp_angle, 0.0))),
         flux_known=array(np.isin(exposures.kind, list(flux_known))),
@@ -60,7 +60,7 @@ def exposure_arrays(
             for prefix, at in exposures.positions.items()
             if prefix != POLARISER and at.inside.any()
         },
-        kinds=known,
+        kinds=order,
     )
 
 
@@ -70,38 +70,38 @@ def plan_for(
     filters: Mapping[str, FilterCurve],
     sources: Sources | None = None,
 ) -> Plan:
-    """Lay out the nodes and bands of `exposures`, as detailed as the instrument and its effects need it.
+    """Lay out the nodes and bands of `exposures`, in the detail required by the instrument.
 
-    Standards that have a colour have the slopes of the bands as well. Raises KeyError for a filter that `filters` does
-    not hold and ValueError for a KIND without a source.
+    Standards with a colour have the slopes of the bands as well. Raises KeyError for a filter missing from `filters`
+    and ValueError for a KIND without a source.
     """
-    own = Settings.of(exposures, instrument.patched().moving())
-    each, stars = np.arange(len(exposures)), 0 if sources is None else len(sources)
+    exposure_settings = Settings.of(exposures, instrument.patched().moving())
+    indices, stars = np.arange(len(exposures)), 0 if sources is None else len(sources)
     # A row for every exposure; of standards one for every star, as each may have a colour of its own.
     of_stars = exposures.direct("standard") & (stars > 0)
-    row = np.repeat(each, np.where(of_stars, stars, 1))
-    teff, last, starlight = own.teff[row], len(row), of_stars[row]
+    row = np.repeat(indices, np.where(of_stars, stars, 1))
+    teff, last, starlight = exposure_settings.teff[row], len(row), of_stars[row]
     if sources is not None and starlight.any():
         colour = np.tile(sources.teff, of_stars.sum())
         teff[starlight] = np.where(np.isfinite(colour), colour, teff[starlight])
-    sloping = np.flatnonzero(of_stars) if instrument.standard.bands else each[:0]
+    sloping = np.flatnonzero(of_stars) if instrument.standard.bands else indices[:0]
     row, teff = np.append(row, sloping), np.append(teff, np.full(len(sloping), _typical(sources)))
-    settings = dataclasses.replace(own[row], teff=teff)
+    settings = dataclasses.replace(exposure_settings[row], teff=teff)
 
     def band_of(band: Int[np.ndarray, " n"]) -> Int[np.ndarray, "e s"]:
-        table = np.empty((len(each), 1 + stars), int)
+        table = np.empty((len(indices), 1 + stars), int)
         table[~of_stars] = band[~starlight, None]
         table[of_stars, 1:] = band[starlight].reshape(of_stars.sum(), stars)
-        table[of_stars, 0] = table[of_stars, -1]  # nothing is used of a standard without its star
+        table[of_stars, 0] = table[of_stars, -1]  # a standard without its star is not used
         return table
 
-    known = [source.kind for source in instrument.sources if source.facts.flux_known]
-    arrays = exposure_arrays(exposures, instrument.kinds, known)
+    unit_flux = [source.kind for source in instrument.sources if source.facts.flux_known]
+    arrays = exposure_arrays(exposures, instrument.kinds, unit_flux)
     steady = np.isin(
         exposures.kind, [source.kind for source in instrument.sources if source.facts.flux_shared]
     )
     if instrument.cameras.split or steady.any():
-        arrays = _sharing(arrays, own, steady, split=instrument.cameras.split)
+        arrays = _sharing(arrays, exposure_settings, steady, split=instrument.cameras.split)
     slope = np.arange(len(row)) >= last
     hours, kinds = hours_of(exposures)[row], exposures.kind[row]
     plan, band = _plan(instrument, settings, hours, filters, arrays, kinds, slope)
@@ -109,18 +109,18 @@ def plan_for(
     if sources is None or not sloping.size:
         return plan
     curves = {name: filters[name] for name in np.unique(exposures.filter).tolist()}
-    slope_band = np.zeros(len(each), int)
+    slope_band = np.zeros(len(indices), int)
     slope_band[sloping] = band[last:]
-    seen = dataclasses.replace(
+    coloured = dataclasses.replace(
         plan.exposures, colour=array(colours(exposures, curves, sources)), slope_band=array(slope_band, int)
     )
-    return dataclasses.replace(plan, exposures=seen)
+    return dataclasses.replace(plan, exposures=coloured)
 
 
 def _typical(sources: Sources | None) -> float:
-    """Colour temperature that stands for those of all stars where a slope of second order is meant."""
-    known = np.zeros(0) if sources is None else sources.teff[np.isfinite(sources.teff)]
-    return float(np.median(known)) if known.size else np.nan
+    """Colour temperature of a typical star, for slopes of second order."""
+    temperatures = np.zeros(0) if sources is None else sources.teff[np.isfinite(sources.teff)]
+    return float(np.median(temperatures)) if temperatures.size else np.nan
 
 
 def colours(
@@ -128,30 +128,32 @@ def colours(
 ) -> Float[np.ndarray, "e s 2"]:
     """Mean wavelength and rms width (µm) of the photons of every star in every exposure."""
     names, number = np.unique(exposures.filter, return_inverse=True)
-    each = [[moments(curves[n].wavelength, curves[n].throughput, t) for t in sources.teff] for n in names]
-    return np.array(each)[number]
+    by_filter = [
+        [moments(curves[n].wavelength, curves[n].throughput, t) for t in sources.teff] for n in names
+    ]
+    return np.array(by_filter)[number]
 
 
 def _sharing(
     exposures: ExposureArrays, settings: Settings, steady: Bool[np.ndarray, " e"], *, split: bool
 ) -> ExposureArrays:
-    """Exposures that have a flux in common: steady light in each filter, and, `split`, light of known flux.
+    """Exposures with a common flux: steady light in each filter, and, `split`, light of known flux.
 
-    Such light is divided between the arms in unknown shares, the same ones in all exposures of a filter with everything
-    in the same place.
+    The shares of such light in the arms are unknown, and equal in all exposures of a filter with the same positions of
+    all elements.
     """
-    known = np.asarray(exposures.flux_known)
-    group = np.arange(len(known))
+    flux_known = np.asarray(exposures.flux_known)
+    group = np.arange(len(flux_known))
     if split:
         for _, rows in settings.layouts():
-            group[rows[known[rows]]] = rows[0]
+            group[rows[flux_known[rows]]] = rows[0]
     _, first, of_filter = np.unique(settings.filter[steady], return_index=True, return_inverse=True)
     group[steady] = np.flatnonzero(steady)[first][of_filter]
-    shares = steady.any() or (split and known.any())
+    shares = steady.any() or (split and flux_known.any())
     _, number = np.unique(group, return_inverse=True)
     return dataclasses.replace(
         exposures,
-        flux_known=array(known & (not split)),
+        flux_known=array(flux_known & (not split)),
         shared=jax.nn.one_hot(number, number.max() + 1, dtype=float) if shares else None,
     )
 
@@ -159,8 +161,8 @@ def _sharing(
 def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mapping[str, FilterCurve]) -> Plan:
     """Lay out the nodes and bands of `settings`, without any light: for analysis vectors.
 
-    The band of a row is `band_of[row, 0]`. Raises KeyError for a filter that `filters` does not hold and ValueError
-    for a moving element that the instrument does not have.
+    The band of a row is `band_of[row, 0]`. Raises KeyError for a filter missing from `filters` and ValueError for an
+    unknown moving element.
     """
     settings.check_moving(instrument.patched().moving())
     blank = blank_exposures(instrument, len(settings))
@@ -170,7 +172,7 @@ def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mappi
 
 @functools.lru_cache(maxsize=256)
 def _rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], *fringes: float) -> Rule:
-    """Nodes of a band and their weights; plans of one set are made for many models, most of which ask for the same."""
+    """Nodes of a band and their weights; cached, since the models of one set mostly share them."""
     path_difference, waves, faint = fringes
     return band_rule(
         np.array(wavelength), np.array(throughput), path_difference=path_difference, waves=waves, faint=faint
@@ -178,28 +180,28 @@ def _rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], *fringes
 
 
 def outgrown(planned: Instrument, instrument: Instrument, curves: Iterable[FilterCurve]) -> bool:
-    """True where retarders have become thicker than the nodes of a plan for `planned` follow in any of the bands."""
+    """True where retarders are too thick for the nodes of a plan for `planned` in any of the bands."""
     old, new = planned.patched(), instrument.patched()
     return any(
-        now > followed
+        waves > followed
         for curve in curves
-        for now, followed in zip(_fringes(new, curve, 1.0), _fringes(old, curve), strict=True)
+        for waves, followed in zip(_fringes(new, curve, 1.0), _fringes(old, curve), strict=True)
     )
 
 
 def extrapolations(instrument: Instrument, curves: Iterable[FilterCurve]) -> tuple[str, ...]:
-    """Sentences on materials (patched instrument) that bands use beyond the wavelengths at which they were measured.
+    """Sentences on materials (patched instrument) in bands beyond their measured wavelengths.
 
-    Raises `DataError` where that is too far for the formulae.
+    Raises `DataError` beyond the validity of the formulae.
     """
     behind = (element for arm in instrument.arms for element in arm.train())
     names = dict.fromkeys(name for element in (*instrument.train(), *behind) for name in element.materials)
     sentences = []
     for curve in curves:
-        seen = curve.wavelength[curve.throughput > 0]
-        for name in names if seen.size else ():
-            (low, high), source = (one := MATERIALS[name]).measured, one.source.split(";")[0]
-            first, last = float(seen.min()), float(seen.max())
+        wavelengths = curve.wavelength[curve.throughput > 0]
+        for name in names if wavelengths.size else ():
+            (low, high), source = (material := MATERIALS[name]).measured, material.source.split(";")[0]
+            first, last = float(wavelengths.min()), float(wavelengths.max())
             if low <= first and last <= high:
                 continue
             what = f"filter {curve.name}, {first:g} to {last:g} µm: the refractive index of {name} was measured at "
@@ -215,18 +217,18 @@ def extrapolations(instrument: Instrument, curves: Iterable[FilterCurve]) -> tup
 def _fringes(instrument: Instrument, curve: FilterCurve, room: float = ROOM) -> tuple[float, float]:
     """Waves of the fringes of an instrument (patched) in a band: at full strength, and of all layers of a plate.
 
-    Behind one another retarders interfere at the sum of their retardances. Nodes are made for `room` times as many.
+    Retarders in series interfere at the sum of their retardances. Nodes are made for `room` times as many.
     """
-    seen = curve.wavelength[curve.throughput > 0]
-    at = np.linspace(seen.min(), seen.max(), SAMPLES) if seen.size else curve.wavelength
+    wavelengths = curve.wavelength[curve.throughput > 0]
+    at = np.linspace(wavelengths.min(), wavelengths.max(), SAMPLES) if wavelengths.size else curve.wavelength
     common, bright, faint = list(instrument.train()), 0.0, 0.0
     for arm in instrument.arms:
-        each = [found for element in (*common, *arm.train()) if (found := element.retardances(at))]
-        whole = sum(waves_over(at, together) for together, _ in each)
+        retardances = [pair for element in (*common, *arm.train()) if (pair := element.retardances(at))]
+        summed = sum(waves_over(at, together) for together, _ in retardances)
         layers = max(
-            (waves_over(at, sums) - waves_over(at, together) for together, sums in each), default=0.0
+            (waves_over(at, sums) - waves_over(at, together) for together, sums in retardances), default=0.0
         )
-        bright, faint = max(bright, whole), max(faint, whole + layers)
+        bright, faint = max(bright, summed), max(faint, summed + layers)
     return rounded_up(room * bright, WAVES), rounded_up(room * faint, FAINT)
 
 
@@ -240,15 +242,15 @@ def _plan(
     slope: Bool[np.ndarray, " n"] | None = None,
 ) -> tuple[Plan, Int[np.ndarray, " n"]]:
     """A plan, but for `Plan.band_of`, and the band of every setting; `slope` is true for those of slopes."""
-    asked, patched = needs(instrument), instrument.patched()
+    requirements, patched = needs(instrument), instrument.patched()
     moving = patched.moving()
-    names = sorted(asked.conditions)
+    names = sorted(requirements.conditions)
     values = {"temperature": settings.temperature, "hour_angle": settings.hour_angle, "hours": hours}
     assert set(values) == set(CONDITIONS)
     # A band is (positions, filter, conditions, colour temperature, slope, KIND); sorting puts equal positions together.
-    # NaN (out, flat spectrum) becomes a sortable stand-in. KINDs of one colour are apart, so that a set in which one of
-    # them has another has a plan of the same shape, and the same programs.
-    # The angle of each element, and after all of them by how much each turns.
+    # NaN (out, flat spectrum) becomes a sortable stand-in. KINDs of one colour are separate, so that a set with another
+    # colour for one of them has a plan of the same shape, and the same programs.
+    # The angles of all elements, then their turns during the exposure.
     still = np.zeros(len(settings))
     places = [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving]
     turns = [settings.turns.get(prefix, still) for prefix in moving]
@@ -257,8 +259,8 @@ def _plan(
     teff = np.nan_to_num(settings.teff).tolist()
     sloping = np.zeros(len(settings), bool) if slope is None else slope
     labels = [""] * len(settings) if kinds is None else kinds.tolist()
-    each = (states, settings.filter.astype(str).tolist(), planned, teff, sloping.tolist(), labels)
-    keys = list(zip(*each, strict=True))
+    columns = (states, settings.filter.astype(str).tolist(), planned, teff, sloping.tolist(), labels)
+    keys = list(zip(*columns, strict=True))
     bands = sorted(set(keys))
     index = {key: i for i, key in enumerate(bands)}
 
@@ -269,7 +271,7 @@ def _plan(
         name: _rule(
             tuple(c.wavelength.tolist()),
             tuple(c.throughput.tolist()),
-            asked.path_difference,
+            requirements.path_difference,
             *_fringes(patched, c),
         )
         for name, c in curves.items()
@@ -292,11 +294,11 @@ def _plan(
         return array(np.repeat(np.asarray(of_group, float), counts))
 
     laid = []
-    found = [key[0] for key in bands]
-    for value in sorted(set(found)):
+    ordered = [key[0] for key in bands]
+    for value in sorted(set(ordered)):
         pairs = zip(value[: len(moving)], value[len(moving) :], strict=True)
         state = tuple(None if np.isinf(at) else Turning(at, turn) if turn else at for at, turn in pairs)
-        laid.append((state, found.index(value), len(found) - found[::-1].index(value)))
+        laid.append((state, ordered.index(value), len(ordered) - ordered[::-1].index(value)))
     plan = Plan(
         wavelength=array(np.concatenate([rules[name][0] for name, _ in groups])),
         conditions=Conditions(

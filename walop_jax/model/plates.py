@@ -75,7 +75,7 @@ def _air(sx: Real, sy: Real) -> _Waves:
 
 
 def _anisotropy(plate: Plate) -> Real:
-    """n_e² − n_o², to the last digit: of squares that are subtracted 10⁻¹⁴ would be lost, 10⁻¹² rad of a thick plate.
+    """n_e² − n_o², to the last digit: a difference of squares would lose 10⁻¹⁴, 10⁻¹² rad of a thick plate.
 
     The phase follows without a cancellation from k_ze² − k_zo² = (n_e² − n_o²)(1 − (s·c)²/n_o²).
     """
@@ -86,15 +86,15 @@ def _crystal(sx: Real, sy: Real, plate: Plate) -> _Waves:
     cx, cy = jnp.cos(plate.axis), jnp.sin(plate.axis)
     no2, ne2 = plate.ordinary**2, plate.extraordinary**2
     along, across = sx * cx + sy * cy, -sx * cy + sy * cx
-    rest = 1.0 - along**2 * (1.0 / no2)
+    factor = 1.0 - along**2 * (1.0 / no2)
     kz_o = jnp.sqrt(no2 - sx**2 - sy**2)
-    kz_e = jnp.sqrt(ne2 * rest - across**2)
+    kz_e = jnp.sqrt(ne2 * factor - across**2)
     e_o = (-kz_o * cy, kz_o * cx, -across)
     e_e = (no2 * cx - along * sx, no2 * cy - along * sy, -along * kz_e)
     h_o = _tangential(sx, sy, kz_o, e_o)
     h_e = _tangential(sx, sy, kz_e, e_e)
     electric = Matrix2(e_o[0], e_e[0], e_o[1], e_e[1])
-    phase = _anisotropy(plate) * rest * (1.0 / (kz_e + kz_o))
+    phase = _anisotropy(plate) * factor * (1.0 / (kz_e + kz_o))
     return _Waves(electric, Matrix2(h_o[0], h_e[0], h_o[1], h_e[1]), phase)
 
 
@@ -141,8 +141,8 @@ def _crystal_both_ways(sx: Real, sy: Real, plate: Plate) -> _BothWays:
         e_e = (no2 * cx - along * sx, no2 * cy - along * sy, no2 * cz - along * kz_e)
         h_o, h_e = _tangential(sx, sy, kz_o, e_o), _tangential(sx, sy, kz_e, e_e)
         electric = Matrix2(e_o[0], e_e[0], e_o[1], e_e[1])
-        rest = 1.0 - along**2 * (1.0 / no2)
-        phase = _anisotropy(plate) * rest * (1.0 / (kz_e + kz_o))
+        factor = 1.0 - along**2 * (1.0 / no2)
+        phase = _anisotropy(plate) * factor * (1.0 / (kz_e + kz_o))
         return _Waves(electric, Matrix2(h_o[0], h_e[0], h_o[1], h_e[1]), phase)
 
     forward, backward = _extraordinary_kz(sx, sy, plate)
@@ -157,9 +157,7 @@ def _face_both_ways(before: _BothWays, after: _BothWays) -> Matrix2:
 
 
 def _stack(
-    media: list[_Waves] | list[_BothWays],
-    phases: list[Real],
-    face: Callable[[Any, Any], Matrix2],
+    media: list[_Waves] | list[_BothWays], phases: list[Real], face: Callable[[Any, Any], Matrix2]
 ) -> Matrix2:
     jones = face(media[0], media[1])
     for before, after, phase in zip(media[1:-1], media[2:], phases, strict=True):

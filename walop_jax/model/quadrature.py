@@ -2,13 +2,13 @@
 
 The band integral ∫ THROUGHPUT f dλ over the tabulated curve is a sum with positive weights (trapezium rule
 on the table, refined to 0.5 nm by linear interpolation where it is coarser). The Gauss rule of that
-discrete measure integrates polynomials of degree 2n − 1 exactly, so n nodes follow an oscillation of the
+discrete measure integrates polynomials of degree 2n − 1 exactly, so n nodes resolve an oscillation of the
 plates as well as any n nodes can. n is the smallest that integrates the fringes of plates of 35 waves
-(periods near 17 nm, half of that at second order, in all phases) to `tolerance`, and those of the plates that
-an instrument has, where these are thicker.
+(periods near 17 nm, half of that at second order, in all phases) to `tolerance`, and those of the plates of
+an instrument, where these are thicker.
 
-Fringes of full strength that turn faster than those of 35 waves are told from the tabulated curve by what it
-does between its rows: their measure is that of straight lines, by Gauss–Legendre rules on pieces of it.
+Fringes of full strength faster than those of 35 waves are sensitive to the curve between its tabulated rows:
+their measure is that of straight lines, by Gauss–Legendre rules on pieces of it.
 
 Source      `SOURCE`; the discrete measure by the Lanczos process.
 """
@@ -25,10 +25,10 @@ SOURCE = "Golub & Welsch 1969, Math. Comp. 23, 221; Gautschi 2004, Orthogonal Po
 FINEST = 0.0005  # µm
 WAVES = 36.0  # of one plate at 0.62 µm: (n_e − n_o) d / λ
 FAINT = (
-    80.0  # waves of all layers of a plate together, a thousand times fainter, that a rule for `WAVES` follows
+    80.0  # waves of all layers of a plate together, a thousand times fainter, resolved by a rule for `WAVES`
 )
 FAINTER = 1e4  # tolerance of those, in units of that of full strength
-STEP = 1.05  # between numbers of waves that rules are made for, so that plates of nearly one thickness share a rule
+STEP = 1.05  # ratio of the numbers of waves of rules: plates of nearly equal thickness share a rule
 PER_WAVE = 8.0  # pieces of a straight line for each turn of the fastest fringe, at least
 MAXIMUM_NODES = 600
 
@@ -73,7 +73,7 @@ def moments(wavelength: Vector, throughput: Vector, teff: float) -> tuple[float,
 
 
 def waves_over(wavelength: Vector, retardance: Vector) -> float:
-    """Waves at 0.62 µm of a fixed birefringence, which turns as 1/λ, that turn as often over a band as a retardance.
+    """Waves at 0.62 µm of a fixed birefringence (∝ 1/λ) with as many turns over a band as a retardance.
 
     The wavelengths (µm) span the band; the retardance is in waves.
     """
@@ -82,7 +82,7 @@ def waves_over(wavelength: Vector, retardance: Vector) -> float:
 
 
 def rounded_up(waves: float, known: float) -> float:
-    """The next number of waves that rules are made for, above `known`, which the smallest rule follows."""
+    """The next number of waves with a rule, at least `known`, that of the smallest rule."""
     return known if waves <= known else known * STEP ** float(np.ceil(np.log(waves / known) / np.log(STEP)))
 
 
@@ -106,10 +106,10 @@ def gauss_rules(node: Vector, weight: Vector, counts: range) -> Iterator[Rule]:
     """Gauss rules of growing numbers of nodes, fewer than the measure has; its weights sum to 1."""
     centre, half = 0.5 * (node[0] + node[-1]), 0.5 * (node[-1] - node[0])
     rows = _recurrence((node - centre) / half, weight)
-    known: list[tuple[float, float]] = []
+    coefficients: list[tuple[float, float]] = []
     for count in counts:
-        known += itertools.islice(rows, count - len(known))
-        alpha, beta = np.array(known).T
+        coefficients += itertools.islice(rows, count - len(coefficients))
+        alpha, beta = np.array(coefficients).T
         value, columns = np.linalg.eigh(np.diag(alpha) + np.diag(beta[:-1], 1) + np.diag(beta[:-1], -1))
         yield centre + half * value, columns[0] ** 2
 
@@ -148,7 +148,7 @@ def band_rule(
     followed += [(waves, tolerance)] if waves > WAVES else []
     followed += [(faint, FAINTER * tolerance)] if faint > FAINT else []
     fine, fine_weight = tabulated_measure(wavelength, throughput, waves)
-    # No rule follows a fringe with fewer than two nodes a cycle: there is no need to try those.
+    # No rule resolves a fringe with fewer than two nodes a cycle: those are not tried.
     cycles = 0.62 * max(fringes, waves if waves > WAVES else 0.0) * (1.0 / fine[0] - 1.0 / fine[-1])
     counts = range(max(1, int(2.0 * cycles)), min(MAXIMUM_NODES, len(fine)))
     for node, weight in gauss_rules(fine, fine_weight, counts) if counts else ():

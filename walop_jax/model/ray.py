@@ -1,4 +1,4 @@
-"""A ray on its way through the train: where it comes from, where it goes, and under which conditions.
+"""A ray on its way through the train: field point, direction and conditions.
 
 Units       field coordinates deg; direction cosines of the unit vector along the ray in air, axes of the instrument
             frame; vacuum wavelength µm. Leading achromatic elements are evaluated without a wavelength.
@@ -20,7 +20,7 @@ their columns of EXPOSURES."""
 
 
 class NotPlannedError(ValueError):
-    """The optics have asked for a quantity that the computation was not laid out for; `quantity` is its name."""
+    """The optics depend on a quantity that the plan lacks; `quantity` is its name."""
 
     def __init__(self, quantity: str) -> None:
         self.quantity = quantity
@@ -31,9 +31,9 @@ class NotPlannedError(ValueError):
 
 
 class Conditions(eqx.Module):
-    """Conditions of an exposure at every wavelength node; of `CONDITIONS` only those that the optics have asked for.
+    """Conditions of an exposure at every wavelength node; of `CONDITIONS` only those used by the optics.
 
-    `band_width` is the equivalent width (µm) of the filter that a node belongs to.
+    `band_width` is the equivalent width (µm) of the filter of a node.
     """
 
     band_width: Real

@@ -1,4 +1,4 @@
-"""Sources of the physics of a model, also as BibTeX: those that elements, sources, materials and effects name."""
+"""Sources of the physics of a model, also as BibTeX: those of elements, sources, materials and effects."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _OWN = "physics of this package; no outside source"
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """A piece of physics and the works that it rests on."""
+    """A piece of physics and its published works."""
 
     what: str
     source: str
 
 
 class References(tuple[Reference, ...]):
-    """Several of them, which print as a line each."""
+    """Several references, printed as a line each."""
 
     __slots__ = ()
 
@@ -52,27 +52,29 @@ def _optics(instrument: Instrument) -> Iterator[Reference]:
 
 
 def references(model: Model, filters: Iterable[str] = ()) -> tuple[Reference, ...]:
-    """The sources of the physics in a model, each once: the base in the order light meets it, then its effects.
+    """The sources of the physics in a model, each once: the base in the order of the light path, then its effects.
 
-    `filters` are the names of those that are used: built-in curves have a source.
+    `filters` are the names of the used ones: built-in curves have a source.
     """
     instrument = model.template
-    found = [Reference("the instrument and its calibration", instrument.source)] if instrument.source else []
-    found += _optics(instrument)
-    found.append(Reference("band integral", quadrature.SOURCE))
+    entries = (
+        [Reference("the instrument and its calibration", instrument.source)] if instrument.source else []
+    )
+    entries += _optics(instrument)
+    entries.append(Reference("band integral", quadrature.SOURCE))
     if DEFAULT_FILTER in set(filters):
-        found.append(Reference(f"{DEFAULT_FILTER} filter curve", "Doi et al. 2010, AJ 139, 1628, Table 4"))
+        entries.append(Reference(f"{DEFAULT_FILTER} filter curve", "Doi et al. 2010, AJ 139, 1628, Table 4"))
     if instrument.standard.bands:
-        found.append(Reference("colour of standards", COLOUR_OF_STANDARDS))
-    found.append(Reference("throughput over the field", legendre.SOURCE))
+        entries.append(Reference("colour of standards", COLOUR_OF_STANDARDS))
+    entries.append(Reference("throughput over the field", legendre.SOURCE))
     for source in instrument.sources:
         used = any(model.parameters[i].free for i in model.positions(source.name))
         if source.reference and used:
-            found.append(Reference(f"light of KIND {source.kind}", source.reference))
-    found += [
+            entries.append(Reference(f"light of KIND {source.kind}", source.reference))
+    entries += [
         Reference(f"effect {effect.name}", effect.kind.reference or _OWN) for effect in instrument.effects
     ]
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(entries))
 
 
 # ------------------------------------------------------------------------------------------------- as BibTeX
@@ -86,41 +88,41 @@ _OF_SAMPLES = ("emcee2013", "arviz2019")
 def _library() -> dict[str, str]:
     """The entries of `references.bib` by key."""
     text = (files("walop_jax.model") / "references.bib").read_text(encoding="utf-8")
-    return {found[1]: found[0].strip() for found in re.finditer(r"@\w+{(\w+),.*?\n}", text, re.DOTALL)}
+    return {match[1]: match[0].strip() for match in re.finditer(r"@\w+{(\w+),.*?\n}", text, re.DOTALL)}
 
 
 def bibtex(found: Sequence[Reference], version: str, *, sampled: bool = False) -> str:
     """BibTeX entries of this software, of all published works among the sources, and of the packages beneath.
 
-    `sampled`: those of the posterior as well. A work that `references.bib` lacks is an entry with what its source says.
+    `sampled`: those of the posterior as well. A work missing from `references.bib` becomes an entry from its source.
     """
-    known = _library()
-    entries = {"walop_jax": known["walop_jax"].replace("VERSION", version)}
+    library = _library()
+    entries = {"walop_jax": library["walop_jax"].replace("VERSION", version)}
     for reference in found:
-        for part in reference.source.split("; "):
-            key = "maharana2022" if "Paper II" in part else _key(part)
-            if key in known:
-                entries[key] = known[key]
-            elif (plain := _YEAR.match(part)) is not None:
+        for work in reference.source.split("; "):
+            key = "maharana2022" if "Paper II" in work else _key(work)
+            if key in library:
+                entries[key] = library[key]
+            elif (plain := _YEAR.match(work)) is not None:
                 lines = (
                     plain["who"].replace(" et al.", " and others").replace(" & ", " and "),
-                    part,
+                    work,
                     plain["year"],
                 )
                 lines = (line.replace("&", r"\&").replace("_", r"\_") for line in lines)
                 fields = zip(("author", "note", "year"), lines, strict=True)
                 listed = ",\n".join(f"  {name:<6} = {{{value}}}" for name, value in fields)
                 entries[key] = f"@misc{{{key},\n{listed}\n}}"
-    entries |= {key: known[key] for key in (*_SOFTWARE, *(_OF_SAMPLES if sampled else ()))}
+    entries |= {key: library[key] for key in (*_SOFTWARE, *(_OF_SAMPLES if sampled else ()))}
     return "\n\n".join(entries.values()) + "\n"
 
 
 def _key(work: str) -> str:
-    """Family name of the first author and the year, that of the library where the work states none."""
-    found = _YEAR.match(work)
-    first = re.split(r",| et al\.| & | and ", found["who"] if found else work)[0]
+    """Family name of the first author and the year, that of the library for a work without one."""
+    match = _YEAR.match(work)
+    first = re.split(r",| et al\.| & | and ", match["who"] if match else work)[0]
     plain = unicodedata.normalize("NFKD", first).encode("ascii", "ignore").decode()
     name = re.sub(r"[^a-z]", "", plain.lower())
-    if found:
-        return name + found["year"]
+    if match:
+        return name + match["year"]
     return next((key for key in _library() if key.rstrip("0123456789") == name), name)

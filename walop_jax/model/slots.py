@@ -1,17 +1,17 @@
-"""Slots: places of the light path at which it may be otherwise, and what a little of it there does to the light.
+"""Slots: places of possible changes of the light path, and the derivatives of the light in these changes.
 
-A slot is a change without factors (`effects.change`), or a part of one; what a change is in slots, its kind says
-(`Kind.slots`). What multiplies a change, over the field or from exposure to exposure, multiplies its slot. Elements,
-fold, band integral and patches are those that light takes, differentiated where nothing is changed.
+A slot is a change without factors (`effects.change`), or a term of one; the kind of a change holds its slots
+(`Kind.slots`). The factors of a change, over the field or from exposure to exposure, multiply its slots. Elements,
+fold, band integral and patches are those of the forward model, differentiated at the unchanged instrument.
 
     inserted    generators (`optics.GENERATORS`) at every place between two elements, by themselves and × (λ/λ₀ − 1)
     number      axis and thermal change of every wave plate; thickness, axis and cut of each of its layers
-    whole       displacement of what the optics behind a mapping to the pupil see; shift of the bands
+    whole       displacement of the field for the optics behind a mapping to the pupil; shift of the bands
     throughput  of a camera, relative to itself; mixed: light of one camera in another
-    fringes     of air ahead of a wave plate, which take more wavelength nodes than all others
+    fringes     of air ahead of a wave plate, which need more wavelength nodes than all others
     light       of sources, ahead of the polariser and of it: Stokes vectors behind it
 
-Method      The rows that the analysers see are linear in the matrix M of every element: δrows = (rows behind it) δM
+Method      The rows of the analysers are linear in the matrix M of every element: δrows = (rows behind it) δM
             (matrix ahead of it), and δM of all elements in the same numbers come from one derivative.
 Symbols     s slots, g generators, t changes of numbers, b bands, k cameras, r rows, c states, n nodes
 Limits      first order.
@@ -63,29 +63,29 @@ def trains(instrument: Instrument) -> dict[str, tuple[Element, ...]]:
 
 
 def acts(element: Element) -> bool:
-    """True if an element does anything to polarisation."""
+    """True if an element has a Mueller matrix."""
     return _acts(*shapes_of(element))
 
 
 @functools.lru_cache(maxsize=1024)
 def _acts(structure: Any, shapes: Any) -> bool:
-    one, zero = array(np.ones(1)), array(np.zeros(()))
+    ones, zero = array(np.ones(1)), array(np.zeros(()))
 
     def run(*arrays: Array) -> Any:
         element = jax.tree_util.tree_unflatten(structure, arrays)
-        conditions = Conditions(band_width=0.1 * one, planned=dict.fromkeys(CONDITIONS, one))
-        return element.mueller(Ray.entering(zero, zero, (0.62 * one, conditions)))
+        conditions = Conditions(band_width=0.1 * ones, planned=dict.fromkeys(CONDITIONS, ones))
+        return element.mueller(Ray.entering(zero, zero, (0.62 * ones, conditions)))
 
     return jax.eval_shape(run, *(jax.ShapeDtypeStruct(s, d) for s, d in shapes)) is not None
 
 
 def _places(instrument: Instrument) -> list[list[int]]:
-    """Number of the place behind so many elements of each train: the same where nothing acts in between."""
-    number, found = -1, []
+    """Numbers of the places between the elements of each train, equal on both sides of an inactive element."""
+    number, places = -1, []
     for train, elements in enumerate(trains(instrument).values()):
         number += train == 0 or len(instrument.arms) > 1
-        found.append([number, *(number := number + acts(element) for element in elements)])
-    return found
+        places.append([number, *(number := number + acts(element) for element in elements)])
+    return places
 
 
 def _is_plate(element: Element) -> bool:
@@ -94,14 +94,14 @@ def _is_plate(element: Element) -> bool:
 
 def _numbers(instrument: Instrument) -> list[list[Slot]]:
     """The numbers of every wave plate behind the polariser."""
-    found = []
+    numbers = []
     for train, elements in trains(instrument).items():
         for plate in filter(_is_plate, elements):
             place, layers = f"{train}{plate.name}", plate.layers  # pyright: ignore[reportAttributeAccessIssue]
-            each = [(kind, place) for kind in OF_PLATE]
-            each += [(kind, f"{place}.{layer.name}") for layer in layers for kind in OF_LAYER]
-            found.append([("number", kind, "of", at) for kind, at in each])
-    return found
+            entries = [(kind, place) for kind in OF_PLATE]
+            entries += [(kind, f"{place}.{layer.name}") for layer in layers for kind in OF_LAYER]
+            numbers.append([("number", kind, "of", at) for kind, at in entries])
+    return numbers
 
 
 def _whole(instrument: Instrument) -> list[Slot]:
@@ -111,7 +111,7 @@ def _whole(instrument: Instrument) -> list[Slot]:
 
 
 def fringe_places(instrument: Instrument) -> tuple[str, ...]:
-    """Places of the plates of an instrument (`patched`) ahead of which there may be air."""
+    """Places of the plates of an instrument (`patched`) with a possible air gap ahead of them."""
     return tuple(numbers[0][-1] for numbers in _numbers(instrument))
 
 
@@ -122,22 +122,22 @@ def vector_slots(instrument: Instrument) -> dict[Slot, int]:
     for (train, elements), numbers in zip(trains(instrument).items(), places, strict=True):
         for element, (ahead, behind) in zip(elements, itertools.pairwise(numbers), strict=True):
             where = {"ahead of": ahead, "behind": behind, "of": behind}
-            names |= {(one, f"{train}{element.name}"): number for one, number in where.items()}
+            names |= {(side, f"{train}{element.name}"): number for side, number in where.items()}
     for arm, numbers in zip(instrument.arms, places[1:], strict=True):
         names["ahead of", f"{arm.name}.{arm.analyser.name}"] = numbers[-1]
-    found: dict[Slot, int] = {}
+    positions: dict[Slot, int] = {}
     kinds = list(itertools.product((0, 1), GENERATORS))
     count = 1 + places[-1][-1]
     for i, (colour, kind) in enumerate(kinds):
-        found |= {("inserted", kind, *name, colour): i * count + number for name, number in names.items()}
+        positions |= {("inserted", kind, *name, colour): i * count + number for name, number in names.items()}
     first, numbers = len(kinds) * count, _numbers(instrument)
     for plate in numbers:
-        found |= {slot: first + t for t, slot in enumerate(plate)}
+        positions |= {slot: first + t for t, slot in enumerate(plate)}
         first += max(map(len, numbers))
     cameras = range(len(instrument.cameras))
     mixed = [("mixed", *pair) for pair in itertools.product(cameras, cameras)]
-    rest = [*_whole(instrument), *(("throughput", camera) for camera in cameras), *mixed]
-    return found | {slot: first + i for i, slot in enumerate(rest)}
+    further = [*_whole(instrument), *(("throughput", camera) for camera in cameras), *mixed]
+    return positions | {slot: first + i for i, slot in enumerate(further)}
 
 
 # ------------------------------------------------------------------------------------------------ analysis vectors
@@ -151,7 +151,7 @@ class VectorSlopes(NamedTuple):
 
 
 class _Banded(NamedTuple):
-    """Band sums of the rows that the analysers see, and slopes: of generators at places, of plates, all together."""
+    """Band sums of the rows of the analysers, and slopes: of generators at places, of plates, all together."""
 
     rows: Float[Array, "b r 4"]
     inserted: Float[Array, "m g h b r 4"]
@@ -162,32 +162,32 @@ class _Banded(NamedTuple):
 def vector_slopes(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> VectorSlopes:
     """Slopes of the analysis vectors at a field point (deg)."""
     instrument = instrument.patched()
-    numbers, whole, cameras = _numbers(instrument), _whole(instrument), len(instrument.cameras)
-    most = max(map(len, numbers), default=0)
+    numbers, overall, cameras = _numbers(instrument), _whole(instrument), len(instrument.cameras)
+    longest = max(map(len, numbers), default=0)
 
     def moved(sizes: Float[Array, " t"]) -> Instrument:
-        each = [*(pair for plate in numbers for pair in enumerate(plate)), *enumerate(whole, most)]
-        return patched(instrument, [(Change(*slot[1:]), sizes[t]) for t, slot in each])
+        indexed = [*(pair for plate in numbers for pair in enumerate(plate)), *enumerate(overall, longest)]
+        return patched(instrument, [(Change(*slot[1:]), sizes[t]) for t, slot in indexed])
 
     def mean(shift: Scalar) -> Float[Array, " b"]:
-        return light.mean_wavelengths(patched(instrument, [(Change(*whole[-1][1:]), shift)]), plan)
+        return light.mean_wavelengths(patched(instrument, [(Change(*overall[-1][1:]), shift)]), plan)
 
-    found = _banded(plan, (x, y), moved, (most, len(whole)), jnp.zeros(1))
-    rows = jnp.concatenate([part.reshape(-1, *found.rows.shape) for part in found[1:]])
+    banded = _banded(plan, (x, y), moved, (longest, len(overall)), jnp.zeros(1))
+    rows = jnp.concatenate([block.reshape(-1, *banded.rows.shape) for block in banded[1:]])
     shifted = jax.jacfwd(mean)(jnp.zeros(()))
     means = jnp.zeros((len(rows), len(shifted))).at[-1].set(shifted)
     neutral = (
-        found.rows,
+        banded.rows,
         light.mean_wavelengths(instrument, plan),
         instrument.throughput.at(x, y),
         jnp.zeros(cameras**2),
     )
     value, push = jax.linearize(functools.partial(_vectors, instrument, (x, y)), *neutral)
-    none = [jnp.zeros_like(one) for one in neutral]
+    zeros = [jnp.zeros_like(tangent) for tangent in neutral]
     slopes = (
-        jax.vmap(lambda one, mean: push(one, mean, *none[2:]))(rows, means),
-        jax.vmap(lambda one: push(*none[:2], one, none[3]))(jnp.diag(neutral[2])),
-        jax.vmap(lambda one: push(*none[:3], one))(jnp.eye(cameras**2)),
+        jax.vmap(lambda tangent, mean: push(tangent, mean, *zeros[2:]))(rows, means),
+        jax.vmap(lambda tangent: push(*zeros[:2], tangent, zeros[3]))(jnp.diag(neutral[2])),
+        jax.vmap(lambda tangent: push(*zeros[:3], tangent))(jnp.eye(cameras**2)),
     )
     return VectorSlopes(value, jnp.concatenate(slopes))
 
@@ -199,11 +199,11 @@ def fringe_slopes(
     instrument = instrument.patched()
 
     def moved(sizes: Float[Array, " t"]) -> Instrument:
-        """Air without thickness: no fringes, and all else of it."""
-        own = instrument
+        """Air without thickness: no fringes, but all its other effects."""
+        changed = instrument
         for place in fringe_places(instrument):
-            own = with_air_gap(own, place, sizes[0], jnp.zeros(()))
-        return own
+            changed = with_air_gap(changed, place, sizes[0], jnp.zeros(()))
+        return changed
 
     def vectors(rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
         none = jnp.zeros(len(instrument.cameras) ** 2)
@@ -216,8 +216,8 @@ def fringe_slopes(
             none,
         )
 
-    found = _banded(plan, (x, y), moved, (1, 0), gaps)
-    return jax.vmap(jax.vmap(jax.linearize(vectors, found.rows)[1]))(found.plates[:, :, 0])
+    banded = _banded(plan, (x, y), moved, (1, 0), gaps)
+    return jax.vmap(jax.vmap(jax.linearize(vectors, banded.rows)[1]))(banded.plates[:, :, 0])
 
 
 def _vectors(
@@ -255,62 +255,72 @@ def _summed(
     gaps: Float[Array, " g"],
     stretch: Scalar,
 ) -> _Banded:
-    """The same at wavelengths times a factor, without what differs between beams."""
+    """The same at wavelengths times a factor, without the differences between beams."""
     states, conditions = [state for state, _, _ in plan.settings], plan.conditions
     if "temperature" not in conditions.planned:  # the thermal change of one kelvin
         warm = jnp.full_like(plan.wavelength, REFERENCE_TEMPERATURE + 1.0)
         conditions = Conditions(conditions.band_width, {**conditions.planned, "temperature": warm})
 
-    def stations(own: Instrument) -> list[list[fold.Station]]:
-        common, *arms = trains(own).values()
-        spectrum = stretch * light.node_wavelengths(own, plan), conditions
+    def stations(instrument: Instrument) -> list[list[fold.Station]]:
+        common, *arms = trains(instrument).values()
+        spectrum = stretch * light.node_wavelengths(instrument, plan), conditions
         first, ray = fold.stations(common, Ray.entering(*at, spectrum))
         return [first, *(fold.stations(arm, ray)[0] for arm in arms)]
 
     def solved(sizes: Float[Array, " t"]) -> tuple[fold.Solved, Float[Array, "b n"]]:
-        own = moved(sizes)
-        every = list(itertools.chain(*stations(own)))
-        return fold.solved(every, plan.moving, states), light.band_weights(own, plan)
+        changed = moved(sizes)
+        all_stations = list(itertools.chain(*stations(changed)))
+        return fold.solved(all_stations, plan.moving, states), light.band_weights(changed, plan)
 
     single, together = sizes
     nothing = jnp.zeros(single + together)
     (matrices, weights), push = jax.linearize(solved, nothing)
     slopes, weight_slopes = jax.vmap(push)(jnp.eye(len(nothing)))
     common, *arms = stations(neutral := moved(nothing))
-    analysers, every = [arm.analyser for arm in neutral.arms], list(itertools.chain(common, *arms))
+    analysers, all_stations = [arm.analyser for arm in neutral.arms], list(itertools.chain(common, *arms))
     folded = fold.around(common, arms, analysers, matrices, plan.moving, states, len(plan.wavelength))
-    sides = [(behind, ahead) for one in folded for (_, ahead), (behind, _) in itertools.pairwise(one)]
+    sides = [
+        (behind, ahead)
+        for folded_train in folded
+        for (_, ahead), (behind, _) in itertools.pairwise(folded_train)
+    ]
     rows, sums = folded[0][0][0], functools.partial(light.integrated, plan)
 
-    def pushed(number: int, some: slice) -> Float[Array, "t c n r 4"]:
+    def pushed(number: int, selection: slice) -> Float[Array, "t c n r 4"]:
         """Rows for some changes of the matrix of a station."""
-        own = {key: each[some] for key, each in slopes.items() if key[0] == number and each is not None}
-        if not own:
-            return jnp.zeros((len(nothing[some]), *rows.shape))
+        tangents = {
+            key: tangent[selection]
+            for key, tangent in slopes.items()
+            if key[0] == number and tangent is not None
+        }
+        if not tangents:
+            return jnp.zeros((len(nothing[selection]), *rows.shape))
         behind, ahead = sides[number]
 
-        def change(own: fold.Solved) -> Float[Array, "c n r 4"]:
-            matrix = fold.stacked(own, number, every[number][0], plan.moving, states, jnp.zeros((4, 4)))
+        def change(tangents: fold.Solved) -> Float[Array, "c n r 4"]:
+            matrix = fold.stacked(
+                tangents, number, all_stations[number][0], plan.moving, states, jnp.zeros((4, 4))
+            )
             assert matrix is not None
             return behind @ matrix @ ahead
 
-        return jax.vmap(change)(own)
+        return jax.vmap(change)(tangents)
 
     wavelength = stretch * light.node_wavelengths(neutral, plan)
     moments = weights, weights * (wavelength / neutral.units.wavelength - 1.0)
     inserted = _inserted(plan, moments, _places(neutral), folded)
     plates = [jnp.zeros((0, len(gaps), single, *sums(weights, rows).shape))]
-    for number, (element, ray) in enumerate(every):
+    for number, (element, ray) in enumerate(all_stations):
         if _is_plate(element):
             change = pushed(number, slice(single))
             waves = jax.vmap(fringe, (0, None))(gaps, ray)
             plates.append(jax.vmap(lambda wave, change=change: sums(wave * weights, change))(waves)[None])
-    whole = sum(
-        (pushed(number, slice(single, None)) for number in range(len(every))),
+    overall = sum(
+        (pushed(number, slice(single, None)) for number in range(len(all_stations))),
         jnp.zeros((together, *rows.shape)),
     )
-    shifted = jax.vmap(lambda own: sums(own, rows))(weight_slopes[single:])
-    return _Banded(sums(weights, rows), inserted, jnp.concatenate(plates), sums(weights, whole) + shifted)
+    shifted = jax.vmap(lambda slope: sums(slope, rows))(weight_slopes[single:])
+    return _Banded(sums(weights, rows), inserted, jnp.concatenate(plates), sums(weights, overall) + shifted)
 
 
 def _inserted(
@@ -320,13 +330,13 @@ def _inserted(
     folded: list[list[tuple[Float[Array, "c n r 4"], Float[Array, "c n 4 4"]]]],
 ) -> Float[Array, "m g h b r 4"]:
     """Slopes in generators at every place, for some weights of the nodes."""
-    generators, found = _generators(), []
+    generators, slopes = _generators(), []
     for place, (behind, ahead) in zip(itertools.chain(*places), itertools.chain(*folded), strict=True):
-        if place == len(found):
+        if place == len(slopes):
             pairs = jnp.einsum("cnri,cnjk->ijcnrk", behind, ahead)
-            each = jnp.stack([light.integrated(plan, weights, pairs) for weights in moments])
-            found.append(jnp.einsum("gij,mijbrk->mgbrk", generators, each))
-    return jnp.stack(found, 2)
+            products = jnp.stack([light.integrated(plan, weights, pairs) for weights in moments])
+            slopes.append(jnp.einsum("gij,mijbrk->mgbrk", generators, products))
+    return jnp.stack(slopes, 2)
 
 
 def _generators() -> Float[Array, "g 4 4"]:
@@ -345,8 +355,8 @@ def _generators() -> Float[Array, "g 4 4"]:
 class LightSlopes(NamedTuple):
     """Stokes vectors behind the place of the polariser, per exposure, and their slopes in `light_slots`.
 
-    Counts are the product of the analysis vectors with `taken`, what a camera takes of the light with everything that
-    the cameras do in single exposures; `factor` is that for a change of the light.
+    Counts are the product of the analysis vectors with `taken`, the light in a camera with all responses of the cameras
+    in single exposures; `factor` is the response to a change of the light.
     """
 
     stokes: Float[Array, "e 4"]
@@ -358,15 +368,15 @@ class LightSlopes(NamedTuple):
 def light_slots(instrument: Instrument) -> dict[Slot, int]:
     """Positions of the slots of the light of an instrument (`patched`); of a single star it is that of all."""
     polariser = instrument.polariser
-    found: list[Slot] = [("rotator", "of", SKY)]
+    slots: list[Slot] = [("rotator", "of", SKY)]
     if any(isinstance(source, MoonSky) for source in instrument.sources):
-        found += [(kind, "of", SKY) for kind in OF_SOURCES]
+        slots += [(kind, "of", SKY) for kind in OF_SOURCES]
     if instrument.standard.names:
-        found += [(kind, "of", Standards.name) for kind in (*OF_QU, "rotator")]
+        slots += [(kind, "of", Standards.name) for kind in (*OF_QU, "rotator")]
     if polariser is not None:
-        found += [(kind, "of", polariser.name) for kind in (*OF_POLARISER, *GENERATORS)]
-        found += [(kind, "ahead of", polariser.name) for kind in (*GENERATORS, *ADDED)]
-    return {("light", *slot): i for i, slot in enumerate(found)}
+        slots += [(kind, "of", polariser.name) for kind in (*OF_POLARISER, *GENERATORS)]
+        slots += [(kind, "ahead of", polariser.name) for kind in (*GENERATORS, *ADDED)]
+    return {("light", *slot): i for i, slot in enumerate(slots)}
 
 
 def light_slopes(instrument: Instrument, sight: Sight) -> LightSlopes:
@@ -380,11 +390,11 @@ def light_slopes(instrument: Instrument, sight: Sight) -> LightSlopes:
 
     value, push = jax.linearize(stokes, jnp.zeros(len(slots)))
     factor, share = jnp.ones((count, len(instrument.cameras))), jnp.zeros((count, len(instrument.cameras)))
-    for part in instrument.cameras.exposures:
-        own = part.factors(exposures, x, y)
-        factor, share = factor * own, share * own + part.share(exposures, x, y)
-    taken = (factor[..., None] * value[:, None]).at[..., 0].add(share)
-    return LightSlopes(value, jax.vmap(push)(jnp.eye(len(slots))), taken, factor)
+    for gain in instrument.cameras.exposures:
+        factors = gain.factors(exposures, x, y)
+        factor, share = factor * factors, share * factors + gain.share(exposures, x, y)
+    response = (factor[..., None] * value[:, None]).at[..., 0].add(share)
+    return LightSlopes(value, jax.vmap(push)(jnp.eye(len(slots))), response, factor)
 
 
 def _lit(instrument: Instrument, sizes: dict[Slot, Scalar], count: int) -> Instrument:
@@ -398,22 +408,24 @@ def _lit(instrument: Instrument, sizes: dict[Slot, Scalar], count: int) -> Instr
             terms.append((Change(*slot), size))
     instrument = patched(instrument, terms)
     if sources[SKY]:
-        every = MoonPatches(*(jnp.full(count, one) for one in sources[SKY]), positions=tuple(range(count)))
+        patches = MoonPatches(
+            *(jnp.full(count, component) for component in sources[SKY]), positions=tuple(range(count))
+        )
         instrument = instrument.changed(
-            SKY, patches=lambda there: every if there is None else there.joined(every)
+            SKY, patches=lambda old: patches if old is None else old.joined(patches)
         )
     if sources[Standards.name]:
         q, u = sources[Standards.name]
-        instrument = instrument.changed(Standards.name, q=lambda there: there + q, u=lambda there: there + u)
+        instrument = instrument.changed(Standards.name, q=lambda old: old + q, u=lambda old: old + u)
     return instrument
 
 
-def generators_ahead(instrument: Instrument, some: Sequence[Slot]) -> dict[Slot, Float[np.ndarray, "4 4"]]:
+def generators_ahead(instrument: Instrument, slots: Sequence[Slot]) -> dict[Slot, Float[np.ndarray, "4 4"]]:
     """Slopes of Mueller matrices in slots of the light ahead of the polariser of an instrument (`patched`)."""
     zero = array(0.0)
 
     def matrices(size: Scalar) -> list[Any]:
-        each = [patched(instrument, [(Change(*slot[1:]), size)]) for slot in some]
-        return [one.telescope()[-1].mueller(Ray.entering(zero, zero)) for one in each]
+        instruments = [patched(instrument, [(Change(*slot[1:]), size)]) for slot in slots]
+        return [changed.telescope()[-1].mueller(Ray.entering(zero, zero)) for changed in instruments]
 
-    return dict(zip(some, map(np.asarray, compiled(jax.jacfwd(matrices))(zero)), strict=True))
+    return dict(zip(slots, map(np.asarray, compiled(jax.jacfwd(matrices))(zero)), strict=True))

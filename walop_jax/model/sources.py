@@ -1,11 +1,10 @@
-"""Sources of light, one class for each KIND of exposures; `SOURCES` lists those that every instrument can look at.
+"""Sources of light, one class for each KIND of exposures; `SOURCES` lists those of every instrument.
 
 Moon sky    (q, u) = δ (q₁, u₁) − p (q₁, u₁)/|(q₁, u₁)| + (q_e, u_e), (q₁, u₁) single Rayleigh scattering:
             p₁ = sin²γ / (1 + cos²γ), perpendicular to the scattering plane; γ angle from the Moon; δ depolarisation,
-            one for all patches and wavelengths; p degree that multiple scattering takes away; q_e, u_e what a patch has
-            beyond it
+            one for all patches and wavelengths; p degree lost by multiple scattering; q_e, u_e excess of a patch
 Standards   (q + iu) in the instrument frame = (Q + iU) exp(−2i ROTATOR), catalogue values in the equatorial frame.
-            A star with a colour has in a band b what it has in the band a of its value, times
+            The polarisation of a star with a colour in a band b is that in the band a of its value, times
             ⟨p⟩_b/⟨p⟩_a exp(2i turn (λ_b − λ_a)), p(λ) = exp(−K ln²(λmax/λ)), K = 1.66 λmax + 0.01, ⟨ ⟩ the mean over
             the photons of a band, λ (µm) their mean wavelength; inside a band it changes by its slope there
 Sources     Maharana et al. 2022, Paper II, eq. 8; multiple scattering: Berry, Dennis & Lee 2004, New J. Phys. 6, 162;
@@ -40,14 +39,14 @@ SHORTEST = 0.2  # µm: no λmax below
 
 
 class ExposureArrays(eqx.Module):
-    """Exposures as the light path needs to know them, one element each; `median` only where it is asked for.
+    """Exposures in the arrays of the light path, one element each; `median` only where needed.
 
     `kind` counts the kinds of `kinds`. Angles in radians; `clp_angle` is 0 when the polariser is out, `rotator` where
-    it has no meaning; `shared` is 1 where an exposure belongs to a group that has its fluxes in common, None: no
-    exposures have. `moving` holds angles of elements that move behind the polariser (NaN: out). `hours` since the first
-    exposure, temperature in Celsius, hour angle in h, exposure time in s. Where standards have a colour, `colour` holds
-    mean wavelength and rms width (µm) of the photons of each of them behind the filter, `slope_band` the band that is
-    weighted with the distance from its mean wavelength (`Plan.slope`).
+    it has no meaning; `shared` is 1 for an exposure of a group with common fluxes, None: no such groups. `moving` holds
+    angles of elements that move behind the polariser (NaN: out). `hours` since the first exposure, temperature in
+    Celsius, hour angle in h, exposure time in s. Where standards have a colour, `colour` holds mean wavelength and rms
+    width (µm) of the photons of each of them behind the filter, `slope_band` the band that is weighted with the
+    distance from its mean wavelength (`Plan.slope`).
     """
 
     kind: Int[Array, " e"]
@@ -68,7 +67,7 @@ class ExposureArrays(eqx.Module):
 
     @property
     def wavelength(self) -> Any:
-        """Mean wavelengths (µm) of the filters, as the first star sees them; the usual one where no colour matters."""
+        """Mean wavelengths (µm) of the filters, for the first star; the reference wavelength without colours."""
         return REFERENCE_WAVELENGTH if self.colour is None else self.colour[:, 0, 0]
 
     @property
@@ -100,8 +99,8 @@ class Sight(NamedTuple):
 class Source(Component):
     """Light of one KIND of exposures: its polarisation ahead of the instrument, per unit of flux.
 
-    `kind` is what EXPOSURES says, `facts` what is true of all its exposures; `reference` is the source of what is
-    assumed about it.
+    `kind` is the KIND in EXPOSURES, `facts` are the properties of all its exposures; `reference` is the source of its
+    assumptions.
     """
 
     name: ClassVar[str] = ""
@@ -110,11 +109,11 @@ class Source(Component):
     reference: ClassVar[str] = ""
 
     def shines(self, sight: Sight) -> Bool[Array, " e"]:
-        """The exposures that see it."""
+        """True for its exposures."""
         return jnp.asarray(sight.exposures.of_kind(self.kind))
 
     def polarisation(self, sight: Sight) -> Float[Array, "e 2"]:
-        """(q, u) in the instrument frame; unpolarised unless a source says otherwise."""
+        """(q, u) in the instrument frame; unpolarised by default."""
         return jnp.zeros((sight.exposures.kind.shape[0], 2))
 
 
@@ -132,7 +131,7 @@ class MoonPatches(Component):
     positions: tuple[int, ...] = eqx.field(static=True, default=())
 
     def joined(self, other: MoonPatches) -> MoonPatches:
-        """These and others; what both have adds up."""
+        """The union of both; common patches add up."""
         q, u = jnp.concatenate([self.q, other.q]), jnp.concatenate([self.u, other.u])
         return MoonPatches(q, u, (*self.positions, *other.positions))
 
@@ -155,11 +154,11 @@ class MoonSky(Source):
     reference: ClassVar[str] = f"{PAPER_II}, eq. 8"
 
     def shines(self, sight: Sight) -> Bool[Array, " e"]:
-        """Moon exposures that are not taken through the polariser."""
+        """Moon exposures without the polariser."""
         return super().shines(sight) & ~sight.exposures.clp_in
 
     def polarisation(self, sight: Sight) -> Float[Array, "e 2"]:
-        """That of the patch."""
+        """Polarisation of the patch."""
         sky = sight.sky
         qu = self.depolarisation * sky
         if self.missing is not None:
@@ -187,8 +186,8 @@ class Standards(Source):
     """Catalogue Stokes parameters of the standard stars.
 
     There is a value for each of `names`; `stars` holds for each the first value of its star, `bands` mean wavelength
-    and rms width (µm) of the band that it is of. Both are empty where no star has a colour: then a value holds for any
-    light. `unknown` are values of which no band is known, but that it is one of those that the star was seen in.
+    and rms width (µm) of its band. Both are empty without colours: then a value holds for any light. `unknown` are
+    values of an unknown band among those in which the star was observed.
     `changes` are added to the values in single exposures.
     """
 
@@ -227,12 +226,12 @@ class Standards(Source):
         lmax: float = LMAX,
     ) -> Standards:
         """Standards that follow the law of interstellar polarisation from band to band."""
-        each = len(set(stars))
+        count = len(set(stars))
         numbers: dict[str, Any] = {
             "q": qu[0],
             "u": qu[1],
-            "lmax": np.full(each, lmax),
-            "turn": np.zeros(each),
+            "lmax": np.full(count, lmax),
+            "turn": np.zeros(count),
             "wavelength": [bands[i][0] for i in unknown],
         }
         return cls(
@@ -253,23 +252,23 @@ class Standards(Source):
         return tuple(f"{name}.{field}" for name in names)
 
     def shines(self, sight: Sight) -> Bool[Array, " e"]:
-        """Whatever has a star as its source."""
-        seen = sight.source >= 0
-        return seen if self.names else jnp.zeros_like(seen)
+        """True for exposures with a star as their source."""
+        has_star = sight.source >= 0
+        return has_star if self.names else jnp.zeros_like(has_star)
 
     def values(self, source: Int[Any, "*p e"], colour: Float[Any, "e s 2"] | None) -> Int[Any, "*p e"]:
-        """The value that each exposure of a source goes by: that of its star whose band is the nearest; −1 for none."""
+        """The value of a source in each exposure: that of its star with the nearest band; −1 for none."""
         if colour is None or len(set(self.stars)) == len(self.names):
             return source
-        seen = colour[jnp.arange(source.shape[-1]), source, 0]
-        distance = jnp.abs(seen[..., None] - jnp.array([wavelength for wavelength, _ in self.bands]))
+        observed = colour[jnp.arange(source.shape[-1]), source, 0]
+        distance = jnp.abs(observed[..., None] - jnp.array([wavelength for wavelength, _ in self.bands]))
         nearest = jnp.argmin(
             jnp.where(jnp.array(self.stars) == source[..., None], distance, jnp.inf), axis=-1
         )
         return jnp.where(source >= 0, nearest, -1)
 
     def polarisation(self, sight: Sight) -> Float[Array, "e 2"]:
-        """That of the star of each exposure, its mean over the band."""
+        """Polarisation of the star of each exposure, the mean over the band."""
         if not self.names:
             return super().polarisation(sight)
         return self._seen(sight)[0]
@@ -283,25 +282,25 @@ class Standards(Source):
         colour = sight.exposures.colour
         row = jnp.maximum(self.values(sight.source, colour), 0)
         qu, rotator = jnp.stack([self.q[row], self.u[row]], axis=-1), sight.exposures.rotator
-        for one in self.changes:
-            qu = qu.at[:, one.axis].add(
-                jnp.where(row == one.value, one.size * one.factor(sight.exposures), 0.0)
+        for change in self.changes:
+            qu = qu.at[:, change.axis].add(
+                jnp.where(row == change.value, change.size * change.factor(sight.exposures), 0.0)
             )
         if self.angle is not None:
             rotator = rotator - jnp.deg2rad(self.angle)
         if colour is None or not self.bands:
             return turned(qu, rotator), jnp.zeros_like(qu)
         first, number = np.unique(self.stars, return_inverse=True)
-        here = colour[jnp.arange(len(row)), jnp.asarray(first[number])[row]]
-        there = jnp.array(self.bands).at[np.array(self.unknown, int), 0].set(self.wavelength)[row]
+        band = colour[jnp.arange(len(row)), jnp.asarray(first[number])[row]]
+        catalogue_band = jnp.array(self.bands).at[np.array(self.unknown, int), 0].set(self.wavelength)[row]
         star = jnp.asarray(number)[row]
         lmax, turn = jnp.maximum(self.lmax[star], SHORTEST), jnp.deg2rad(self.turn[star])
-        degree = mean_over_band(lmax, here) / mean_over_band(lmax, there)
-        seen = turned(degree[:, None] * qu, rotator - turn * (here[:, 0] - there[:, 0]))
+        degree = mean_over_band(lmax, band) / mean_over_band(lmax, catalogue_band)
+        observed = turned(degree[:, None] * qu, rotator - turn * (band[:, 0] - catalogue_band[:, 0]))
         # d/dλ of p exp(2i angle), relative to it
-        rising = 2.0 * width_of_law(lmax) * jnp.log(lmax / here[:, 0]) / here[:, 0]
-        across = jnp.stack([-seen[:, 1], seen[:, 0]], axis=-1)
-        return seen, rising[:, None] * seen + 2.0 * turn[:, None] * across
+        rising = 2.0 * width_of_law(lmax) * jnp.log(lmax / band[:, 0]) / band[:, 0]
+        across = jnp.stack([-observed[:, 1], observed[:, 0]], axis=-1)
+        return observed, rising[:, None] * observed + 2.0 * turn[:, None] * across
 
 
 def width_of_law(lmax: Array) -> Array:

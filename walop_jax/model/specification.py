@@ -1,4 +1,4 @@
-"""The model as a list of parameters beside their instrument: what is free, tied, known beforehand.
+"""The model as a list of parameters beside their instrument: free or tied ones, with priors.
 
 Three things of one shape: values, freedom and priors. Names come from the tree (`parameters.leaves`).
 """
@@ -27,15 +27,15 @@ from walop_jax.model.parameters import Parameter, check_names, leaves, unknown_n
 
 Vector = Float[np.ndarray, " n"]
 THROUGHPUT = "throughput"
-"""The part of an instrument that is a smooth map: its terms mean nothing one by one."""
+"""The part of an instrument that is a smooth map: single terms of it have no meaning."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Model(Displayed):
-    """An instrument with what may vary in it. Immutable: every change returns a new model.
+    """An instrument with its parameters. Immutable: every change returns a new model.
 
-    `catalogue` are the effects that it may be given by name, `laws` how parameters may change from night to night: the
-    [law] tables of a model file (`model.laws`), which a fit of one set does not need.
+    `catalogue` are the effects available by name, `laws` the changes of parameters from night to night: the [law]
+    tables of a model file (`model.laws`), unused in a fit of one set.
 
     >>> model = walop.base_model(calset)
     >>> model.names[:2]
@@ -49,7 +49,7 @@ class Model(Displayed):
     laws: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def display(self) -> Display:
-        """The number of parameters, and those of them that are not terms of the throughput."""
+        """The number of parameters, and all of them but the terms of the throughput."""
         effects = ", ".join(self.effect_names) or "none beyond the base model"
         counts = f"{len(self.parameters)} parameters, {len(self.free)} free"
         rows = tuple(
@@ -63,7 +63,7 @@ class Model(Displayed):
         return Display(f"Model of {self.name}: {counts}; effects: {effects}", (), head, rows, note)
 
     def to_table(self) -> Any:
-        """All parameters as an astropy table: start value, unit, prior, whether it is free, and what it is."""
+        """All parameters as an astropy table: start value, unit, prior, state and meaning."""
         priors = np.array([p.prior or (np.nan, np.nan) for p in self.parameters]).reshape(-1, 2)
         columns: Mapping[str, tuple[np.ndarray, str, str]] = {
             "NAME": (np.array(self.names), "", "parameter"),
@@ -94,12 +94,12 @@ class Model(Displayed):
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """The active effects, in the order light meets them."""
+        """The active effects, in the order of the light path."""
         return tuple(effect for effect in self.template.effects if isinstance(effect, Effect))
 
     @property
     def effect_names(self) -> tuple[str, ...]:
-        """Names of the active effects, in the order light meets them."""
+        """Names of the active effects, in the order of the light path."""
         return tuple(effect.name for effect in self.template.effects)
 
     def __getitem__(self, name: str) -> Parameter:
@@ -114,11 +114,11 @@ class Model(Displayed):
 
     def positions(self, component: str) -> Int[np.ndarray, " _"]:
         """Positions of the parameters of a part or an effect, in tree order; none where the model has none."""
-        parts = (f"{p.part}." for p in self.parameters)
-        return np.array([i for i, part in enumerate(parts) if part.startswith(f"{component}.")], int)
+        owners = (f"{p.part}." for p in self.parameters)
+        return np.array([i for i, owner in enumerate(owners) if owner.startswith(f"{component}.")], int)
 
     def change(self, name: str, **changes: Any) -> Model:
-        """The model with fields of one parameter replaced. Raises ValueError for values that mean nothing."""
+        """The model with fields of one parameter replaced. Raises ValueError for meaningless values."""
         i = self.index(name)
         check_names("field of a parameter", changes, Parameter.__dataclass_fields__)
         changed = dataclasses.replace(self.parameters[i], **changes).checked()
@@ -130,7 +130,7 @@ class Model(Displayed):
 
     @property
     def masters(self) -> Int[np.ndarray, " n"]:
-        """For each parameter the position of the one that sets its value: its master if it is tied, else itself."""
+        """For each parameter the position of its master: the parameter of its tie, else itself."""
         place = {p.name: i for i, p in enumerate(self.parameters)}
         return np.array([place[p.tie or p.name] for p in self.parameters], int)
 
@@ -149,9 +149,9 @@ class Model(Displayed):
         return (self.masters[:, None] == self.free).astype(float)
 
     def full(self, free_values: Float[np.ndarray, " f"], others: Vector | None = None) -> Vector:
-        """All parameters from the values of the free ones: those that do not vary from `others` (default: the start).
+        """All parameters from the values of the free ones, the fixed ones from `others` (default: the start).
 
-        A tied parameter has the value of its master, whatever `others` holds for it.
+        A tied parameter has the value of its master, not that in `others`.
         """
         values = self.start if others is None else np.array(others, float)
         values[self.free] = free_values
@@ -160,7 +160,7 @@ class Model(Displayed):
     def thicknesses(self) -> dict[int, Layer]:
         """The free parameters that are thicknesses of crystal layers, by position, each with its layer.
 
-        The layers next to the air behind each plate come first; a thickness that several layers share is there once.
+        The layers next to the air behind each plate come first; a thickness shared by several layers is listed once.
         """
         behind: dict[int, Layer] = {}
         inside: dict[int, Layer] = {}
@@ -175,15 +175,15 @@ class Model(Displayed):
         return behind | {master: layer for master, layer in inside.items() if master not in behind}
 
     def gaps(self) -> tuple[int, ...]:
-        """Positions of the free thicknesses of air gaps ahead of plates, which effects alone have."""
+        """Positions of the free thicknesses of air gaps ahead of plates, all from effects."""
         if not any(plate.air_gaps for _, plate in _wave_plates(self.template.patched())):
             return ()
 
         def moves_one(position: int) -> bool:
             marked = self.start
             marked[position] = np.nan
-            there = _wave_plates(self.instrument(marked[self.masters]).patched())
-            return any(bool(np.isnan(gap.gap)) for _, plate in there for gap in plate.air_gaps)
+            plates = _wave_plates(self.instrument(marked[self.masters]).patched())
+            return any(bool(np.isnan(gap.gap)) for _, plate in plates for gap in plate.air_gaps)
 
         of_effects = {i for name in self.effect_names for i in self.positions(name).tolist()}
         return tuple(i for i in self.free.tolist() if i in of_effects and moves_one(i))
@@ -223,9 +223,9 @@ def make_model(
     priors: Mapping[str, tuple[float, float]] | None = None,
     frozen: Sequence[str] = (),
 ) -> Model:
-    """The model of an instrument at its nominal values with the priors that its components declare.
+    """The model of an instrument at its nominal values with the priors of its declarations.
 
-    `priors` adds priors by name (catalogue errors of standards), `frozen` names parameters that do not vary.
+    `priors` adds priors by name (catalogue errors of standards), `frozen` names fixed parameters.
     """
     priors = dict(priors or {})
     parameters = [
@@ -241,7 +241,7 @@ def make_model(
 
 
 def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
-    """Facts about a data set for effects: its Moon exposures, its standards, how many exposures."""
+    """Facts about a data set for effects: its Moon exposures, its standards, its number of exposures."""
     moon = np.flatnonzero(exposures.direct("moon"))
     return Context(
         exposures=len(exposures),
@@ -255,11 +255,11 @@ def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
 
 
 def with_effects(model: Model, effects: Sequence[str | EffectKind | Effect], context: Context) -> Model:
-    """The model with effects added, in the order light meets them; what it had stays as it was.
+    """The model with effects added, in the order of the light path, otherwise unchanged.
 
-    A name or a class adds the effect at its neutral value, at the shape of its first probe; an instance starts where it
-    stands. Priors are centred on neutral, with the widths of the declarations. Raises ValueError for a name
-    that does not exist, for an effect that is there already, and for two that state one number.
+    A name or a class adds the effect at its neutral value, at the shape of its first probe; an instance starts at its
+    values. Priors are centred on neutral, with the widths of the declarations. Raises ValueError for an unknown
+    name, for a duplicate effect, and for two effects on one number.
 
     >>> context = walop.ObservingPlan(grid=3).context()
     >>> walop.with_effects(walop.base_model(calset), ["hwp1_axis"], context).effect_names
@@ -271,36 +271,38 @@ def with_effects(model: Model, effects: Sequence[str | EffectKind | Effect], con
         if not isinstance(effect, Effect):
             kind = effect_by_name(effect, model.catalogue) if isinstance(effect, str) else effect
             effect = next((group[0] for group in kind.probes(context)), kind.neutral(context))
-        if effect.name in (other.name for other in active):
+        if effect.name in (present.name for present in active):
             raise ValueError(f"effect {effect.name!r} is in the model already")
         active.append(effect)
         neutral = effect.at_neutral(context)
         names = [f"{effect.name}.{leaf.name}" for leaf in leaves(effect)]
         values = zip(np.asarray(values_of(effect)), np.asarray(values_of(neutral)), strict=True)
         starts |= dict(zip(names, values, strict=True))
-    told = {text for effect in active if isinstance(effect, Described) for text in effect.sentences}
+    sentences = {text for effect in active if isinstance(effect, Described) for text in effect.sentences}
     for effect in active:
-        for text in told.intersection(effect.stated):
+        for text in sentences.intersection(effect.stated):
             raise ValueError(
                 f"effect {effect.name!r} is the number that {text!r} adds to: leave one of them out"
             )
     instrument = dataclasses.replace(model.template, effects=in_order(active))
-    jax.eval_shape(lambda i: i.patched(), instrument)  # whatever does not fit the instrument is an error here
-    known = {p.name: p for p in model.parameters}
+    jax.eval_shape(
+        lambda i: i.patched(), instrument
+    )  # an effect that does not fit the instrument is an error here
+    by_name = {p.name: p for p in model.parameters}
     parameters = []
     for p in make_model(model.name, instrument).parameters:
         if p.name in starts:
             start, neutral = map(float, starts[p.name])
             prior = None if p.prior is None else (neutral, p.prior[1])
-            known[p.name] = dataclasses.replace(p, start=start, prior=prior)
-        parameters.append(known[p.name])
+            by_name[p.name] = dataclasses.replace(p, start=start, prior=prior)
+        parameters.append(by_name[p.name])
     return dataclasses.replace(model, template=jax.tree.map(array, instrument), parameters=tuple(parameters))
 
 
 def model_without(model: Model, name: str) -> Model:
-    """The model with one effect taken out."""
-    rest = tuple(effect for effect in model.template.effects if effect.name != name)
-    own = model.positions(name)
-    parameters = tuple(p for i, p in enumerate(model.parameters) if i not in own)
-    template = dataclasses.replace(model.template, effects=rest)
+    """The model without one effect."""
+    effects = tuple(effect for effect in model.template.effects if effect.name != name)
+    removed = model.positions(name)
+    parameters = tuple(p for i, p in enumerate(model.parameters) if i not in removed)
+    template = dataclasses.replace(model.template, effects=effects)
     return dataclasses.replace(model, template=template, parameters=parameters)

@@ -1,4 +1,4 @@
-"""The standards of a set as the model sees them: names of their values, and whether they have a colour."""
+"""The standards of a set in the model: names of their values, and their colours."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def standard_names(sources: Sources) -> tuple[str, ...]:
     ]
     names: dict[int, str] = {}
     for number, name in zip(sources.source.tolist(), plain, strict=True):
-        # A name that another star bears by right is not given to a namesake.
+        # The name of another star is not given to a namesake.
         unique = name
         while number not in names and (unique in names.values() or (unique != name and unique in plain)):
             unique = f"{unique}_{number}"
@@ -38,22 +38,22 @@ def _usable(name: str, further: str = "") -> str:
 
 
 def standards_of(sources: Sources, exposures: Exposures, filters: Curves) -> Standards:
-    """The standards of a set, with their values as they are.
+    """The standards of a set, with their catalogue values.
 
-    They have a colour where a band is stated for any of them, or where they were seen in several filters: else a value
-    is that of the only filter.
+    They have a colour where a band is stated for any of them, or where they were observed in several filters; otherwise
+    a value is that of the only filter.
     """
     names, qu = standard_names(sources), np.stack([sources.q, sources.u])
-    seen = _filters_seen(exposures)
+    filter_names = _filters_seen(exposures)
     stated = sources.filter != ""
-    if not (stated.any() or len(seen) > 1):
+    if not (stated.any() or len(filter_names) > 1):
         return Standards(names=names, q=qu[0], u=qu[1])
     bands = []
     for teff, band in zip(sources.teff.tolist(), sources.filter.tolist(), strict=True):
-        each = [_band(name, teff, filters) for name in ([band] if band else seen)]
-        wavelength, width = np.mean(each, axis=0) if each else _band("V", teff, filters)
+        band_moments = [_band(name, teff, filters) for name in ([band] if band else filter_names)]
+        wavelength, width = np.mean(band_moments, axis=0) if band_moments else _band("V", teff, filters)
         bands.append((float(wavelength), float(width)))
-    unknown = np.flatnonzero(~stated).tolist() if len(seen) > 1 else ()
+    unknown = np.flatnonzero(~stated).tolist() if len(filter_names) > 1 else ()
     return Standards.coloured(names, qu, bands, sources.stars.tolist(), unknown)
 
 
@@ -62,9 +62,9 @@ def _filters_seen(exposures: Exposures) -> list[str]:
 
 
 def half_range(sources: Sources, row: int, exposures: Exposures, filters: Curves) -> float:
-    """Half of the range of the mean wavelengths in which a star was seen (µm)."""
-    seen = [_band(name, float(sources.teff[row]), filters)[0] for name in _filters_seen(exposures)]
-    return 0.5 * max(max(seen) - min(seen), LEAST_RANGE)
+    """Half of the range of the mean wavelengths of the observations of a star (µm)."""
+    means = [_band(name, float(sources.teff[row]), filters)[0] for name in _filters_seen(exposures)]
+    return 0.5 * max(max(means) - min(means), LEAST_RANGE)
 
 
 def _band(name: str, teff: float, filters: Curves) -> tuple[float, float]:

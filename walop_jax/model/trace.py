@@ -1,9 +1,9 @@
 """Following the light: one source through the instrument, element by element, with the fold that a fit uses.
 
-`light.py` folds the train backwards from the analysers, once for all sources. Here the Stokes vector goes forward as
-far as there, averaged over the band from where the light depends on wavelength; what the cameras see of it is the fold.
+`light.py` folds the train backwards from the analysers, once for all sources. Here the Stokes vector goes forward to
+the analysers, averaged over the band once the light depends on wavelength; the cameras use the fold.
 
-Units       Stokes vectors in units of the flux that arrives; counts per unit of flux, as in `light.counts`: ghosts of
+Units       Stokes vectors in units of the arriving flux; counts per unit of flux, as in `light.counts`: ghosts of
             other field points and effects of the detectors, which act on electrons, come after.
 """
 
@@ -42,11 +42,11 @@ class LightStage:
 
 @dataclasses.dataclass(frozen=True)
 class Sightline:
-    """A source and the way through which it is looked at; angles and field coordinates in degrees.
+    """A source and its path through the instrument; angles and field coordinates in degrees.
 
     `q`, `u` are those of the source in the instrument frame (taken as catalogue values at ROTATOR 0); `clp_angle` is
-    NaN where the polariser is out; `setting` is a single row: the colour of the source, and where the optics stand.
-    Raises ValueError for light that is polarised by more than 1, and for several settings.
+    NaN where the polariser is out; `setting` is a single row: the colour of the source, and the positions of the
+    optics. Raises ValueError for a degree of polarisation above 1, and for several settings.
     """
 
     x: float = 0.0
@@ -95,22 +95,23 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
         if matrix is not None or element.moves:
             stages.append(_one(element.name, _about(element, plan), weight @ nodes))
     of_arms = [
-        weight @ functools.reduce(lambda one, matrix: _through(matrix, one), arm, nodes) for arm in inside
+        weight @ functools.reduce(lambda vector, matrix: _through(matrix, vector), arm, nodes)
+        for arm in inside
     ]
     names = tuple(arm.name for arm in instrument.arms)
     stages.append(LightStage("arms", "ahead of the analysers", names, STOKES, np.asarray(of_arms)))
 
-    # From there as in every fit: the rows that the analysers see, times the light.
+    # From there as in every fit: the rows of the analysers, times the light.
     rows, throughput = light.band_rows(instrument, plan, x, y), instrument.throughput.at(x, y)
     unmixed = dataclasses.replace(instrument, cameras=dataclasses.replace(instrument.cameras, mixing=()))
-    for name, about, seen in (
+    for name, about, vectors in (
         ("analysers", "share of the light in each beam of its arm",
          light.beams(instrument, rows) @ light.upstream(instrument, x, y)),
         ("cameras", "behind lenses, filter and detector of each camera",
          light.camera_vectors(unmixed, rows, throughput, x, y)),
         ("counts", "electrons per electron of flux", light.camera_vectors(instrument, rows, throughput, x, y)),
     ):  # fmt: skip
-        stages.append(LightStage(name, about, ("",), instrument.cameras.names, np.asarray(seen @ beam)))
+        stages.append(LightStage(name, about, ("",), instrument.cameras.names, np.asarray(vectors @ beam)))
     return tuple(stages)
 
 
@@ -119,7 +120,7 @@ def _through(matrix: Float[Array, "... 4 4"] | None, nodes: Float[Array, "n 4"])
 
 
 def _about(element: Element, plan: Plan) -> str:
-    """Remark on an element: what it is, or where it stands."""
+    """Remark on an element: its description, or its position."""
     if element.moves is None:
         return type(element).__doc__ or ""
     (angle,) = fold.positions(element, plan.moving, [plan.settings[0][0]])
@@ -127,7 +128,7 @@ def _about(element: Element, plan: Plan) -> str:
 
 
 def _with_source(instrument: Instrument, sightline: Sightline) -> Instrument:
-    """The instrument with one more standard star: the source that is followed."""
+    """The instrument with one more standard star: the traced source."""
     stars = instrument.standard
     q, u = jnp.append(stars.q, sightline.q), jnp.append(stars.u, sightline.u)
     return instrument.with_source(Standards(q=q, u=u, names=(*stars.names, "traced")))

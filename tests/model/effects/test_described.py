@@ -356,10 +356,10 @@ def test_what_cannot_be_carried_over_is_said():
         ("retardence q behind collimator", "cannot read"),
         ("turn of polariser * z", "there is no factor 'z'"),
         ("gain of O3", "did you mean 'O2'"),
-        ("polarisation q of sky", "of which exposure"),
+        ("polarisation q of sky", "state the exposure"),
         ("polarisation q of green_star", "did you mean 'polarisation q of"),
         ("polarisation of blue_star", "there is no description 'polarisation of blue_star'"),
-        ("fringes of half1.plate", "of which gap"),
+        ("fringes of half1.plate", "state the gap"),
         ("shift of filter", "there is no place of shift 'filter'"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Physical effects beyond the base model: changes of an instrument, and the catalogue of those that have a name."""
+"""Physical effects beyond the base model: changes of an instrument, and the catalogue of the named ones."""
 
 from collections.abc import Iterable, Sequence
 
@@ -27,9 +27,9 @@ def effect_by_name(name: str, catalogue: Sequence[EffectKind] = EFFECTS) -> Effe
 
 
 def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Effects in the order in which light meets them; what is not in the catalogue comes last.
+    """Effects in the order of the light path; those outside the catalogue come last.
 
-    How the instrument is described comes first: the others act on that.
+    Other descriptions of the instrument come first: the others act on these.
     """
     order = {effect.name: place for place, effect in enumerate((OtherDescription, *EFFECTS))}
     return tuple(sorted(effects, key=lambda effect: order.get(effect.name, len(order))))

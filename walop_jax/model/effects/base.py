@@ -1,8 +1,7 @@
 """Effects: components with a name that patch the instrument.
 
-`patch` is all that an effect does: it changes a number that an element has, or inserts an element, a part of the
-cameras, or something of a source. What patches the instrument reaches everything that asks for light; an effect that is
-not active is not in the tree and costs nothing.
+An effect acts by `patch` alone: it changes a number of an element, or inserts an element, a part of the cameras or of a
+source. Every computation of light uses the patched instrument; an inactive effect is not in the tree and costs nothing.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ Scalar = Float[Array, ""]
 
 
 class Context(NamedTuple):
-    """Facts about the data for effects that grow with them.
+    """Facts about the data for the effects.
 
     `moon` holds the positions of the Moon exposures and `moon_ids` their EXPOSURE numbers; `sources` the
     names of the standards, `exposures` the number of exposures, `cameras` the names of the cameras; `extinction` is
@@ -49,12 +48,12 @@ class Effect(Component):
     """A physical effect beyond the base model.
 
     Its parameters are the `param` fields; static fields are its discrete choices (which camera, which
-    star). `shape` names the parameters that act non-linearly (phase, gap, position); all others are
-    amplitudes, and nothing happens when they are neutral, whatever the shape. `starts` are groups of shapes
-    from which to look for the effect: groups are alternatives, the members of a group are directions that
-    are fitted together and that `combine` turns into one effect. `one_sided` names amplitudes that physics
-    keeps above neutral; `over_field` says that only a number of field points can show it; `reference` says where
-    the effect is known from; `said` are the changes that it is (`change`), none where no change holds it.
+    star). `shape` names the non-linear parameters (phase, gap, position); all others are
+    amplitudes, without effect at neutral, whatever the shape. `starts` are groups of initial shapes for a
+    search: groups are alternatives, the members of a group are directions of a joint fit that `combine` turns
+    into one effect. `one_sided` names amplitudes that physics keeps above neutral; `over_field` is true for an
+    effect visible only in several field points; `reference` is its source; `said` are its changes (`change`),
+    empty for an effect beyond them.
 
     >>> walop.effect_by_name("hwp1_axis").neutral(walop.ObservingPlan(grid=3).context()).name
     'hwp1_axis'
@@ -83,32 +82,32 @@ class Effect(Component):
 
     @classmethod
     def of(cls, context: Context, **values: Any) -> Self:
-        """The neutral effect with some values replaced; a scalar fills a parameter that has many elements.
+        """The neutral effect with some values replaced; a scalar fills a parameter of many elements.
 
-        A camera goes by its name, or by its number from 0. Raises ValueError, with the nearest names, for a parameter
-        that the effect does not have, and for a camera that does not exist.
+        A camera is given by its name, or by its number from 0. Raises ValueError, with the nearest names, for an
+        unknown parameter or camera.
         """
         return cls.neutral(context).given(context, **values)
 
     @classmethod
     def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
-        """Neutral effects at the shapes of `starts`: what a linear search differentiates."""
+        """Neutral effects at the shapes of `starts`, to be differentiated by a linear search."""
         return tuple(tuple(cls.of(context, **start) for start in group) for group in cls.starts)
 
     @classmethod
     def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
-        """The effect with the amplitudes that a linear fit of the probes of a group has found.
+        """The effect with amplitudes from a linear fit of the probes of a group.
 
         `amplitudes` are counted from neutral, member by member in the order of the fields. A group of one
-        takes them as they are; groups of more know how to merge their members.
+        takes them as they are; larger groups override this.
         """
         if len(group) != 1:
-            raise NotImplementedError(f"{cls.name} does not say how its probes combine")
+            raise NotImplementedError(f"{cls.name} has no `combine` for its probes")
         return group[0].moved(amplitudes)
 
     @classmethod
     def head(cls) -> str:
-        """Equation, symbols, source, neutral values and what reveals it, for its page: the head of its file."""
+        """Equation, symbols, source, neutral values and revealing data, for its page: the head of its file."""
         return inspect.cleandoc(sys.modules[cls.__module__].__doc__ or "").partition("\n")[2].strip("\n")
 
     @classmethod
@@ -118,19 +117,19 @@ class Effect(Component):
 
     @classmethod
     def amplitudes(cls) -> tuple[str, ...]:
-        """Names of the parameters in which the effect is linear at neutral."""
+        """Names of the parameters with a linear effect at neutral."""
         return tuple(name for name in cls.numbers() if name not in cls.shape)
 
     @classmethod
     def is_structural(cls) -> bool:
-        """True if the effect has no parameter: it is there or it is not."""
+        """True for an effect without parameters: present or absent."""
         return not cls.numbers()
 
     # ------------------------------------------------------------------------------------- an effect at some values
 
     @property
     def kind(self) -> Any:
-        """Its class, or its entry in the catalogue: what effects of one name have in common."""
+        """Its class, or its entry in the catalogue: common to all effects of its name."""
         return type(self)
 
     def declarations(self) -> Mapping[str, Parameter]:
@@ -163,24 +162,24 @@ class Effect(Component):
         return self.replaced(**changed)
 
     def choices(self) -> dict[str, Any]:
-        """Discrete choices that belong to the description of the effect, e.g. the number of a camera."""
+        """Discrete choices of the effect, e.g. the number of a camera."""
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.metadata.get("static")}
 
     def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
-        """Descriptions of the changes that the effect is in an instrument: to first order it is a sum of theirs."""
+        """Descriptions of the changes whose sum, to first order, is the effect in an instrument."""
         return self.said
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
-        """For each amplitude the changes whose sum, with their coefficients, it is to first order; none: not known."""
+        """For each amplitude its changes and their coefficients to first order; empty: unknown."""
         return ()
 
     @property
     def stated(self) -> tuple[str, ...]:
-        """Changes of numbers that a parameter of it is itself: beside such a change it would be another number."""
+        """Changes of numbers of which a parameter is the value itself: the two exclude each other."""
         return ()
 
     def at_neutral(self, context: Context) -> Self:
-        """The same effect, discrete choices included, with values that change nothing."""
+        """The same effect, discrete choices included, at neutral values."""
         return self.kind.of(context, **self.choices())
 
     def standard_form(self) -> Self:
@@ -188,7 +187,7 @@ class Effect(Component):
         return self
 
     def lacks(self, instrument: Instrument) -> str:
-        """The part that the effect acts on and the instrument does not have, in words; empty where it fits."""
+        """The part that the instrument lacks for the effect, in words; empty where it fits."""
         try:
             jax.eval_shape(lambda: self.patch(dataclasses.replace(instrument, effects=())))
         except NoSuchPlaceError as error:
@@ -212,7 +211,7 @@ def with_amplitudes(
 
 
 def numbered_camera(effect: str, camera: int | str, names: Sequence[str]) -> int:
-    """The number of a camera that is given by name or number; ValueError, naming the effect, where it is not there."""
+    """The number of a camera that is given by name or number; ValueError, with the effect, for an unknown camera."""
     if camera in names:
         return names.index(camera)  # type: ignore[arg-type]
     if camera not in range(len(names)):

@@ -3,7 +3,7 @@
 Equation    throughput × (1 − depth · exp(−((X − x)² + (Y − y)²) / 2 size²)) in one camera
 Symbols     x, y centre and size (standard deviation) [deg]; depth, a share
 Source      dust near a focal plane, or a damaged coating.
-Neutral     depth = 0, wherever it is
+Neutral     depth = 0, at any position
 Revealed by a local zero offset of one half, the same in all exposures.
 """
 
@@ -46,14 +46,14 @@ class Spot(Transmission):
     cameras: int = eqx.field(static=True)
 
     def factors(self, x: Scalar, y: Scalar) -> Float[Array, " k"]:
-        """Share of the throughput that the spot leaves."""
+        """Share of the throughput behind the spot."""
         distance = _distance(self, x, y)
         return jnp.ones(self.cameras).at[self.camera].add(-self.depth * jnp.exp(-distance))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Pattern:
-    """The spot as a factor of a column."""
+    """The spot as a factor."""
 
     x: float
     y: float
@@ -69,12 +69,7 @@ class Blemish(Effect):
     x: Scalar = param(unit="deg", about="centre along X", source=SOURCE, scale=0.02, loose=1.0, default=0.0)
     y: Scalar = param(unit="deg", about="centre along Y", source=SOURCE, scale=0.02, loose=1.0, default=0.0)
     size: Scalar = param(
-        unit="deg",
-        about="standard deviation of the spot",
-        source=SOURCE,
-        scale=0.02,
-        loose=0.5,
-        default=0.05,
+        unit="deg", about="standard deviation of the spot", source=SOURCE, scale=0.02, loose=0.5, default=0.05
     )
     depth: Scalar = param(unit="", about="share that is missing", source=SOURCE, width=0.02, default=0.0)
     camera: int = eqx.field(static=True, default=0)
@@ -102,7 +97,7 @@ class Blemish(Effect):
         )
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
-        """A gain of the camera that goes as the spot."""
+        """A gain of the camera with the pattern of the spot."""
         pattern = _Pattern(float(self.x), float(self.y), float(self.size))
         return (((-1.0, Change("gain", "of", instrument.cameras.names[self.camera], (pattern,))),),)
 

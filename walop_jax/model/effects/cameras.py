@@ -1,11 +1,11 @@
-"""Changes of cameras and detectors: gains, light of elsewhere, what the exposure before leaves behind.
+"""Changes of cameras and detectors: gains, light from elsewhere, afterglow of the preceding exposure.
 
 Equation    N_k → N_k + a f g_k, with g_k
             gain           N_k; growing with the counts: N_k² / 10⁶
-            reported gain  N_k as the detector reports it, behind whatever else it does
+            reported gain  N_k as reported, behind all other changes of the detector
             light          N_j of another camera; of no origin: the median counts of the exposure; of opposite: N_k at
                            (−X, −Y), extended sources only
-            afterglow      N_k of the exposure before
+            afterglow      N_k of the preceding exposure
 Symbols     a amplitude, f product of the factors; the place is a camera, or an arm for both of its cameras
 """
 
@@ -105,7 +105,7 @@ class Ghost(GhostPart):
 
 
 def _before(counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
-    """The counts of the exposure before."""
+    """Counts of the preceding exposure."""
     order = jnp.argsort(exposures.hours)
     return jnp.zeros_like(counts).at[order[1:]].set(counts[order[:-1]])
 
@@ -116,16 +116,16 @@ ADDED: Mapping[str, Callable[[Float[Array, "e k"], ExposureArrays], Float[Array,
     "median": lambda _, exposures: exposures.median,
     "afterglow": _before,
 }
-"""Additions to counts as they arrive by a change of amplitude 1 without factors, by stage."""
+"""Additions to arriving counts by a change of amplitude 1 without factors, by stage."""
 
 
 class OfDetectors(_Cameras, DetectorPart):
-    """Additions to counts as they arrive, of one stage of `ADDED`."""
+    """Additions to arriving counts, of one stage of `ADDED`."""
 
     stage: str = eqx.field(static=True, default="reported")
 
     def reported(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
-        """Counts with what is added."""
+        """Counts with the additions."""
         added, total = ADDED[self.stage](counts, exposures), counts
         for change, size in zip(self.changes, self.sizes, strict=True):
             if any(factor.depends_on != COUNTS for factor in change.grows_with):
@@ -180,7 +180,7 @@ _WITH: Mapping[str, tuple[str, ...]] = {
 _CAMERA = (
     Combinations(along=("counts",), among=("alone", "all")),
     Combinations(along=("harmonics to 6", *SLOW, *SINGLE, "side", "night", "step", "exposure", "kind")),
-    Combinations(("tilt",), ("harmonics to 1",), ("alone", "all")),  # an image that goes in a circle
+    Combinations(("tilt",), ("harmonics to 1",), ("alone", "all")),  # an image that moves in a circle
     Combinations(("tilt", "focus"), SLOW),
     Combinations(("tilt",), (*SINGLE, "kind", "side"), ("alone", "arm")),
     Combinations(("smooth",), (*SLOW, *SINGLE, "kind", "side"), ("alone", "arm")),
@@ -202,7 +202,7 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
 
 
 def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
-    """A stage and the cameras; of what acts on analysis vectors a part for each camera, or target and origin."""
+    """A stage and the cameras; for analysis vectors a slot for each camera, or target and origin."""
     stage, cameras = stage_of(change), cameras_of(instrument, change.place)
     slots: list[tuple[Any, ...]] = [(stage, cameras)]
     if stage == "mixed":
@@ -223,7 +223,7 @@ KINDS |= {name: Kind("share", _patch, stage_of, test, _grows, slots=_slots) for 
 
 
 def cameras_of(instrument: Instrument, place: str) -> Weights:
-    """1 for the cameras that a place means: one of them, or those of an arm. Raises ValueError for any other name."""
+    """1 for the cameras of a place: a camera, or an arm. Raises ValueError for any other name."""
     names = instrument.cameras.names
     for arm in instrument.arms:
         if arm.name == place:

@@ -10,17 +10,17 @@
 
 Parameters are the keys that hold a table:
 
-    does        the change (`change`) that the parameter is the amplitude of; `every NAME` stands for all of them
-                (`EVERY`), all alike, `{choice}` for a choice of the entry
+    does        the change (`change`) with the parameter as amplitude; `every NAME` means all of them (`EVERY`), all
+                alike, `{choice}` a choice of the entry
     per_unit    amplitude of the change for one unit of the parameter (1)
-    said        the same, to first order, as the grammar of a diagnosis writes it, where that differs
+    said        the same, to first order, in the grammar of a diagnosis, where that differs
     each        "camera": one value for each of `every camera`; "moon exposure": for each exposure of the Moon
-    polar       name of the parameter that is its angle: `does` has two changes, for cos and sin of `turns` × the angle
-    absolute    true: the extinction itself instead of what is added to it; `neutral` is its value without the effect
+    polar       name of the parameter of its angle: `does` has two changes, for cos and sin of `turns` × the angle
+    absolute    true: the extinction itself instead of an addition to it; `neutral` is its value without the effect
     unit, about, width, scale, loose    as for `parameters.param`
 
 Keys of an entry: about, equation, note, source, revealed_by, separated_by; one_sided (parameters that physics keeps
-above neutral), over_field (true: only a number of field points can show it), choices ({ camera = "cameras" },
+above neutral), over_field (true: visible only in several field points), choices ({ camera = "cameras" },
 { source = "stars" }, or a list of words), arrangement (a change of `alternatives`; such an effect has no parameter),
 class (an effect of this package that is not linear in all its numbers), part (of the page of effects, which begins with
 this one).
@@ -65,7 +65,7 @@ EffectKind = type[Effect] | Entry
 
 
 def entries(content: Mapping[str, Any]) -> tuple[EffectKind, ...]:
-    """The effects that tables describe, by name. Raises ValueError, naming entry and key, for what is wrong."""
+    """The effects of tables, by name. Raises ValueError, with entry and key, for invalid tables."""
     result = []
     for name, table in content.items():
         if not isinstance(table, Mapping):
@@ -145,7 +145,7 @@ def _member(
     absolute, turns = bool(settings.get("absolute", False)), float(settings.get("turns", 1.0))
     if absolute and any(Change.parsed(text).kind != "extinction" for text in does):
         raise ValueError(
-            f"{name}: absolute is for the extinction of the polariser alone; say what is added instead"
+            f"{name}: absolute is for the extinction of the polariser alone; give the addition instead"
         )
     unit = RADIANS[parameters[polar]["unit"]] if polar else 1.0
     return Member(
@@ -158,7 +158,7 @@ def _texts(value: Any) -> tuple[str, ...]:
 
 
 def own_entries(path: str | os.PathLike[str]) -> tuple[EffectKind, ...]:
-    """The effects of a user's TOML file. Raises `DataError`, naming file, entry and key, for what is wrong."""
+    """The effects of a user's TOML file. Raises `DataError`, with file, entry and key, for invalid entries."""
     try:
         with open(path, encoding="utf-8") as file:
             text = file.read()
@@ -171,14 +171,13 @@ def own_entries(path: str | os.PathLike[str]) -> tuple[EffectKind, ...]:
 
 
 EFFECTS = entries(parse_toml((files("walop_jax.model.effects") / FILE).read_text(encoding="utf-8")))
-"""All effects, in the order in which light meets them."""
+"""All effects, in the order of the light path."""
 
 
 def applies(effect: Effect, instrument: Instrument) -> bool:
-    """True if an instrument has what an effect of a catalogue acts on.
+    """True if an instrument has the places of an effect of a catalogue.
 
-    Raises ValueError, with the nearest names, for an effect that does not come with the package: whoever wrote it meant
-    this instrument.
+    Raises ValueError, with the nearest names, for a user's effect, which is meant for this instrument.
     """
     lacking = effect.lacks(instrument)
     if lacking and lacking != NO_STANDARD and effect.kind not in EFFECTS:
@@ -187,15 +186,15 @@ def applies(effect: Effect, instrument: Instrument) -> bool:
 
 
 def is_own(effect: Effect) -> TypeGuard[Named]:
-    """True if an effect is an entry that does not come with the package."""
+    """True for an entry of a user's catalogue."""
     return isinstance(effect, Named) and effect.kind not in EFFECTS
 
 
 def catalogue_with(own: str | os.PathLike[str] | None) -> tuple[EffectKind, ...]:
     """The catalogue followed by the effects of a file (None: nothing more): entries of a TOML file, classes of Python.
 
-    A Python file is run. Raises `DataError` if it cannot be, defines no effect, or one without a name or with that of
-    another.
+    A Python file is run. Raises `DataError` if that fails, and for a file without effects, or with an effect without a
+    name or with that of another.
     """
     if own is None:
         return EFFECTS

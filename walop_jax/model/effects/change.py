@@ -1,16 +1,16 @@
-"""One thing that may be otherwise in an instrument, with one amplitude: a kind, at a place, growing with something.
+"""A change of an instrument with one amplitude: a kind, at a place, with factors.
 
     KIND PREPOSITION PLACE [* FACTOR ...]
 
     retardance q behind collimator * r2         a linear retarder with its axis along X, growing as r² over the field
-    turn of polariser * cos 2 CLP               an axis that is turned by an amount that depends on its own reading
+    turn of polariser * cos 2 CLP               an axis turned by an amount that depends on its own reading
     gain of O1 * hours                          a camera that grows more sensitive
     light of E1 in O1                           a share of the counts of one camera in another one
-    polarisation q of HD_14069                  a star that is not what the catalogue says
+    polarisation q of HD_14069                  a star that differs from the catalogue
 
-At an amplitude of 0 nothing happens. A kind (`Kind`) stands in the file of its family (`optics`, `cameras`, `numbers`):
-it says what a change does to an instrument. Factors (`factors`) multiply each other; without one the
-amplitude is the same everywhere.
+An amplitude of 0 has no effect. A kind (`Kind`), defined in the file of its family (`optics`, `cameras`, `numbers`),
+holds the action of a change on an instrument. Factors (`factors`) multiply each other; without one the amplitude is the
+same everywhere.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from walop_jax.model.sources import ExposureArrays
 
 Term = tuple["Change", Scalar]
 Given = str | Callable[[Any], Any]
-"""A factor: a text, or a function of the quantities that factors may ask for."""
+"""A factor: a text, or a function of the quantities of factors."""
 OPPOSITE = "opposite"  # the field point, as an origin of light
 SLOW, SINGLE = ("hours", "kelvin", "hour angle"), ("per EXPTIME", "order")
 OF_LIST = ("exposure", "kind", "side", *SINGLE)  # forms of factors that ask for the list of exposures
-SKY, BAND = "sky", "band"  # places that are no element
+SKY, BAND = "sky", "band"  # places other than elements
 
 
 class Amplitude(NamedTuple):
@@ -65,10 +65,10 @@ AMPLITUDES = {
 
 
 class Combinations(NamedTuple):
-    """Factors with which a diagnosis tries changes: each pattern over the field with each form of dependence.
+    """Factors of changes in a diagnosis: each pattern over the field with each form of dependence.
 
-    Patterns and forms are those of `diagnosis.dependences`; `among` says which changes are tried together, each with
-    its amplitude: each alone, those of the cameras of an arm, of all cameras or arms, or anything optics can do there.
+    Patterns and forms are those of `diagnosis.dependences`; `among` is the group of changes tried together,
+    each with its amplitude: single ones, those of the cameras of an arm, of all cameras or arms, or all optics there.
     """
 
     over: tuple[str, ...] = ("even",)
@@ -77,10 +77,10 @@ class Combinations(NamedTuple):
 
 
 class Grows(NamedTuple):
-    """Dependences that a change may have (`Factor.depends_on`), which of angles and single exposures, what is `tried`.
+    """Dependences allowed in a change (`Factor.depends_on`), on which `angle`, and combinations `tried` in a diagnosis.
 
-    Of angles that of one element, by the prefix of its columns; None: of any, and in single exposures and those of a
-    KIND as well.
+    `angle` is the prefix of the columns of one element; None: any element, and also single exposures and those of a
+    KIND.
     """
 
     allowed: tuple[str, ...] = ()
@@ -89,11 +89,11 @@ class Grows(NamedTuple):
 
 
 class NoSlotError(ValueError):
-    """A change that is no sum of slots to first order: its own derivative is needed."""
+    """A change without a sum of slots to first order: it needs its own derivative."""
 
 
 class SlotTerm(NamedTuple):
-    """A part of a change to first order: a slot of the light path (`model.slots`), a coefficient, factors."""
+    """A first-order term of a change: a slot of the light path (`model.slots`), a coefficient, factors."""
 
     slot: tuple[Any, ...]
     size: float
@@ -104,17 +104,17 @@ SlotTerms = Callable[["Instrument", "Change"], Iterable[SlotTerm]]
 
 
 def itself(stage: str) -> SlotTerms:
-    """Slots of changes that are slots themselves: without their factors, at a stage of the light path."""
+    """Slots of changes with a slot of their own: without factors, at a stage of the light path."""
     return lambda _, change: [SlotTerm((stage, change.kind, change.where, change.place), 1.0, change.factors)]
 
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of change: one of `AMPLITUDES`, what changes of some amplitudes make of an instrument, what would show it.
+    """A kind of change: one of `AMPLITUDES`, its patch of an instrument, the observation that would test it.
 
-    Changes for which `patch` and `together` are equal are patched together. `patch` and `grows` raise
-    `NoSuchPlaceError` where an instrument has no such place, ValueError for a change that cannot be made. `slots` are
-    its parts to first order; slots that an instrument does not have are no error here.
+    Changes with equal `patch` and `together` are patched together. `patch` and `grows` raise
+    `NoSuchPlaceError` where an instrument has no such place, ValueError for an impossible change. `slots` are its
+    first-order terms; slots beyond an instrument are no error here.
     """
 
     parameter: str
@@ -131,7 +131,7 @@ KINDS: dict[str, Kind] = {}
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """A kind at a place with its factors; `origin` is where light comes from: another camera, or `OPPOSITE`.
+    """A kind at a place with its factors; `origin` is the origin of its light: another camera, or `OPPOSITE`.
 
     Factors are counted in the `units` of an instrument: those of WALOP until it is `counted_in` those of another.
     """
@@ -145,7 +145,7 @@ class Change:
 
     @classmethod
     def parsed(cls, text: str) -> Self:
-        """The change of a text. Raises ValueError, with the nearest words, for what is none."""
+        """The change of a text. Raises ValueError, with the nearest words, for an invalid text."""
         return cls(*_parsed(text))
 
     @property
@@ -167,7 +167,7 @@ class Change:
     @property
     def grows_with(self) -> tuple[Factor, ...]:
         """Its factors that have a text."""
-        return tuple(factor(one) for one in self.factors if isinstance(one, str))
+        return tuple(factor(item) for item in self.factors if isinstance(item, str))
 
     def counted_in(self, units: Units) -> Change:
         """The change of an instrument with its scales."""
@@ -175,7 +175,7 @@ class Change:
 
     @property
     def of_stars(self) -> bool:
-        """True if what it does to a star is known from the counts and the place of the star alone."""
+        """True if its effect on a star depends on the counts and the place of the star alone."""
         elsewhere = self.kind == "afterglow" or (self.kind == "light" and self.origin in ("", OPPOSITE))
         return not elsewhere and not any(
             item.text == "hours" or item.form in ("hours", *OF_LIST) for item in self.grows_with
@@ -187,19 +187,19 @@ class Change:
 
     @property
     def number(self) -> int:
-        """The exposure that it is about. Raises ValueError for a change of no single one."""
-        return int(self._only("exposure", "of which exposure", "exposure 7"))
+        """Number of its exposure. Raises ValueError for a change without a single one."""
+        return int(self._only("exposure", "the exposure", "exposure 7"))
 
     @property
     def gap(self) -> float:
-        """Thickness (µm) of the air whose fringes it is about. Raises ValueError for a change without one."""
-        return float(self._only("gap", "of which gap (µm)", "gap 10"))
+        """Thickness (µm) of the air of its fringes. Raises ValueError for a change without one."""
+        return float(self._only("gap", "the gap (µm)", "gap 10"))
 
     def _only(self, form: str, what: str, example: str) -> str:
         """Value given in the only factor of a form."""
         matches = [item.given[0] for item in self.grows_with if item.form == form]
         if len(matches) != 1:
-            raise ValueError(f"{self.text!r}: say {what}, as in '{self.kind} of {self.place} * {example}'")
+            raise ValueError(f"{self.text!r}: state {what}, as in '{self.kind} of {self.place} * {example}'")
         return matches[0]
 
     def factor(self, at: Any) -> Any:
@@ -207,11 +207,11 @@ class Change:
         return product(self.factors, at, self.units)
 
     def in_train(self, ray: Ray, angle: Any) -> Any:
-        """Product of its factors for a ray, in an element that stands at `angle` (deg)."""
+        """Product of its factors for a ray, in an element at `angle` (deg)."""
         return self.factor(_InTrain(ray, angle))
 
     def check_factors(self, instrument: Instrument) -> None:
-        """Raise ValueError for a factor that the kind would leave out."""
+        """Raise ValueError for a factor beyond those of the kind."""
         allowed, angle, _ = KINDS[self.kind].grows(instrument, self)
         for item in self.grows_with:
             if item.form == "kind":
@@ -225,7 +225,7 @@ class Change:
                 raise ValueError(f"{self.text!r}: {what}, only with {takes}{only}")
 
     def in_words(self) -> str:
-        """Kind, place and dependence, to be read by people."""
+        """Kind, place and dependence in plain words."""
         origin = "the opposite field point" if self.origin == OPPOSITE else self.origin
         of = f" of {origin}" if origin else ""
         return ", ".join(
@@ -234,7 +234,7 @@ class Change:
 
     @property
     def tested_by(self) -> str:
-        """The observations that would show whether it is so."""
+        """Observations that would test it."""
         advice = [f.test for f in self.grows_with if f.test]
         if self.origin == OPPOSITE:
             advice.append("a star dithered over the field: its ghost moves the other way")
@@ -274,7 +274,7 @@ def _pattern() -> re.Pattern[str]:
 
 
 def patched(instrument: Instrument, terms: Iterable[Term]) -> Instrument:
-    """The instrument with changes of some amplitudes; those of one place that act together are combined."""
+    """The instrument with changes of some amplitudes; joint changes at one place are combined."""
     together: dict[tuple[Any, Hashable], list[Term]] = {}
     for change, size in terms:
         change.check_factors(instrument)
@@ -292,16 +292,16 @@ def product(factors: Iterable[Given], at: Any, units: Units) -> Any:
 
 
 def add(size: Scalar) -> Any:
-    """Function that adds an amplitude to a number of an instrument that may not have it."""
+    """Function that adds an amplitude to a number, or to an absent one."""
     return lambda value: size if value is None else value + size
 
 
-# ---------------------------------------------------------------------------- what factors may ask for
+# ---------------------------------------------------------------------------- quantities of factors
 
 
 @dataclasses.dataclass(frozen=True)
 class _InTrain:
-    """Quantities of a ray; `axis` (deg) is where the element stands that moves."""
+    """Quantities of a ray; `axis` (deg) is the angle of the moving element."""
 
     ray: Ray
     axis: Any
@@ -311,13 +311,13 @@ class _InTrain:
         return getattr(source, name)
 
     def angle(self, prefix: str) -> Any:
-        """That of the element itself, the only one that the optics know (`Grows`)."""
+        """Angle of the element itself, the only one in the optics (`Grows`)."""
         return jnp.deg2rad(self.axis)
 
 
 @dataclasses.dataclass(frozen=True)
 class AtPoint:
-    """A field point, and nothing else: whatever a factor asks for beyond that is an error."""
+    """A field point alone: requests for other quantities are errors."""
 
     x: Any
     y: Any
@@ -347,7 +347,7 @@ class InExposures:
         return self.exposures.of_kind(name)
 
     def angle(self, prefix: str) -> Any:
-        """That of the polariser or of another element that moves (rad); NaN where it is out."""
+        """Angle (rad) of the polariser or of another moving element; NaN where it is out."""
         angle = self.exposures.clp_angle
         if prefix == POLARISER:
             xp = np if isinstance(angle, np.ndarray) else jnp
@@ -356,5 +356,5 @@ class InExposures:
 
 
 def in_exposures(change: Change, exposures: ExposureArrays, x: Any = 0.0, y: Any = 0.0) -> Float[Array, " e"]:
-    """The factor of a change in every exposure, 0 where the condition that it needs is unknown."""
+    """The factor of a change in every exposure, 0 where its condition is unknown."""
     return jnp.nan_to_num(change.factor(InExposures(exposures, x, y))) * jnp.ones(exposures.hours.shape[0])

@@ -1,12 +1,12 @@
 """Missing physics without a name: changes (`change`), each with an amplitude; several of them are one effect.
 
-Not in the catalogue: `diagnose` tries all changes that an instrument and its exposures allow
-(`diagnosis/grammar.py`) beside the names, and adds one where it explains the data better than any name.
+Not in the catalogue: `diagnose` tries all possible changes of an instrument and its exposures
+(`diagnosis/grammar.py`) beside the names, and adds one that explains the data better than any name.
 
 Equation    that of each change: `optics`, `numbers`, `cameras`
 Source      Lu & Chipman 1996, JOSA A 13, 1106: every Mueller matrix near the identity is a product of these
 Neutral     all zero
-Revealed by data that no name explains as well
+Revealed by data without an equally good named explanation
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ def _amplitude(name: str) -> Any:
 
 @functools.lru_cache(maxsize=64)
 def _zeros(count: int) -> Float[Array, " n"]:
-    """So many zeros; there are thousands of changes that have no size yet."""
+    """Zeros, shared by the thousands of changes without a size."""
     with jax.ensure_compile_time_eval():
         return array(np.zeros(count))
 
 
 class Described(Effect):
-    """Descriptions of what is missing, each with an amplitude in the parameter of its unit."""
+    """Descriptions of missing physics, each with an amplitude in the parameter of its unit."""
 
     share: Float[Array, " a"] = _amplitude("share")
     retardance: Float[Array, " b"] = _amplitude("retardance")
@@ -67,7 +67,7 @@ class Described(Effect):
 
     @classmethod
     def of(cls, context: Context, **values: Any) -> Self:
-        """The descriptions given, zero but for values given. Raises ValueError for what is no description."""
+        """Descriptions with some values, zero elsewhere. Raises ValueError for an invalid description."""
         sentences = tuple(values.pop("sentences", ()))
         held = [Change.parsed(text).parameter for text in sentences]
         for name in values:
@@ -95,7 +95,7 @@ class Described(Effect):
         return cls.of(Context(), sentences=sentences, **held)
 
     def joined(self, other: Described) -> Described:
-        """These changes and others that it has not."""
+        """The union of both sets of changes."""
         new = [(s.text, float(a)) for s, a in other.terms() if s.text not in self.sentences]
         terms = [(s.text, float(a)) for s, a in self.terms()] + new
         return Described.saying([text for text, _ in terms], [value for _, value in terms])
@@ -112,7 +112,7 @@ class Described(Effect):
             count[change.parameter] += 1
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
-        """Each amplitude is a change."""
+        """One change for each amplitude."""
         changes = [Change.parsed(text) for text in self.sentences]
         return tuple(
             ((1.0, change),) for name in AMPLITUDES for change in changes if change.parameter == name
@@ -124,11 +124,11 @@ class Described(Effect):
 
 
 class OtherDescription(Effect):
-    """The instrument is not as its description says: elements in another order, turned, left out, of another crystal.
+    """The instrument differs from its description: elements in another order, turned, left out, of another crystal.
 
-    Not in the catalogue: `diagnose` tries every change that the instrument has a place for (`model/alternatives.py`)
-    when something is missing, and adds the one that the data demand. The description file is then to be corrected.
-    `change` says what, in words; several are joined by "; ".
+    Not in the catalogue: after a poor fit `diagnose` tries every possible change of the instrument
+    (`model/alternatives.py`), and adds the one that the data demand. The description file is then to be corrected.
+    `change` is its sentence; several are joined by "; ".
     """
 
     change: str = eqx.field(static=True, default="")
@@ -143,5 +143,5 @@ class OtherDescription(Effect):
     )
 
     def patch(self, instrument: Instrument) -> Instrument:
-        """Arrange the instrument as the change says. Raises ValueError for a change that it has no place for."""
+        """Rearrange the instrument by the change. Raises ValueError for a change without a place in it."""
         return changed(instrument, self.change)

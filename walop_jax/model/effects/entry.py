@@ -1,7 +1,7 @@
-"""Effects that are values: parameters that are amplitudes of changes, as an entry of a catalogue describes them.
+"""Effects as values: parameters that are amplitudes of changes, described by an entry of a catalogue.
 
 An effect is to first order Σ_p v_p Σ_i s_pi c_i over its parameters p, v their values, c changes and s the sizes of
-these for one unit. Of a polar pair, which has a size and an angle, two changes have cos and sin of the angle.
+these for one unit. A polar pair, a size and an angle, has two changes with cos and sin of the angle.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ EVERY: Mapping[str, Callable[[Instrument], Sequence[str]]] = {
     "analyser": lambda instrument: [f"{arm.name}.{arm.path[-1]}" for arm in instrument.arms],
     "wave_plate": lambda instrument: instrument.places(WavePlate),
 }
-"""Places that `every` stands for."""
+"""Places of `every`."""
 
 
 class Member(NamedTuple):
-    """A parameter of an entry: keys of its table in a file. The angle of a polar pair does nothing by itself.
+    """A parameter of an entry: keys of its table in a file. The angle of a polar pair has no changes of its own.
 
     `turns` is the phase of cos and sin (rad) for one unit of that angle.
     """
@@ -57,7 +57,7 @@ class Member(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Entry:
-    """An effect of a catalogue; its `table` is that of the file. What a class of effects says, it says as well.
+    """An effect of a catalogue; its `table` is that of the file. It has the attributes of a class of effects.
 
     `choices` are words, or "cameras" or "stars"; `arrangement` is one of `alternatives`.
     """
@@ -86,7 +86,7 @@ class Entry:
 
     @property
     def shape(self) -> tuple[str, ...]:
-        """Parameters that act non-linearly: angles."""
+        """Non-linear parameters: angles."""
         return tuple(member.polar for member in self.members if member.polar)
 
     def numbers(self) -> dict[str, Parameter]:
@@ -94,15 +94,15 @@ class Entry:
         return {member.name: member.declared for member in self.members}
 
     def amplitudes(self) -> tuple[str, ...]:
-        """Names of the parameters in which it is linear at neutral."""
+        """Names of the parameters with a linear effect at neutral."""
         return tuple(member.name for member in self.members if member.does)
 
     def is_structural(self) -> bool:
-        """True if it has no parameter: it is there or it is not."""
+        """True without parameters: present or absent."""
         return not self.members
 
     def head(self) -> str:
-        """Equation, symbols, source, neutral values and what reveals it."""
+        """Equation, symbols, source, neutral values and revealing data."""
         neutral = [f"{member.name} = {member.neutral:g}" for member in self.members if member.does]
         units = {
             name: f" [{declared.unit}]" * bool(declared.unit) for name, declared in self.numbers().items()
@@ -119,13 +119,13 @@ class Entry:
         return "\n".join(f"{title:<12}{text}" for title, text in page.items() if text)
 
     def neutral(self, context: Context) -> Named:
-        """The effect with values that change nothing; choices are the first there are."""
+        """The effect at neutral values, with the first of all choices."""
         count = {"camera": (len(context.cameras),), "moon exposure": (len(context.moon),)}
         values = {
-            one.name: as_number(
-                np.full(count.get(one.each, ()), context.extinction if one.absolute else one.neutral)
+            member.name: as_number(
+                np.full(count.get(member.each, ()), context.extinction if member.absolute else member.neutral)
             )
-            for one in self.members
+            for member in self.members
         }
         first = {"cameras": 0, "stars": next(iter(context.sources), "")}
         chosen = tuple((name, first[of] if isinstance(of, str) else of[0]) for name, of in self.choices)
@@ -164,7 +164,7 @@ class Entry:
 class Named(Effect):
     """An effect of an entry. Parameters and choices, by name, are its attributes as well.
 
-    `moon` holds position and EXPOSURE number of every exposure of the Moon that it has a value for.
+    `moon` holds position and EXPOSURE number of every exposure of the Moon with a value.
     """
 
     values: dict[str, Array]
@@ -225,7 +225,7 @@ class Named(Effect):
         return self.replaced(**{polar.name: abs(size), polar.polar: phase / polar.turns})
 
     def lacks(self, instrument: Instrument) -> str:
-        """As for any effect; there may be no star that a choice could name."""
+        """As for any effect; also where no star is available for a choice."""
         if "" in self.choices().values():
             return NO_STANDARD
         if not (arrangement := self.entry.arrangement):
@@ -233,7 +233,7 @@ class Named(Effect):
         available = alternatives(dataclasses.replace(instrument, effects=()))
         return "" if arrangement in available else str(unknown_name("arrangement", arrangement, available))
 
-    # ------------------------------------------------------------------------------------ what it does
+    # ------------------------------------------------------------------------------------ its action
 
     def patch(self, instrument: Instrument) -> Instrument:
         """All changes at their sizes."""
@@ -250,7 +250,7 @@ class Named(Effect):
         return patched(instrument, terms)
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
-        """The changes of each amplitude, with what one unit of it is of them."""
+        """The changes of each amplitude, with their sizes for one unit of it."""
         return tuple(
             tuple((float(size), change) for size, change in combination)
             for member in self.entry.members
@@ -258,7 +258,7 @@ class Named(Effect):
         )
 
     def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
-        """The changes as the grammar of a diagnosis writes them."""
+        """The changes in the grammar of a diagnosis."""
         return tuple(
             _behind(Change.parsed(text), instrument).text
             for member in self.entry.members
@@ -269,7 +269,7 @@ class Named(Effect):
 
     @property
     def stated(self) -> tuple[str, ...]:
-        """The changes of the numbers that its parameters are themselves."""
+        """The changes of numbers of which its parameters are the values."""
         return tuple(text for member in self.entry.members if member.absolute for text in member.does)
 
     def _values(self, member: Member, instrument: Instrument) -> list[Scalar]:
@@ -298,7 +298,7 @@ class Named(Effect):
         ]
 
     def _each(self, member: Member, text: str, instrument: Instrument) -> list[list[str]]:
-        """The texts that one stands for, for each value of a parameter."""
+        """The expanded texts of a text, for each value of a parameter."""
         chosen = self.choices()
         if "camera" in chosen:
             names = instrument.cameras.names
@@ -324,7 +324,7 @@ def _expanded(text: str, instrument: Instrument) -> Iterator[str]:
 
 
 def _behind(change: Change, instrument: Instrument) -> Change:
-    """The same place told from the other side, where there is an element ahead of it."""
+    """The same place relative to the element ahead of it, if any."""
     if change.where != "ahead of" or change.kind.startswith("displacement"):
         return change
     arm, _, name = change.place.rpartition(".")

@@ -9,8 +9,8 @@ Neutral     contrast = 0, whatever the gap
 Revealed by zero offsets that oscillate with wavelength (period λ²/2 gap) and in rings over the field; a
             broad band averages gaps beyond some tens of µm away.
 
-Near a gap the fringe is a cosine and a sine: the probes come in pairs λ₀/8 apart, a quarter of a fringe at the
-wavelength that an instrument counts from, on a grid that no fringe of its bands escapes. The wavelength nodes follow
+Near a gap the fringe is a cosine and a sine: the probes are pairs λ₀/8 apart, a quarter of a fringe at the reference
+wavelength of an instrument, on a grid fine enough for all fringes of its bands. The wavelength nodes follow
 gaps up to `LARGEST_GAP`.
 """
 
@@ -37,7 +37,7 @@ STEP = 0.75  # between gaps, at the reference wavelength of WALOP
 
 
 def probed_gaps(units: Units) -> tuple[tuple[float, float], ...]:
-    """Pairs of gaps (µm) from which to look for fringes: a quarter of a fringe apart at the wavelength of the units."""
+    """Initial pairs of gaps (µm) for fringes: a quarter of a fringe apart at the wavelength of the units."""
     step, quarter = STEP * (units.wavelength / REFERENCE_WAVELENGTH), units.wavelength / 8.0
     return tuple((gap, gap + quarter) for gap in np.arange(1.0, LARGEST_GAP, step).tolist())
 
@@ -49,12 +49,7 @@ class Etalon(Effect):
         unit="", about="diattenuation at a maximum", source=SOURCE, width=0.003, default=0.0
     )
     gap: Scalar = param(
-        unit="um",
-        about="thickness of the air gap",
-        source=SOURCE,
-        scale=0.05,
-        loose=5.0,
-        default=10.0,
+        unit="um", about="thickness of the air gap", source=SOURCE, scale=0.05, loose=5.0, default=10.0
     )
 
     name: ClassVar[str] = "etalon"

@@ -1,13 +1,13 @@
-"""Factors with which a change grows: field, wavelength, time, temperature, counts, or the angle of an element.
+"""Factors of changes: field, wavelength, time, temperature, counts, or the angle of an element.
 
-A factor knows its `text` as it is typed, its `value`, its `words`, the observation that would `test` it (empty: none of
-its own) and what it `depends_on`: FIELD, WAVELENGTH, EXPOSURE, COUNTS, or SHAPE (of the change itself). `factor` is the
-one reader of their texts.
+A factor has a `text` as typed, a `value`, `words`, the observation that would `test` it (empty: none of its own) and
+the quantity that it `depends_on`: FIELD, WAVELENGTH, EXPOSURE, COUNTS, or SHAPE (of the change itself). `factor` alone
+reads the texts.
 
-A value is asked for with something that has x, y (deg), wavelength (µm), hours since the first exposure, hour_angle
+The argument of a value has x, y (deg), wavelength (µm), hours since the first exposure, hour_angle
 (h), temperature (Celsius), exposure time (s), the number of the exposure in its list, `of_kind(name)`, true for
 exposures of a KIND, and `angle(prefix)` (rad) of the polariser or another moving element, NaN where that is out of the
-beam; all are scalars, or arrays that broadcast. With it come the scales of field and wavelength of the instrument.
+beam; all are scalars, or arrays that broadcast. The second argument holds the scales of field and wavelength.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ NUMBER = r"(-?\d*\.?\d+|-?\d+\.)"
 
 @dataclasses.dataclass(frozen=True)
 class Factor:
-    """One factor; `form` is the first word of those that have numbers or names in them, `given` are these."""
+    """One factor; `form` is the first word of a text with numbers or names, `given` holds these."""
 
     text: str
     depends_on: str
@@ -126,7 +126,7 @@ def _side(prefix: str) -> Factor:
 
 
 def _gap(thickness: str) -> Factor:
-    """Thickness (µm) of the air whose fringes a change is: 1, the fringes themselves know it."""
+    """Thickness (µm) of the air of a change by fringes: 1, as the fringes depend on it themselves."""
     words = f"of {thickness} µm of air (amplitude at a maximum)"
     return Factor(f"gap {thickness}", SHAPE, words, "", lambda at, _: 1.0, "gap", (thickness,))
 
@@ -140,7 +140,7 @@ FORMS: Mapping[str, tuple[str, Callable[..., Factor]]] = {
     "side PREFIX": (r"side (\S+)", _side),
     "gap N": (rf"gap (?!-){NUMBER}", _gap),
 }
-"""Factors with numbers or names in them, as messages name them: how they are typed, and what makes one."""
+"""Factors with numbers or names, by their form in messages: pattern of the text, and constructor."""
 
 
 # ------------------------------------------------------------------------------------------------------ plain ones
@@ -205,7 +205,7 @@ PLAIN = _plain()
 
 @functools.cache
 def factor(text: str) -> Factor:
-    """The factor of a text. Raises ValueError, with the nearest ones, for what is none."""
+    """The factor of a text. Raises ValueError, with the nearest ones, for an unknown text."""
     if text in PLAIN:
         return PLAIN[text]
     for pattern, make in FORMS.values():

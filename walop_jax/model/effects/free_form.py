@@ -1,14 +1,14 @@
-"""Patterns without a name: what is left when no effect of the catalogue explains the data.
+"""Patterns without a name, for residuals beyond all effects of the catalogue.
 
-Not a name, never a candidate: `diagnose` adds it, labelled, so that a calibration improves although nobody knows
-yet why. It holds only the blocks that it is made with, others have no elements.
+Not a name, never a candidate: `diagnose` adds it, labelled, so that a calibration improves without a known cause.
+Blocks that were not requested have no elements.
 
 Equation    vectors     a_k → a_k + a_k0 · Σ_t v_kst P_t(x, y) e_s, s = q, u: any linear effect smooth in the field
             harmonics   N_k → N_k + N⁰_k · Σ_ht (c_kht cos hθ + s_kht sin hθ) P_t(x, y), θ polariser angle
             fine        N_k → N_k + N⁰_k · Σ_t f_kt P_t(x, y), P_t of higher degree than the throughput
             exposures   N_k → N_k + N⁰_k · g_ek
-Symbols     a_k analysis vector of camera k, a_k0 its response to unpolarised light; N_k counts and N⁰_k those that
-            unpolarised light of the same flux would give; P_t products of Legendre polynomials, in the scale
+Symbols     a_k analysis vector of camera k, a_k0 its response to unpolarised light; N_k counts and N⁰_k those of
+            unpolarised light of the same flux; P_t products of Legendre polynomials, in the scale
             of the field of the instrument
 Source      the strata of the free-form score test (`diagnosis.design`), with the same plausible size
 Neutral     all zero
@@ -80,12 +80,12 @@ class FreeShares(ExposurePart):
 
     harmonics: Float[Array, "c h 2 g"]
     exposures: Float[Array, "e k"]  # one of the two may be empty
-    fine: Float[Array, "d f"]  # structure that the response is told without; may be empty
+    fine: Float[Array, "d f"]  # structure beyond the response of the throughput; may be empty
     scale: float = eqx.field(static=True)  # of the field, degrees
 
     @property
     def exposures_known(self) -> int | None:
-        """As many as the block of single exposures was made for."""
+        """Number of exposures of the block of single exposures."""
         return len(self.exposures) or None
 
     def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"]:
@@ -122,7 +122,7 @@ class FreeForm(Effect):
 
     @classmethod
     def of(cls, context: Context, **values: Any) -> Self:
-        """The blocks that are asked for, all zero. Raises ValueError for a block that does not exist."""
+        """The requested blocks, all zero. Raises ValueError for an unknown block."""
         blocks = tuple(values.pop("blocks", BLOCKS))
         for name in [*blocks, *values]:
             if name not in BLOCKS:

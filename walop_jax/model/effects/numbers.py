@@ -1,4 +1,4 @@
-"""Changes of a number that a part of the instrument has, or of what is looked at: what is found is added to it."""
+"""Changes of a number of the instrument, or of a source: the amplitude is added to it."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ PLACES = {
     "shift": {BAND: ("", "filter_shift")},
     "rotator": {SKY: ("", "rotator_zero"), Standards.name: (Standards.name, "angle")},
 }
-"""Places of numbers of the instrument as a whole: the part that holds them, and its field."""
+"""Places of numbers of the instrument as a whole: their part, and its field."""
 
 
 def _number(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    """Add to a number of the polariser; it has the name of the kind."""
+    """Add to a number of the polariser, which has the name of the kind."""
     for change, size in terms:
         instrument = instrument.changed(change.place, **{change.kind: add(size)})
     return instrument
@@ -50,7 +50,7 @@ _FIELD = ("even", "tilt", "r2")
 
 
 def _with_ray(instrument: Instrument, change: Change) -> Grows:
-    """Plates with what a ray knows, and with their own angle."""
+    """Plates: with the quantities of a ray, and with their own angle."""
     holders = [p for p in instrument.places(WavePlate) if f"{change.place}.".startswith(f"{p}.")]
     moves = instrument.element(holders[0]).moves if holders else None
     tried = (
@@ -64,13 +64,13 @@ def _with_ray(instrument: Instrument, change: Change) -> Grows:
 
 
 def _of_plate(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    """Add to a number of a wave plate, or of a layer of it, the same one for every ray or one that grows."""
+    """Add to a number of a wave plate, or of one of its layers: a constant, or an amplitude with factors."""
     for change, size in terms:
         if not change.factors:
             instrument = instrument.changed(change.place, **{change.kind: add(size)})
             continue
         grown = Grown(size, jnp.zeros(()), change)
-        instrument = instrument.changed(change.place, grown=lambda there, one=grown: (*there, one))
+        instrument = instrument.changed(change.place, grown=lambda old, new=grown: (*old, new))
     return instrument
 
 
@@ -80,8 +80,8 @@ def _of_instrument(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
         places = PLACES[change.kind]
         if change.place not in places:
             raise unknown_name(f"place of {change.kind}", change.place, places)
-        part, field = places[change.place]
-        instrument = instrument.changed(part, **{field: add(size)})
+        holder, field = places[change.place]
+        instrument = instrument.changed(holder, **{field: add(size)})
     return instrument
 
 
@@ -103,13 +103,11 @@ def _polarised(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
         at = positions.index(item.number)
         components[item.kind[-1]][at] = components[item.kind[-1]][at] + value
     patches = MoonPatches(jnp.stack(components["q"]), jnp.stack(components["u"]), positions)
-    return instrument.changed(
-        "sky", patches=lambda there: patches if there is None else there.joined(patches)
-    )
+    return instrument.changed("sky", patches=lambda old: patches if old is None else old.joined(patches))
 
 
 def _of_patch(instrument: Instrument, change: Change) -> Grows:
-    """Of one patch of the sky, which is an exposure; of a star what changes with time and from filter to filter."""
+    """Patches of the sky: single exposures; stars: changes with time and from filter to filter."""
     if change.place != SKY:
         return Grows((EXPOSURE, WAVELENGTH), tried=(Combinations(),))
     if change.kind == "polarisation":
@@ -127,8 +125,8 @@ def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
             raise NoSuchPlaceError(str(what))
         at = names.index(change.place)
         if change.factors:
-            one = GrownStandard(size, at, "qu".index(axis), change)
-            instrument = instrument.changed("standard", changes=lambda there, one=one: (*there, one))
+            grown = GrownStandard(size, at, "qu".index(axis), change)
+            instrument = instrument.changed("standard", changes=lambda old, grown=grown: (*old, grown))
             continue
         instrument = instrument.changed(
             "standard", **{axis: lambda value, at=at, size=size: value.at[at].add(size)}
@@ -137,7 +135,7 @@ def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 
 class GrownStandard(StandardChange):
-    """A change of a standard that grows with time, or from filter to filter."""
+    """A change of a standard with time, or from filter to filter."""
 
     change: Change = eqx.field(static=True)
 
@@ -147,7 +145,7 @@ class GrownStandard(StandardChange):
 
 
 def _slots_of_source(instrument: Instrument, change: Change) -> list[SlotTerm]:
-    """Of the light: q or u of a star has its number in the list."""
+    """Slots of the light: q or u of a star with its number in the list."""
     names = [name.replace(" ", "_") for name in instrument.standard.names]
     star = (names.index(change.place),) if change.place in names else ()
     place = instrument.standard.name if star else change.place
@@ -155,7 +153,7 @@ def _slots_of_source(instrument: Instrument, change: Change) -> list[SlotTerm]:
 
 
 NUMBERS = {"axis": "angle", "cut": "angle", "thickness": "length", "thermal": "number"}
-"""Kinds that are numbers of wave plates, of layers of them (µm, deg), and their amplitudes."""
+"""Numbers of wave plates and of their layers (µm, deg), with their amplitudes."""
 KINDS |= {
     name: Kind(amplitude, _of_plate, grows=_with_ray, slots=itself("number"))
     for name, amplitude in NUMBERS.items()

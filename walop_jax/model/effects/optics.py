@@ -3,9 +3,9 @@
 Equation    M → M_Δ M_R M_D M at one place of the train, with
             M_R = exp Σ r_i G_i (a retarder), M_D the diattenuator of vector d, M_Δ = diag(1, k_q, k_u, k_v)
 Symbols     r, d sums of amplitude × factor along q, u, v; radial: x² − y² along q, 2xy along u (in units of the field);
-            diagonal: −2xy and x² − y²; k = 1 − the share of it that is lost; a turn by α is r_v = −2α
+            diagonal: −2xy and x² − y²; k = 1 − its lost share; a turn by α is r_v = −2α
 Source      Lu & Chipman 1996, JOSA A 13, 1106: every Mueller matrix near the identity is such a product
-Limits      exact for one kind at a place; which of several acts first is a matter of second order
+Limits      exact for one kind at a place; the order of several kinds matters at second order
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ AXES = ("q", "u", "v", "radial", "diagonal")
 GENERATORS = tuple(
     f"{what} {axis}" for what in ("diattenuation", "retardance", "depolarisation") for axis in "quv"
 )
-"""Kinds of which all others are sums."""
+"""Basic kinds: all others are sums of these."""
 ADDED = ("added polarisation q", "added polarisation u")
 DISPLACEMENTS = ("displacement x", "displacement y")
 GROUPS = (
@@ -63,11 +63,11 @@ GROUPS = (
     ("depolarisation",),
     *((f"{what} {axis}",) for what in ("diattenuation", "retardance") for axis in ("radial", "diagonal")),
 )
-"""Kinds that a diagnosis tries, those of one phenomenon together."""
+"""Kinds in a diagnosis, grouped by phenomenon."""
 
 
 def generators_of(kind: str) -> tuple[tuple[str, float, tuple[str, ...]], ...]:
-    """The `GENERATORS` that a kind is, with coefficients and factors."""
+    """The `GENERATORS` of a kind, with coefficients and factors."""
     what, _, axis = kind.partition(" ")
     if what == "turn":  # a circular retarder
         return (("retardance v", -2.0 * np.pi / 180.0, ()),)
@@ -94,8 +94,8 @@ def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
     )
     if any(name.startswith("depolarisation") for name in sums):
         lost = [jnp.asarray(sums.get(f"depolarisation {axis}", 0.0)) for axis in "quv"]
-        kept = 1.0 - jnp.stack(jnp.broadcast_arrays(jnp.zeros(()), *lost), axis=-1)[..., None]
-        matrix = kept * (jnp.eye(4) if matrix is None else matrix)
+        remaining = 1.0 - jnp.stack(jnp.broadcast_arrays(jnp.zeros(()), *lost), axis=-1)[..., None]
+        matrix = remaining * (jnp.eye(4) if matrix is None else matrix)
     assert matrix is not None
     return matrix
 
@@ -133,7 +133,7 @@ class PolariserFilm(Component):
 
 @dataclasses.dataclass(frozen=True)
 class Inside:
-    """The factor that is 1 where a moving element is in the beam."""
+    """A factor: 1 while a moving element is in the beam, else 0."""
 
     prefix: str
 
@@ -143,7 +143,7 @@ class Inside:
 
 
 class SkyFilm(PolariserFilm):
-    """Changes of light from the sky ahead of the polariser that differ from exposure to exposure."""
+    """Changes of light from the sky ahead of the polariser, variable from exposure to exposure."""
 
     def through(
         self, light: Float[Array, "e 4"], exposures: ExposureArrays, x: Scalar, y: Scalar
@@ -163,7 +163,7 @@ class SkyFilm(PolariserFilm):
 
 
 class Displaced(Element):
-    """A change of where the optics behind see the field point."""
+    """A displacement of the field point for the optics behind."""
 
     amplitudes: tuple[Scalar, ...] = ()
     changes: tuple[Change, ...] = eqx.field(static=True, default=())
@@ -171,7 +171,7 @@ class Displaced(Element):
     kind: ClassVar[str] = "described"
 
     def ray(self, ray: Ray) -> Ray:
-        """The ray from the place that the optics behind see."""
+        """The ray from the displaced field point."""
         x, y = ray.x, ray.y
         for change, size in zip(self.changes, self.amplitudes, strict=True):
             by = size * change.in_train(ray, 0.0)
@@ -208,20 +208,20 @@ _ANYTHING = Combinations(_FIELD[:3], ("steady", "hours", "kelvin"), ("anything",
 _TURN = (
     Combinations(_FIELD, ("steady", *SLOW)),
     Combinations(along=("harmonics to 6", *SINGLE, "side", "night", "step", "spell", "exposure")),
-    Combinations(("tilt", "r2"), ("harmonics to 1",)),  # a beam that wanders over a film that is not uniform
+    Combinations(("tilt", "r2"), ("harmonics to 1",)),  # a beam that wanders over a non-uniform film
 )
 
 
 def _grows(instrument: Instrument, change: Change) -> Grows:
-    """Optics with what a ray knows, and with the angle of the element that they are of; the polariser by exposure."""
+    """Optics: with the quantities of a ray and the angle of their element; the polariser: by exposure."""
     kind, polariser = change.kind, instrument.polariser
     over = _NOT_IN_OTHER_KINDS.get(kind.rpartition(" ")[2], _FIELD)
     always = Combinations(over, ("steady", *SLOW))
     if _is_ahead(instrument, change):
         return Grows((FIELD, EXPOSURE), None, (always, Combinations(along=(*SINGLE, "kind")), _ANYTHING))
     if change.where != "of":
-        more = Combinations(over, ("colour",)), Combinations(among=("all",)), _ANYTHING
-        return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=(always, *more))
+        further = Combinations(over, ("colour",)), Combinations(among=("all",)), _ANYTHING
+        return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=(always, *further))
     if polariser is not None and change.place == polariser.name:
         film = always, Combinations(over, ("harmonics to 2",)), Combinations(along=(*SINGLE, "side"))
         as_a_turn = {"turn": _TURN, "retardance v": ()}
@@ -233,19 +233,19 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
 
 
 def _is_ahead(instrument: Instrument, change: Change) -> bool:
-    """True for what acts on light from the sky alone, ahead of the polariser."""
+    """True for changes of light from the sky alone, ahead of the polariser."""
     polariser = instrument.polariser
     return polariser is not None and change.where == "ahead of" and change.place == polariser.name
 
 
 def _differs(instrument: Instrument, terms: Sequence[Term]) -> bool:
-    """True for changes ahead of the polariser that differ from exposure to exposure."""
+    """True for changes ahead of the polariser that vary from exposure to exposure."""
     with_exposure = any(item.depends_on == EXPOSURE for change, _ in terms for item in change.grows_with)
     return with_exposure and _is_ahead(instrument, terms[0][0])
 
 
 def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    """One more element at the place; of an element that moves, or of the polariser: in the beam only when it is."""
+    """One more element at the place; in the beam together with a moving element or polariser of that place."""
     change, polariser = terms[0][0], instrument.polariser
     if _differs(instrument, terms):
         return instrument.changed("", sky_films=lambda films: (*films, SkyFilm(**_columns(terms))))
@@ -281,9 +281,9 @@ def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 
 def _grows_added(instrument: Instrument, change: Change) -> Grows:
-    """Anything where light from the sky has it alone, nothing behind."""
+    """All dependences for light from the sky, none behind the polariser."""
     tried = (
-        Combinations(("tilt", "r2")),  # the same everywhere it is diattenuation
+        Combinations(("tilt", "r2")),  # uniform over the field it is diattenuation
         Combinations(("even", "tilt", "r2"), SLOW),
         Combinations(along=(*SINGLE, "kind")),
     )

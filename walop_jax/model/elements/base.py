@@ -1,7 +1,7 @@
 """Elements of the train: each maps a ray to a ray and has a Mueller matrix for it.
 
-An element is neutral when it is made without numbers. It may move: `moves` is the prefix of its columns in EXPOSURES
-(`CHWP` for CHWP_IN and CHWP_ANGLE), which say whether it stands in the beam and at what angle.
+An element without numbers is neutral. It may move: `moves` is the prefix of its columns in EXPOSURES (`CHWP` for
+CHWP_IN and CHWP_ANGLE), its presence in the beam and its angle.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ Mueller = Float[Array, "... 4 4"]
 class Element(Component):
     """An element of the train; concrete ones are final.
 
-    `declared` says which of its numbers are parameters of the instrument, by field. `path_difference` (µm) is the
-    largest optical path between waves that meet again in it: the wavelength nodes must follow its fringes.
+    `declared` holds the parameters of the instrument among its numbers, by field. `path_difference` (µm) is the largest
+    optical path between interfering waves: the wavelength nodes must follow its fringes.
     """
 
     name: str = eqx.field(static=True, default="")
@@ -41,15 +41,12 @@ class Element(Component):
         return ray
 
     def mueller(self, ray: Ray) -> Mueller | None:
-        """Mueller matrix for a ray that enters; None: the identity.
-
-        It has a leading axis where it depends on wavelength.
-        """
+        """Mueller matrix for an entering ray, with a leading axis if it depends on wavelength; None: the identity."""
         return None
 
     @classmethod
     def solved(cls, cases: Sequence[tuple[Any, Ray]]) -> list[Mueller | None]:
-        """Mueller matrices of several elements of this class; overridden where solving them together pays.
+        """Mueller matrices of several elements of this class; overridden where a joint solution is faster.
 
         One element at many angles is traced once: an instrument with many settings would take minutes otherwise.
         """
@@ -72,7 +69,7 @@ class Element(Component):
         return dataclasses.replace(self, axis=self.axis + jnp.asarray(angle, float))  # pyright: ignore
 
     def position(self, angle: float | None) -> float | None:
-        """Angle (deg) at which it really stands when the exposure says `angle`, None when it is out."""
+        """True angle (deg) for a recorded `angle`, None when out of the beam."""
         return angle
 
     @property
@@ -82,14 +79,14 @@ class Element(Component):
 
     @property
     def materials(self) -> tuple[str, ...]:
-        """Names of the materials whose refractive indices it asks for."""
+        """Names of the materials with a refractive index in it."""
         return ()
 
     def retardances(self, wavelength: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], ...]:
-        """Retardance along the axis at wavelengths (µm), in waves, and the sum of those of all layers; none: no waves.
+        """Retardance along the axis at wavelengths (µm), in waves, and the sum over all layers; empty: no waves.
 
-        What crossed layers leave of each other interferes at full strength. The layers by themselves do where rays
-        are oblique, hundreds of times more weakly.
+        The difference of crossed layers interferes at full strength. Single layers do for oblique rays alone,
+        hundreds of times more weakly.
         """
         return ()
 
@@ -99,9 +96,9 @@ def _at_axis(element: Any, axis: Float[Array, ""], ray: Ray) -> Mueller | None:
 
 
 def _turned_copies(cases: Sequence[tuple[Any, Ray]]) -> list[list[int]]:
-    """Positions of the cases that are one element at different angles, met by the same ray."""
+    """Positions of the cases of one element at different angles in the same ray, in groups."""
     groups: dict[tuple[int, ...], list[int]] = {}
     for i, (element, ray) in enumerate(cases):
-        parts = [getattr(element, f.name) for f in dataclasses.fields(element) if f.name != "axis"]
-        groups.setdefault((*map(id, parts), id(ray)), []).append(i)
+        values = [getattr(element, f.name) for f in dataclasses.fields(element) if f.name != "axis"]
+        groups.setdefault((*map(id, values), id(ray)), []).append(i)
     return list(groups.values())

@@ -1,4 +1,4 @@
-"""Elements that change where a ray goes: the mapping from field to pupil, wedges.
+"""Elements that deflect rays: the mapping from field to pupil, wedges.
 
 Pupil       (X, Y) leaves the collimator along (tan M X′, tan M (1 + a) Y′, 1), X′ = X (1 + κ r²): M magnification,
             κ distortion [deg⁻²], r² = X² + Y² [deg²], a aspect.
@@ -56,7 +56,7 @@ def behind_wedge(direction: tuple[Real, Real, Real], angle: Real, index: Real) -
 
 
 def transport_rotation(before: tuple[Real, Real, Real], after: tuple[Real, Real, Real]) -> Real:
-    """Angle (rad, from the first carried axis to the second) by which light turns on the way between two directions."""
+    """Angle (rad, from the first carried axis to the second) of the rotation of light between two directions."""
     (ax, ay, az), (bx, by, bz) = before, after
     return 2.0 * jnp.arctan2(ax * by - ay * bx, 1.0 + ax * bx + ay * by + az * bz + az + bz)
 
@@ -97,9 +97,9 @@ class PupilMapping(Element):
 class Wedge(Element):
     """A glass wedge: exact refraction, no loss.
 
-    `frame` says what becomes of the plane of vibration: `kept` in the carried axes of the rays (no rotation), or
-    `turned` with the ray at each face, as it is for light (see `wedge_rotation`). `sense` −1: the other
-    way round. It bends light along +X, or along `azimuth` from +X toward +Y.
+    `frame` is the treatment of the plane of vibration: `kept` in the carried axes of the rays (no rotation), or
+    `turned` with the ray at each face, as for light (see `wedge_rotation`). `sense` −1 reverses the wedge.
+    It bends light along +X, or along `azimuth` from +X toward +Y.
     """
 
     angle: Scalar = number(unit="rad", about="wedge angle")
@@ -136,7 +136,7 @@ class Wedge(Element):
         return ray.toward(*(behind if self.azimuth is None else rotated(*behind, self.azimuth)))
 
     def direction(self, ray: Ray) -> tuple[Float[Array, ...], Float[Array, ...], Float[Array, ...]]:
-        """The direction of a ray with +X where the wedge bends light to."""
+        """The direction of a ray, with +X along the deflection by the wedge."""
         if self.azimuth is None:
             return ray.kx, ray.ky, ray.kz
         return *rotated(ray.kx, ray.ky, -self.azimuth), ray.kz
@@ -151,7 +151,7 @@ class Wedge(Element):
         return materials.GLASSES[self.material].dispersion.refractive_index(ray.wavelength)
 
     def mueller(self, ray: Ray) -> Mueller | None:
-        """Rotation of the plane of vibration against the carried axes; None where it is kept."""
+        """Rotation of the plane of vibration against the carried axes; None for a kept plane."""
         if self.frame == "kept":
             return None
         return mueller.rotation(-wedge_rotation(self.direction(ray), self.turn, self.index(ray)))

@@ -1,4 +1,4 @@
-"""`ELEMENTS`: the kinds of elements that a description file may name, and those that users define."""
+"""`ELEMENTS`: the kinds of elements of description files, and those defined by users."""
 
 from __future__ import annotations
 
@@ -45,20 +45,20 @@ ELEMENTS: tuple[type[Element], ...] = (
 
 
 def defined_elements() -> tuple[type[Element], ...]:
-    """The kinds of elements that this process has defined beside those of the package, the latest of a kind."""
-    found, waiting = {}, [Element]
+    """The kinds of elements defined in this process beside those of the package, the latest of each name."""
+    kinds, waiting = {}, [Element]
     while waiting:
         for kind in waiting.pop(0).__subclasses__():
             waiting.append(kind)
             if vars(kind).get("kind") and not kind.__module__.startswith("walop_jax.model."):
-                found[kind.kind] = kind
-    return tuple(found.values())
+                kinds[kind.kind] = kind
+    return tuple(kinds.values())
 
 
 def load_elements(given: str | os.PathLike[str] | Sequence[type]) -> None:
-    """Run the file of kinds of elements of one's own: what is defined is known (`defined_elements`).
+    """Run a user's file of kinds of elements, which registers them (`defined_elements`).
 
-    Raises `DataError` for a file that defines none, TypeError for a class that is none.
+    Raises `DataError` for a file without such a class, TypeError for another class.
     """
     if isinstance(given, str | os.PathLike):
         advice = "give a Python file with subclasses of Element (walop-jax docs adding-an-instrument)"

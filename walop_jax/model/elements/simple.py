@@ -96,12 +96,12 @@ class Depolariser(Element):
 
     def mueller(self, ray: Ray) -> Mueller:
         """The depolariser."""
-        kept = 1.0 - self.linear
-        return jnp.diag(jnp.stack([jnp.ones_like(kept), kept, kept, 1.0 - self.circular]))
+        remaining = 1.0 - self.linear
+        return jnp.diag(jnp.stack([jnp.ones_like(remaining), remaining, remaining, 1.0 - self.circular]))
 
 
 class AddedPolarisation(Element):
-    """(0, q, u, 0) per unit of light is added: what mirrors of a telescope do to weakly polarised light."""
+    """(0, q, u, 0) per unit of light is added, as by mirrors of a telescope to weakly polarised light."""
 
     q: Scalar = number(unit="", about="polarisation added along +X")
     u: Scalar = number(unit="", about="polarisation added along +45°")
@@ -118,14 +118,14 @@ FOLLOWING = ("cos1", "sin1", "cos2", "sin2")
 
 
 class AnalysisVector(Element):
-    """The response of a camera where nothing is known of the optics ahead of it: a free row of a Mueller matrix.
+    """The response of a camera behind unknown optics: a free row of a Mueller matrix.
 
-    Equation    M = [a, 0, 0, 0], a = (1, q, u, v) + Σ_m (c_m cos m φ + s_m sin m φ): what arrives is a · S
+    Equation    M = [a, 0, 0, 0], a = (1, q, u, v) + Σ_m (c_m cos m φ + s_m sin m φ): the detected light is a · S
     Symbols     q, u, v response to fully polarised light over that to unpolarised light, its scale being throughput
-                φ angle of the element that it follows (`moves`); c_m, s_m changes of the response to I, Q, U, V: an
+                φ angle of a followed element (`moves`); c_m, s_m changes of the response to I, Q, U, V, as by an
                 element that turns and deviates the beam, m = 1 to first order in the deviation, 2 to second order
     Source      analysis vector of a division-of-amplitude polarimeter: Azzam 1985, Opt. Acta 32, 1407
-    Limits      q² + u² + v² = 1: an ideal elliptical analyser; 0: a detector that does not care
+    Limits      q² + u² + v² = 1: an ideal elliptical analyser; 0: a detector insensitive to polarisation
     """
 
     q: Scalar = number(unit="", about="response to light polarised along +X")
@@ -143,7 +143,7 @@ class AnalysisVector(Element):
     reference: ClassVar[str] = "Azzam 1985, Opt. Acta 32, 1407"
 
     def mueller(self, ray: Ray) -> Mueller:
-        """The row, and nothing polarised behind it."""
+        """The row, with unpolarised light behind it."""
         row, angle = jnp.stack([jnp.ones_like(self.q), self.q, self.u, self.v]), jnp.deg2rad(self.axis)
         for name in FOLLOWING:
             if (change := getattr(self, name)) is not None:
@@ -157,8 +157,8 @@ class AnalysisVector(Element):
                 raise ValueError(f"{name} has {len(change)} values; one each for I, Q, U and V is needed")
 
     def labels(self, field: str) -> Sequence[str]:
-        """Those of a change are named by what they are a response to."""
-        return tuple(f"{field}.{one}" for one in "iquv") if field in FOLLOWING else (field,)
+        """Elements of a change have the names of their Stokes parameters."""
+        return tuple(f"{field}.{component}" for component in "iquv") if field in FOLLOWING else (field,)
 
 
 # -------------------------------------------------------------------------------------------- the calibration polariser
@@ -172,7 +172,7 @@ class Polariser(Element):
     Symbols     θ transmission axis in the instrument frame; ε extinction ratio, unwanted over wanted transmission;
                 v circular polarisation behind it; reading: encoder [deg]
     Source      Malus' law for a polariser of finite extinction: Goldstein 2003, Polarized Light, ch. 9.
-    Limits      ε = 0 is the ideal polariser. What it does to the flux of polarised light is part of the unknown flux.
+    Limits      ε = 0 is the ideal polariser. Its effect on the flux of polarised light is part of the unknown flux.
     """
 
     extinction: Scalar = number(unit="", about="ε, unwanted over wanted transmission")
@@ -263,15 +263,15 @@ class Analyser(WithCurves):
                 with a dispersion κ the first camera sees the band at λ (1 + κ), the second at λ (1 − κ), to first
                 order: M → M ± κ λ ∂M/∂λ, M the train ahead of the analyser
                 with balance g and loss l, curves over wavelength taken at the mean wavelength of a band, the beams of
-                η = 1 are ½ (1 ± g) (1, ±(1 − l) cos 2α, ±(1 − l) sin 2α, 0): what differs from band to band
+                η = 1 are ½ (1 ± g) (1, ±(1 − l) cos 2α, ±(1 − l) sin 2α, 0): differences from band to band
     Symbols     η efficiency, near 1, ξ half its difference between the beams; α axis of the first beam, from +X toward
                 +Y; κ half the relative difference of the wavelengths of the two beams
     Source      Wollaston prism as a pair of crossed analysers: Goldstein 2003, Polarized Light, ch. 9.
     Limits      no balance, no loss: as if g = l = 0
                 η = 1, α = 0 are ideal analysers along +X and +Y; κ = 0: both see the filter as it is.
 
-    What depends on the light ahead of it (`seen`) and what does not (`shares`) are kept apart: only the first
-    enters the band integral.
+    The dependence on the light ahead of it (`seen`) is separate from the `shares`, which do not depend on it: only the
+    first enters the band integral.
     """
 
     efficiency: Scalar = number(unit="", about="η of the analysers ½(1, ±η, 0, 0)", default=1.0)
@@ -298,7 +298,7 @@ class Analyser(WithCurves):
     rows: ClassVar[int] = 2
 
     def seen(self, mueller: Float[Array, "*n 4 4"]) -> Float[Array, "*n 2 4"]:
-        """Rows of the Mueller matrix ahead of it that the beams are made of: S0 and what is analysed."""
+        """Rows of the Mueller matrix ahead of it that form the beams: S0 and the analysed component."""
         analysed = mueller[..., 1, :]
         if self.angle is not None:
             twice = 2.0 * jnp.deg2rad(self.angle)
@@ -307,24 +307,24 @@ class Analyser(WithCurves):
 
     def in_band(self, rows: Float[Array, "b r 4"], wavelength: Float[Array, " b"]) -> Float[Array, "b r 4"]:
         """Band-integrated rows of `seen` (or of their slopes) with balance and loss, at mean wavelengths (µm)."""
-        whole, analysed = rows[:, 0], rows[:, 1]
+        total, analysed = rows[:, 0], rows[:, 1]
         if self.loss is not None:
             analysed = (1.0 - self.curve("loss", wavelength))[:, None] * analysed
         if self.balance is not None:
             g = self.curve("balance", wavelength)[:, None]
-            whole, analysed = whole + g * analysed, analysed + g * whole
-        return jnp.stack([whole, analysed], axis=1)
+            total, analysed = total + g * analysed, analysed + g * total
+        return jnp.stack([total, analysed], axis=1)
 
     def shares(self) -> Float[Array, "k 2"]:
-        """Share of `seen` that each beam takes: that of the second camera only where there is one."""
+        """Share of `seen` in each beam; a single camera has the first beam alone."""
         half = 0.5 * jnp.ones_like(self.efficiency)
         extra = jnp.zeros_like(half) if self.contrast is None else 0.5 * self.contrast
         along = 0.5 * self.efficiency
-        both = jnp.stack([jnp.stack([half, along + extra]), jnp.stack([half, extra - along])])
-        return both[: len(self.cameras)] if self.cameras else both
+        beams = jnp.stack([jnp.stack([half, along + extra]), jnp.stack([half, extra - along])])
+        return beams[: len(self.cameras)] if self.cameras else beams
 
     def shares_of_slopes(self) -> Float[Array, "k 2"]:
-        """Share of λ ∂/∂λ of `seen` that each beam takes."""
+        """Share of λ ∂/∂λ of `seen` in each beam."""
         kappa = jnp.zeros_like(self.efficiency) if self.dispersion is None else self.dispersion
         shares = self.shares()
         return shares * jnp.stack([kappa, -kappa])[: len(shares), None]

@@ -1,18 +1,18 @@
-"""Elements whose polarisation is a curve over wavelength: mirrors, derotators, coatings, what has no closed form.
+"""Elements with curves over wavelength: mirrors, derotators, coatings, polarisation without a closed form.
 
 Equation    M = depolariser(loss) · R(ρ) · [diattenuator(D) spread(s) retarder(δ), all along `axis`]; they commute
             each of δ(λ), D(λ), ρ(λ), loss(λ), s(λ) is the natural cubic spline through its values at its own
             wavelengths, continued as a straight line beyond the first and the last; one value: constant
             `FieldDiattenuator`: D(x, y, λ) = Σ c_ij(λ) P_i(x/h) P_j(y/h), i + j ≤ 2, along `axis`, c_ij(λ) such splines
-Symbols     δ retardance [rad], of the fast axis; D diattenuation along `axis`; ρ angle [deg] by which it turns the
-            polarisation from +X toward +Y, a circular retardance of 2ρ (skew mirrors, optical activity);
-            loss share of q, u, v that is lost; s share of what is not along `axis` that is lost, 1 − exp(−σ²/2)
-            where the retardance differs by σ [rad] over the beam or the band
+Symbols     δ retardance [rad], of the fast axis; D diattenuation along `axis`; ρ rotation [deg] of the polarisation
+            from +X toward +Y, a circular retardance of 2ρ (skew mirrors, optical activity);
+            loss lost share of q, u, v; s lost share of the components not along `axis`, 1 − exp(−σ²/2) for a rms
+            spread σ [rad] of the retardance over the beam or the band
 Sources     mirrors as diattenuating retarders: van Harten, Snik & Keller 2009, PASP 121, 377; form of M: Lu & Chipman
             1996, JOSA A 13, 1106; diattenuation of oblique faces (Fresnel): Born & Wolf 1999, § 1.5;
             spline: de Boor 1978, A Practical Guide to Splines, ch. IV.
-Limits      no values: the identity. A spline with as many knots as bands takes up anything that has no
-            curvature within a band; with fewer it is a smooth curve.
+Limits      no values: the identity. A spline with as many knots as bands fits any curve without curvature
+            within a band; with fewer it is smooth.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ class WithCurves(Element):
         return (field,) if knots is None else tuple(f"{field}{i + 1}" for i in range(len(knots)))
 
     def curve(self, name: str, wavelength: Float[Array, " n"]) -> Float[Array, " n"]:
-        """One of the curves that there are, at wavelengths (µm)."""
+        """One of the curves, at wavelengths (µm)."""
         return spline(getattr(self, f"{name}_at"), getattr(self, name), wavelength)
 
 
 def check_curve(name: str, values: Curve | None, knots: Sequence[float]) -> None:
-    """Raise ValueError for values and wavelengths (`name`_at) that do not belong together."""
+    """Raise ValueError for values without their wavelengths (`name`_at), and the reverse."""
     if (values is None) != (len(knots) == 0):
         missing = name if values is None else f"{name}_at"
         raise ValueError(f"{missing} is missing: {name} and {name}_at (um) belong together")
@@ -89,13 +89,13 @@ def spline(knots: Sequence[float], values: Curve, at: Float[Array, " n"]) -> Flo
 
 
 def _bends(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
-    """Matrix that gives the second derivatives at the knots from the values: de Boor's tridiagonal system."""
+    """Matrix from values to second derivatives at the knots: de Boor's tridiagonal system."""
     n, h = len(x), np.diff(x)
-    left, right = np.eye(n), np.zeros((n, n))
+    system, differences = np.eye(n), np.zeros((n, n))
     for i in range(1, n - 1):
-        left[i, i - 1 : i + 2] = h[i - 1] / 6.0, (h[i - 1] + h[i]) / 3.0, h[i] / 6.0
-        right[i, i - 1 : i + 2] = 1.0 / h[i - 1], -1.0 / h[i - 1] - 1.0 / h[i], 1.0 / h[i]
-    return np.linalg.solve(left, right)
+        system[i, i - 1 : i + 2] = h[i - 1] / 6.0, (h[i - 1] + h[i]) / 3.0, h[i] / 6.0
+        differences[i, i - 1 : i + 2] = 1.0 / h[i - 1], -1.0 / h[i - 1] - 1.0 / h[i], 1.0 / h[i]
+    return np.linalg.solve(system, differences)
 
 
 class SpectralElement(WithCurves):
@@ -140,17 +140,19 @@ class SpectralElement(WithCurves):
         if self.delta is not None:
             yield mueller.retarder(self.curve("delta", ray.wavelength), axis)
         if self.spread is not None:
-            kept, one = 1.0 - self.curve("spread", ray.wavelength), jnp.ones_like(ray.wavelength)
-            own = jnp.stack([one, one, kept, kept], axis=-1)[:, :, None] * jnp.eye(4)
-            yield mueller.rotation(-axis) @ own @ mueller.rotation(axis)
+            remaining, ones = 1.0 - self.curve("spread", ray.wavelength), jnp.ones_like(ray.wavelength)
+            matrix = jnp.stack([ones, ones, remaining, remaining], axis=-1)[:, :, None] * jnp.eye(4)
+            yield mueller.rotation(-axis) @ matrix @ mueller.rotation(axis)
         if self.diattenuation is not None:
             d = self.curve("diattenuation", ray.wavelength)
             yield mueller.diattenuator(d * jnp.cos(2.0 * axis), d * jnp.sin(2.0 * axis))
         if self.rotation is not None:
             yield mueller.rotation(-jnp.deg2rad(self.curve("rotation", ray.wavelength)))
         if self.loss is not None:
-            kept = 1.0 - self.curve("loss", ray.wavelength)
-            yield jnp.stack([jnp.ones_like(kept), kept, kept, kept], axis=-1)[:, :, None] * jnp.eye(4)
+            remaining = 1.0 - self.curve("loss", ray.wavelength)
+            yield jnp.stack([jnp.ones_like(remaining), remaining, remaining, remaining], axis=-1)[
+                :, :, None
+            ] * jnp.eye(4)
 
 
 class FieldDiattenuator(Element):
@@ -158,7 +160,7 @@ class FieldDiattenuator(Element):
 
     Directly ahead of an analyser, with its axis, it is a ratio of the two beams: ½ (1 ± D) (1, ±1, 0, 0). The cameras
     have such a ratio too, in their throughput, the same at all wavelengths: with `none_at` (µm) the terms vanish there,
-    and are what changes with colour.
+    and hold the change with colour alone.
     """
 
     p00: Curve | None = number(unit="", about="constant part at `at`", default=None, several=True)
@@ -193,19 +195,19 @@ class FieldDiattenuator(Element):
         if self.none_at > 0.0:
             gap = sum(knot < self.none_at for knot in knots)
             knots = (*knots[:gap], self.none_at, *knots[gap:])
-        parts = [
+        contributions = [
             terms[..., n] * spline(knots, _with_zero(values, gap, len(knots)), ray.wavelength)
             for name, n in FIELD_TERMS.items()
             if (values := getattr(self, name)) is not None
         ]
-        if not parts:
+        if not contributions:
             return None
-        d, twice = sum(parts[1:], parts[0]), 2.0 * jnp.deg2rad(self.axis)
+        d, twice = sum(contributions[1:], contributions[0]), 2.0 * jnp.deg2rad(self.axis)
         return mueller.diattenuator(d * jnp.cos(twice), d * jnp.sin(twice))
 
 
 def _with_zero(values: Curve, at: int, count: int) -> Float[Array, " n"]:
-    """Values of a curve with a zero put in, if it has one value less than `count`."""
+    """Values of a curve, with a zero inserted into a curve of one value less than `count`."""
     return values if len(values) == count else jnp.concatenate([values[:at], jnp.zeros(1), values[at:]])
 
 
@@ -216,7 +218,7 @@ class Mirror(WithCurves):
                 M of the Jones matrix diag(r_p, r_s), p along `axis`, over ½ (|r_p|² + |r_s|²)
     Symbols     θ angle of incidence; n, k index of refraction and extinction coefficient, natural cubic splines through
                 their values at `n_at` and `k_at`; p in the plane of incidence, s normal to it
-    Source      Born & Wolf 1999, § 14.2, for fields that go as exp(i(kz − ωt)), k > 0 then absorbs; as an element of a
+    Source      Born & Wolf 1999, § 14.2, for fields ∝ exp(i(kz − ωt)), k > 0 then absorbs; as an element of a
                 telescope: van Harten, Snik & Keller 2009, PASP 121, 377
     Limits      θ = 0: diag(1, 1, −1, −1), the frame of the reflected beam being (p, s, k) as that of the beam that
                 arrives; k = 0 and tan θ = n (Brewster): light polarised along s alone; k → ∞: no diattenuation.
@@ -246,6 +248,6 @@ class Mirror(WithCurves):
         s = (cos - inside) / (cos + inside)
         p = (index**2 * cos - inside) / (index**2 * cos + inside)
         nothing = jnp.zeros_like(p)
-        own = mueller.from_jones(mueller.Matrix2(p, nothing, nothing, s))
+        matrix = mueller.from_jones(mueller.Matrix2(p, nothing, nothing, s))
         axis = jnp.deg2rad(self.axis)
-        return mueller.rotation(-axis) @ (own / own[..., :1, :1]) @ mueller.rotation(axis)
+        return mueller.rotation(-axis) @ (matrix / matrix[..., :1, :1]) @ mueller.rotation(axis)

@@ -1,13 +1,13 @@
 """Wave plates: crystal layers in contact, solved as plane waves (equations: `plates`).
 
 Layers      optic axis of a layer at fast axis + axis, out of its surface by cut.
-Dispersion  n_e − n_o → (n_e − n_o) (1 + a u + b u² + c u³), u = λ − 0.62 µm: what a crystal, or the catalogue of a
-            design program, differs from the published curve; its part at 0.62 µm is a matter of thickness.
+Dispersion  n_e − n_o → (n_e − n_o) (1 + a u + b u² + c u³), u = λ − 0.62 µm: difference of a crystal, or of the
+            catalogue of a design program, from the published curve; at 0.62 µm it is degenerate with thickness.
 Thermal     n_e − n_o → (n_e − n_o) (1 − thermal · b · (T − 10 °C)), b the published change per kelvin.
 Air gap     diattenuator D = contrast · cos(4π gap cos ϑ / λ) along the fast axis, directly ahead of the plate;
             ϑ angle of the ray in air.
 Sources     Etzel, Rose & Wang 2000, Appl. Opt. 39, 5796 (thermal); Clarke 2005, A&A 434, 377 (fringes).
-Limits      a plate without layers does nothing.
+Limits      a plate without layers is the identity.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MODELS = {"waves": plates.stack_mueller, "fixed_axis": plates.fixed_axis_mueller
 
 
 class Grown(Component):
-    """A change of a number by `size` × what `change` grows with, which says which number (`kind`).
+    """A change of a number (the `kind` of `change`) by `size` × the factors of `change`.
 
     `reading` is the angle (deg) of an element that moves.
     """
@@ -72,7 +72,7 @@ class Layer(Component):
             )
 
     def waves(self, wavelength: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Retardance along the normal, in waves, at wavelengths (µm); an axis out of the surface makes it less."""
+        """Retardance along the normal, in waves, at wavelengths (µm); smaller for an axis out of the surface."""
         birefringence = materials.CRYSTALS[self.material].birefringence(wavelength)
         u = wavelength - REFERENCE_WAVELENGTH
         changes = enumerate((self.slope, self.bend, self.twist), start=1)
@@ -89,9 +89,7 @@ class AirGap(Component):
 
     contrast: Scalar = number(unit="", about="diattenuation at a maximum")
     gap: Scalar = number(unit="um", about="thickness of the air")
-    longest: float = eqx.field(
-        static=True, default=0.0
-    )  # µm: gaps up to which the wavelength nodes must follow
+    longest: float = eqx.field(static=True, default=0.0)  # µm: largest gap for the wavelength nodes
 
 
 class WavePlate(Element):
@@ -109,15 +107,15 @@ class WavePlate(Element):
     reference: ClassVar[str] = "Born & Wolf, Principles of Optics, ch. 15; Yeh 1980, Surf. Sci. 96, 41"
 
     def turned(self, angle: float) -> Self:
-        """The plate turned, and with it the readings that its numbers grow with."""
+        """The plate turned, with the readings of its growing numbers."""
         plate = super().turned(angle)
-        if not any(part.grown for part in (self, *self.layers)):
+        if not any(component.grown for component in (self, *self.layers)):
             return plate
         layers = tuple(dataclasses.replace(layer, grown=_read_at(layer, angle)) for layer in self.layers)
         return dataclasses.replace(plate, grown=_read_at(self, angle), layers=layers)
 
     def position(self, angle: float | None) -> float | None:
-        """At 0° where it always stands in the beam and the exposure says that it is out."""
+        """At 0° where it is always in the beam in spite of a header that reports it out."""
         return 0.0 if angle is None and self.always_in else angle
 
     @property
@@ -131,7 +129,7 @@ class WavePlate(Element):
         return tuple(layer.material for layer in self.layers)
 
     def retardances(self, wavelength: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], ...]:
-        """Of the whole, with the sign that an axis along that of the first layer or across it gives; and the sum."""
+        """Retardance of the plate, layers across the first axis counted negative; and the sum of all layers."""
         waves = [layer.waves(wavelength) for layer in self.layers]
         if not waves:
             return ()
@@ -141,17 +139,17 @@ class WavePlate(Element):
         sum_of_all = np.sum(waves, axis=0)
         return np.abs(sign @ np.array(waves)) if (away < CROSSED).all() else sum_of_all, sum_of_all
 
-    def crystals(self, ray: Ray, known: Known | None = None) -> tuple[plates.Plate, ...]:
-        """The layers at the wavelengths of a ray; `known` keeps indices of refraction from plate to plate."""
-        made, known = [], {} if known is None else known
+    def crystals(self, ray: Ray, indices: Known | None = None) -> tuple[plates.Plate, ...]:
+        """The layers at the wavelengths of a ray; `indices` caches indices of refraction between plates."""
+        crystals, indices = [], {} if indices is None else indices
         for layer in self.layers:
             crystal, case = materials.CRYSTALS[layer.material], (layer.material, id(ray.wavelength))
-            if case not in known:
-                known[case] = (
+            if case not in indices:
+                indices[case] = (
                     crystal.ordinary.refractive_index(ray.wavelength),
                     crystal.extraordinary.refractive_index(ray.wavelength),
                 )
-            ordinary, extraordinary = known[case]
+            ordinary, extraordinary = indices[case]
             changes = (layer.slope, layer.bend, layer.twist)
             if any(change is not None for change in changes):
                 u = ray.wavelength - REFERENCE_WAVELENGTH
@@ -164,8 +162,10 @@ class WavePlate(Element):
             axis = jnp.deg2rad(_number(self, "axis", ray) + _number(layer, "axis", ray))
             cut = _number(layer, "cut", ray)
             cut = None if cut is None else jnp.deg2rad(cut)
-            made.append(plates.Plate(_number(layer, "thickness", ray), ordinary, extraordinary, axis, cut))
-        return tuple(made)
+            crystals.append(
+                plates.Plate(_number(layer, "thickness", ray), ordinary, extraordinary, axis, cut)
+            )
+        return tuple(crystals)
 
     def mueller(self, ray: Ray) -> Mueller | None:
         """The plate with the air gap ahead of it."""
@@ -199,7 +199,7 @@ class WavePlate(Element):
 
     @classmethod
     def solved(cls, cases: Sequence[tuple[WavePlate, Ray]]) -> list[Mueller | None]:
-        """All plates of as many layers as rows of the same arrays: one piece of physics, compiled once."""
+        """Plates with equal numbers of layers as rows of the same arrays: one computation, compiled once."""
         result: list[Mueller | None] = [None] * len(cases)
         groups: dict[tuple[int, str], list[int]] = {}
         for i, (plate, _) in enumerate(cases):
@@ -214,31 +214,31 @@ class WavePlate(Element):
 
 
 def _number(part: WavePlate | Layer, name: str, ray: Ray) -> Any:
-    """A number of a plate or a layer for a ray; None where it has none."""
+    """A number of a plate or a layer for a ray; None where absent."""
     value = getattr(part, name)
-    for one in part.grown:
-        if one.change.kind == name:
-            by = one.size * one.change.in_train(ray, one.reading)
+    for term in part.grown:
+        if term.change.kind == name:
+            by = term.size * term.change.in_train(ray, term.reading)
             value = by if value is None else value + by
     return value
 
 
 def _read_at(part: WavePlate | Layer, angle: float) -> tuple[Grown, ...]:
-    return tuple(dataclasses.replace(one, reading=one.reading + angle) for one in part.grown)
+    return tuple(dataclasses.replace(term, reading=term.reading + angle) for term in part.grown)
 
 
 def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Float[Array, "c n 4 4"]:
     nodes = jnp.shape(cases[0][1].wavelength)
 
     def together(*values: Real) -> Float[Array, "c n"]:
-        """Rows case by case; one row of what is the same in all, one column of single numbers."""
+        """Rows case by case; a single row for common arrays, a single column for numbers."""
         if all(value is values[0] for value in values):
             return jnp.atleast_1d(values[0])[None]
         shape = nodes if any(jnp.ndim(value) for value in values) else (1,)
         return jnp.stack([jnp.broadcast_to(value, shape) for value in values])
 
-    known: Known = {}
-    stacks = [plate.crystals(ray, known) for plate, ray in cases]
+    indices: Known = {}
+    stacks = [plate.crystals(ray, indices) for plate, ray in cases]
     if any(crystal.cut is not None for stack in stacks for crystal in stack):
         stacks = [
             tuple(c if c.cut is not None else c._replace(cut=jnp.zeros(())) for c in stack)
