@@ -44,11 +44,11 @@ class Sharing(NamedTuple):
 
     def summed(self, values: Float[Any, "... e k"]) -> Float[Any, "... e f"]:
         """Sums over what has a flux in common, once for all cameras (f = 1) or camera by camera (f = k)."""
-        each = values.sum(axis=-1, keepdims=True) if self.cameras is None else values @ self.cameras
+        by_camera = values.sum(axis=-1, keepdims=True) if self.cameras is None else values @ self.cameras
         if self.exposures is None:
-            return each
+            return by_camera
         xp = _namespace(values)
-        groups = xp.einsum("...ek,es->...sk", each, self.exposures)
+        groups = xp.einsum("...ek,es->...sk", by_camera, self.exposures)
         return xp.einsum("...sk,es->...ek", groups, self.exposures)
 
     def independent(self, values: Float[Any, "... e k"], inverse: bool = False) -> Float[Any, "... e k"]:

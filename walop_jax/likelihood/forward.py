@@ -161,8 +161,8 @@ class Forward(eqx.Module):
 
     def residuals(self, values: Values | Instrument) -> Float[Array, " d"]:
         """(measured − model) / error of the used intensities, fluxes eliminated; by point, exposure, camera."""
-        every = jax.lax.map(lambda part: self._residuals(values, part), self.data)
-        return every.reshape(-1)[self.used]
+        residuals = jax.lax.map(lambda part: self._residuals(values, part), self.data)
+        return residuals.reshape(-1)[self.used]
 
     # ----------------------------------------------------------------------------------------- densities
 

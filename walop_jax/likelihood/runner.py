@@ -51,9 +51,9 @@ class Runner:
         began = last = time.perf_counter()
         with contextlib.closing(self._each(-(-points // slab), work)) as results:
             for count, result in enumerate(results, start=1):
-                now = time.perf_counter()
-                if now - last > TOLD_EVERY:
-                    last, ready, rate = now, min(count * slab, points), count * slab / (now - began)
+                time_now = time.perf_counter()
+                if time_now - last > TOLD_EVERY:
+                    last, ready, rate = time_now, min(count * slab, points), count * slab / (time_now - began)
                     self.tell(
                         f"{label}: {ready:,} of {points:,} points, {rate:,.0f} points/s, "
                         f"{(points - ready) / rate:.0f} s left of this pass"
