@@ -236,7 +236,7 @@ class Calibration(Contents, Fitted):
         Raises RuntimeError for a fit that nobody has examined.
         """
         calset = result.calset
-        made = cls(
+        calibration = cls(
             model=result.model,
             values=result.values,
             covariance=0.5 * (result.covariance + result.covariance.T),
@@ -251,7 +251,7 @@ class Calibration(Contents, Fitted):
             residuals=residuals,
             hidden=result.hidden,
         )
-        return made if result.averaged is None else result.averaged(made)
+        return calibration if result.averaged is None else result.averaged(calibration)
 
     def with_covariance(self, covariance: Matrix, errors_from: str) -> Calibration:
         """The calibration with the covariance of a posterior, made of errors from `errors_from`, as made now."""
@@ -409,8 +409,8 @@ class Calibration(Contents, Fitted):
             return self.filters[name]
         if name in BUILTIN_FILTERS or single_wavelength(name) is not None:
             return builtin_filter(name)
-        known = (*self.filters, *BUILTIN_FILTERS)
-        raise DataError(f"FILTER: the calibration has no filter {name!r}; {nearest(name, known)}")
+        names = (*self.filters, *BUILTIN_FILTERS)
+        raise DataError(f"FILTER: the calibration has no filter {name!r}; {nearest(name, names)}")
 
     def flags(
         self,
@@ -426,9 +426,9 @@ class Calibration(Contents, Fitted):
         flags = np.zeros(len(x), np.int64)
         if values is not None:
             blocks = values.reshape(len(x), values.shape[1] // 3, 3)[:, :, 1:]
-            known = np.all(np.isfinite(values), axis=1)
+            finite = np.all(np.isfinite(values), axis=1)
             with np.errstate(divide="ignore", invalid="ignore"):
-                condition = np.linalg.cond(np.where(known[:, None, None], blocks, np.eye(*blocks.shape[1:])))
+                condition = np.linalg.cond(np.where(finite[:, None, None], blocks, np.eye(*blocks.shape[1:])))
             flags[~(condition <= HIGH_CROSSTALK)] |= Quality.HIGH_CROSSTALK
         margin = 0.5 / MAP_SIZE * (self.field[1] - self.field[0])
         low_x, low_y = self.field[0] - margin, self.field[2] - margin
@@ -520,9 +520,9 @@ class Calibration(Contents, Fitted):
         Raises `DataError` for a filter that neither the calibration nor the package knows.
         """
         inside = np.flatnonzero(~outside)
-        there, covariance = self.matrix(x[inside], y[inside], settings[inside])
-        values, errors = np.full((2, len(x), there.shape[1]), np.nan)
-        values[inside] = there
+        elements, covariance = self.matrix(x[inside], y[inside], settings[inside])
+        values, errors = np.full((2, len(x), elements.shape[1]), np.nan)
+        values[inside] = elements
         errors[inside] = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
         flag = np.full(len(x), Quality.BEYOND_FIELD, np.int32)
         flag[inside] = self.flags(x[inside], y[inside], settings[inside], values[inside])
@@ -534,9 +534,9 @@ class Calibration(Contents, Fitted):
         for name, column in zip(names, errors.T, strict=True):
             columns[f"{name}_ERR"] = column, f"standard error of {name}"
         if len(names) == 6:
-            known = np.full(len(x), np.nan)
-            known[inside] = p_errors(there, covariance)
-            columns["P_ERR"] = known, "error of p of a star with p <= 5 %, of the calibration alone"
+            error_of_p = np.full(len(x), np.nan)
+            error_of_p[inside] = p_errors(elements, covariance)
+            columns["P_ERR"] = error_of_p, "error of p of a star with p <= 5 %, of the calibration alone"
         columns["FLAG"] = flag, "16 high cross-talk, 32 beyond the calibrated field, 64 filter or temperature"
         return columns
 

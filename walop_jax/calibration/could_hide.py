@@ -72,10 +72,10 @@ class CouldHide(NamedTuple):
 def unmeasured(mistakes: Iterable[CouldHide]) -> dict[str, CouldHide]:
     """Mistakes that the data do not measure, by their names: what one measurement would show together."""
     together: dict[str, list[CouldHide]] = {}
-    for one in mistakes:
-        if not one.measured:
-            together.setdefault(one.remedy, []).append(one)
-    return {", ".join(one.name for one in some): some[0] for some in together.values()}
+    for mistake in mistakes:
+        if not mistake.measured:
+            together.setdefault(mistake.remedy, []).append(mistake)
+    return {", ".join(mistake.name for mistake in group): group[0] for group in together.values()}
 
 
 def off_by(median: float, largest: float) -> str:
@@ -109,8 +109,8 @@ def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
         zip(np.median(errors, axis=1).tolist(), errors.max(axis=1).tolist(), strict=True),
         strict=True,
     )
-    found = [one for one in itertools.starmap(CouldHide, columns) if one.error[1] > 0.0]
-    return tuple(sorted(found, key=lambda one: (-one.error[0], -one.error[1])))
+    mistakes = [mistake for mistake in itertools.starmap(CouldHide, columns) if mistake.error[1] > 0.0]
+    return tuple(sorted(mistakes, key=lambda mistake: (-mistake.error[0], -mistake.error[1])))
 
 
 def hidden_errors(
@@ -121,7 +121,7 @@ def hidden_errors(
     assert hidden is not None
     filters = calibration.curves(settings)
     matrix, slopes = matrix_slopes(instrument, settings, filters, x, y)
-    acting, found = acting_effects(calibration), np.empty((len(hidden), len(x)))
+    acting, errors = acting_effects(calibration), np.empty((len(hidden), len(x)))
     for number, moved in enumerate(hidden.changes):
         change, turn = -slopes @ moved, 0.0
         if number in acting:
@@ -129,8 +129,8 @@ def hidden_errors(
             turn = turn_of(instrument, effect)
             if acts_in(effect, instrument, settings):
                 change = change + change_by_effect(instrument, effect, settings, filters, x, y)
-        found[number] = change_of_qu(matrix, matrix + change) + 2.0 * LARGEST_P * abs(turn)
-    return found
+        errors[number] = change_of_qu(matrix, matrix + change) + 2.0 * LARGEST_P * abs(turn)
+    return errors
 
 
 # ------------------------------------------------------------------------------------ what acts on starlight itself
@@ -146,36 +146,38 @@ def acting_effects(calibration: Calibration) -> Mapping[int, Effect]:
     """The effects of `Hidden.acts` by number, as far as the catalogue of the calibration has them."""
     hidden, model = calibration.hidden, calibration.model
     context = effect_context(model.template, calibration.exposures)
-    known = {kind.name for kind in model.catalogue}
-    found = {}
+    names = {kind.name for kind in model.catalogue}
+    effects = {}
     for number, text in enumerate(() if hidden is None else hidden.acts):
         values: dict[str, Any] = json.loads(text) if text else {}
-        if (name := values.pop("effect", "")) in known:
-            found[number] = effect_by_name(name, model.catalogue).of(context, **values)
-    return found
+        if (name := values.pop("effect", "")) in names:
+            effects[number] = effect_by_name(name, model.catalogue).of(context, **values)
+    return effects
 
 
 def moves_with(effect: Effect, instrument: Instrument) -> frozenset[str]:
     """Column prefixes of the moving elements that an effect is all about: it does nothing where these are out."""
     bare = dataclasses.replace(instrument, effects=())
-    every = itertools.chain(*slots.trains(bare.patched()).values())
-    moving = {one.name: one.moves for one in every if one.moves is not None}
-    found: set[str] = set()
+    elements = itertools.chain(*slots.trains(bare.patched()).values())
+    moving = {element.name: element.moves for element in elements if element.moves is not None}
+    prefixes: set[str] = set()
     for _, change in itertools.chain.from_iterable(effect.first_order(bare)):
-        own = {moving[name] for name in change.place.split(".") if name in moving}
-        if change.where in ("ahead of", "behind") or not own:
+        moved = {moving[name] for name in change.place.split(".") if name in moving}
+        if change.where in ("ahead of", "behind") or not moved:
             return frozenset()
-        found |= own
-    return frozenset(found)
+        prefixes |= moved
+    return frozenset(prefixes)
 
 
 def acts_in(effect: Effect, instrument: Instrument, settings: Settings) -> bool:
     """True if an effect does anything to the light of a star in a setting (one row): it is in the beam there."""
     changes = [
-        one for each in effect.first_order(dataclasses.replace(instrument, effects=())) for _, one in each
+        change
+        for terms in effect.first_order(dataclasses.replace(instrument, effects=()))
+        for _, change in terms
     ]
     if changes and all(
-        one.kind in (*OF_POLARISER, "rotator") for one in changes
+        change.kind in (*OF_POLARISER, "rotator") for change in changes
     ):  # of sources, of the angle of the sky
         return False
     needed = moves_with(effect, instrument)
@@ -186,7 +188,8 @@ def is_ahead(calibration: Calibration, effect: Effect) -> bool:
     """True if an effect acts on the light from the sky ahead of the polariser, or turns the sky."""
     instrument, zero = calibration.model.instrument(calibration.values), jnp.zeros(())
     after, before = (
-        np.asarray(light.telescope(one, zero, zero)) for one in (with_effect(instrument, effect), instrument)
+        np.asarray(light.telescope(model, zero, zero))
+        for model in (with_effect(instrument, effect), instrument)
     )
     return bool(np.any(after != before)) or turn_of(instrument, effect) != 0.0
 
@@ -199,11 +202,13 @@ def with_effect(instrument: Instrument, effect: Effect) -> Instrument:
 def turn_of(instrument: Instrument, effect: Effect) -> float:
     """Angle (rad) by which an effect turns the sky against the instrument, beyond ROTATOR."""
     changes = [
-        one for each in effect.first_order(dataclasses.replace(instrument, effects=())) for _, one in each
+        change
+        for terms in effect.first_order(dataclasses.replace(instrument, effects=()))
+        for _, change in terms
     ]
-    if changes and all(one.kind != "rotator" for one in changes):
+    if changes and all(change.kind != "rotator" for change in changes):
         return 0.0
-    zeros = (one.patched().rotator_zero for one in (with_effect(instrument, effect), instrument))
+    zeros = (model.patched().rotator_zero for model in (with_effect(instrument, effect), instrument))
     after, before = (0.0 if zero is None else float(zero) for zero in zeros)
     return float(np.deg2rad(after - before))
 
@@ -218,7 +223,7 @@ def change_by_effect(
 ) -> Float[np.ndarray, "p a 3"]:
     """Instrument matrix with an effect that stands at its size, less the one without, in one setting."""
     after, before = (
-        planned_matrices(one, plan_for_settings(one, setting, filters), x, y)
-        for one in (with_effect(instrument, effect), instrument)
+        planned_matrices(model, plan_for_settings(model, setting, filters), x, y)
+        for model in (with_effect(instrument, effect), instrument)
     )
     return after - before

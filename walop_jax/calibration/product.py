@@ -155,7 +155,7 @@ def hdus_of(c: Product, path: object) -> list[Any]:
         },
         "WARNINGS": {"TEXT": _strings(in_ascii(text) for text in c.verdict.warnings)},
     }
-    made = {
+    hdus = {
         name: table_hdu(name, columns, path, TABLES[name])
         for name, columns in tables.items()
         if len(next(iter(columns.values())))
@@ -170,9 +170,9 @@ def hdus_of(c: Product, path: object) -> list[Any]:
         images += _residual_hdus(c.residuals)
     if c.hidden is not None:
         images.append(_hidden_hdu(c.hidden))
-    parameters, filters = made.pop("PARAMETERS"), made.pop("FILTERS")
+    parameters, filters = hdus.pop("PARAMETERS"), hdus.pop("FILTERS")
     exposures = set_table_hdu("EXPOSURES", c.exposures.columns(), path)
-    return [_primary(c, version), parameters, *images, filters, exposures, *made.values()]
+    return [_primary(c, version), parameters, *images, filters, exposures, *hdus.values()]
 
 
 def _parameter_columns(c: Product) -> dict[str, np.ndarray]:
@@ -256,9 +256,9 @@ def _validity_cards(c: Product) -> Cards:
         (c.exposures.mjd, ("MJD-BEG", "MJD-END"), "[d] UTC of the exposures"),
         (c.exposures.temp, ("TEMPMIN", "TEMPMAX"), "[Celsius] of the exposures"),
     ):
-        known = values[np.isfinite(values)]
-        if known.size:
-            cards |= {names[0]: (float(known.min()), comment), names[1]: (float(known.max()), comment)}
+        finite = values[np.isfinite(values)]
+        if finite.size:
+            cards |= {names[0]: (float(finite.min()), comment), names[1]: (float(finite.max()), comment)}
     for number, name in enumerate(np.unique(c.exposures.filter).tolist(), start=1):
         cards[f"FILTER{number}"] = (name, "")
     return cards
@@ -442,12 +442,12 @@ class _Reader:
 
     def versions(self) -> dict[str, str]:
         """Versions of the software by name."""
-        found: dict[str, str] = {}
+        versions: dict[str, str] = {}
         for number in range(1, _LONGEST_SOFTWARE_LIST):
             name, _, version = self.text(f"SOFT{number}").partition(" ")
             if name:
-                found[name] = version
-        return found
+                versions[name] = version
+        return versions
 
     # ---------------------------------------------------------------------------- tables and images
 
@@ -485,14 +485,14 @@ class _Reader:
 
     def positions(self, name: str) -> dict[str, float]:
         """Angles (deg) of the moving elements that were in the beam for an image, by column prefix."""
-        header, found = self.hdus[name].header, dict[str, float]()
-        while (card := f"ELEM{len(found) + 1}") in header:
-            prefix, angle = header[card], header.get(f"ANGLE{len(found) + 1}")
-            known = isinstance(prefix, str) and PREFIX.fullmatch(prefix) and prefix not in found
-            if not known or isinstance(angle, bool) or not isinstance(angle, int | float):
+        header, angles = self.hdus[name].header, dict[str, float]()
+        while (card := f"ELEM{len(angles) + 1}") in header:
+            prefix, angle = header[card], header.get(f"ANGLE{len(angles) + 1}")
+            valid = isinstance(prefix, str) and PREFIX.fullmatch(prefix) and prefix not in angles
+            if not valid or isinstance(angle, bool) or not isinstance(angle, int | float):
                 raise Place(self.path, name).fail(f"is {prefix!r} at {angle!r}", card, _AGAIN)
-            found[prefix] = float(angle)
-        return found
+            angles[prefix] = float(angle)
+        return angles
 
     def maps(self) -> MatrixMaps:
         """The maps of the matrix, of as many arms as there are images."""
@@ -587,13 +587,13 @@ def _listed(table: Mapping[str, Any], model_lines: Sequence[str]) -> tuple[Param
         written = tomllib.loads("\n".join(model_lines)).get("parameters", {})
     except tomllib.TOMLDecodeError:
         written = {}
-    found = []
+    parameters = []
     for name, _, _, unit, mean, width, free in zip(*(table[n] for n in TABLES["PARAMETERS"]), strict=True):
         entry, prior = written.get(name, {}), (float(mean), float(width)) if np.isfinite(width) else None
         start = float(entry.get("start", np.nan if prior is None else mean))
         tie = entry.get("tie")
         part = str(name).partition(".")[0]  # names are all that a file has
-        found.append(
+        parameters.append(
             Parameter(str(name), str(unit), "", "", start, prior, bool(free), 1.0, tie=tie, part=part)
         )
-    return tuple(found)
+    return tuple(parameters)

@@ -29,7 +29,7 @@ def summary(
         p.name: {"value": float(value), "sigma": float(sigma), "unit": p.unit}
         for p, value, sigma in zip(result.model.parameters, result.values, result.sigma, strict=True)
     }
-    known = result.answer() if result.answer is not None and result.converged else None
+    accuracy = result.answer() if result.answer is not None and result.converged else None
     return {
         "chi2": result.chi2,
         "dof": result.dof,
@@ -48,12 +48,18 @@ def summary(
         "hidden": None
         if result.hidden is None
         else [
-            dict(zip(("name", "size", "unit", "kind", "measured"), (*one, kind, measured), strict=True))
-            for one, kind, measured in zip(
+            dict(
+                zip(
+                    ("name", "size", "unit", "kind", "measured"),
+                    (*entry, kind, measured),
+                    strict=True,
+                )
+            )
+            for entry, kind, measured in zip(
                 result.hidden.each(), result.hidden.kinds, result.hidden.measured, strict=True
             )
         ],
-        "accuracy_of_p": None if known is None else known.document(),
+        "accuracy_of_p": None if accuracy is None else accuracy.document(),
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),
         "free_parameters": len(result.model.free),

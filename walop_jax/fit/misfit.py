@@ -64,10 +64,10 @@ class Misfit:
     def reasons(self, warnings: Sequence[str], folder: str | PathLike[str] | None) -> tuple[str, ...]:
         """The first reasons against a fit, its `warnings` among them, and the command that shows all of them."""
         reasons = tuple(dict.fromkeys((*self.advice(), *warnings, *self.sentences())))
-        more = len(reasons) - MOST_REASONS
+        omitted = len(reasons) - MOST_REASONS
         return (
             *reasons[:MOST_REASONS],
-            f"{more} more, with the misfit by camera and exposure: walop-jax report {folder}",
+            f"{omitted} more, with the misfit by camera and exposure: walop-jax report {folder}",
         )
 
     def sentences(self) -> tuple[str, ...]:

@@ -195,12 +195,12 @@ def _far_off(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
     """The best place for a model that is far from the data: errors scaled to its residuals, other orders tried."""
     budget, starts = most_passes(likelihood.model) - best.minimum.steps, 1
 
-    def search(label: str, values: Vector, scale: float, most: int) -> FoundMinimum:
+    def search(label: str, values: Vector, scale: float, maximum_steps: int) -> FoundMinimum:
         nonlocal budget
-        most = max(1, min(most, budget))
-        more = _search(likelihood, label, values, scale, best.posterior, maximum_steps=most)
-        budget -= more.minimum.steps
-        return more
+        maximum_steps = max(1, min(maximum_steps, budget))
+        attempt = _search(likelihood, label, values, scale, best.posterior, maximum_steps=maximum_steps)
+        budget -= attempt.minimum.steps
+        return attempt
 
     def rescaled(best: FoundMinimum) -> FoundMinimum:
         for _ in range(MAXIMUM_RESCALINGS):

@@ -422,12 +422,14 @@ class ResponseBlock:
     def _met(self, change: Float[np.ndarray, "s p m b k 4"]) -> Float[np.ndarray, "s m k n"]:
         """Analysis vectors that change, with the light of the exposures."""
         count = change.shape[0]
-        light = np.transpose(self.found.light.taken, (1, 3, 0, 4, 2))  # m k p 4 e
+        incoming = np.transpose(self.found.light.taken, (1, 3, 0, 4, 2))  # m k p 4 e
         counts = np.zeros((count, self.sites, self.cameras, *self.used.shape))
         for band in np.unique(self.band):
             in_band = self.band == band
             at = np.flatnonzero(in_band.any(axis=0))
-            band_counts = np.transpose(change[:, :, :, band], (2, 3, 1, 0, 4)) @ light[..., at]  # m k p s e
+            band_counts = (
+                np.transpose(change[:, :, :, band], (2, 3, 1, 0, 4)) @ incoming[..., at]
+            )  # m k p s e
             if not in_band[:, at].all():
                 band_counts = band_counts * in_band[:, at][:, None]
             counts[..., at] += np.transpose(band_counts, (3, 0, 1, 2, 4))
