@@ -55,7 +55,7 @@ def colour_nodes(count: int) -> Float[np.ndarray, " c"]:
 def colour_weights(teff: Float[np.ndarray, " p"], count: int) -> Float[np.ndarray, "p c"]:
     """Weights of the functions (flat spectrum, then `colour_nodes`) for sources of temperature `teff` (K).
 
-    NaN is a flat photon spectrum; what is cooler than `COOLEST` is taken as that.
+    NaN is a flat photon spectrum; sources cooler than `COOLEST` are taken as that.
     """
     flat = np.isnan(teff)
     t = 2.0 * np.minimum(COOLEST / np.where(flat, COOLEST, teff), 1.0) - 1.0
@@ -105,7 +105,7 @@ class AnalysisVectors:
     # ------------------------------------------------------------------------------------ asking
 
     def reduced(self, settings: Settings) -> Settings:
-        """The settings without what makes no difference to these optics: fewer of them are different."""
+        """The settings without differences that do not matter to these optics: fewer distinct ones."""
         depends, neutral = needs(self.instrument).conditions, Settings.default(len(settings))
         return dataclasses.replace(
             settings,

@@ -230,7 +230,7 @@ class Calibration(Contents, Fitted):
 
     @classmethod
     def from_fit(cls, result: FitResult, residuals: ResidualMap | None = None) -> Calibration:
-        """The calibration that a fit gives, with the verdict on it: of a diagnosis the mean over what it leaves open.
+        """The calibration by a fit, with the verdict on it: of a diagnosis the mean over the models still possible.
 
         `residuals` is what the model leaves over the field (`residual_map`), worth its pass for large sets.
         Raises RuntimeError for a fit that nobody has examined.
@@ -495,7 +495,7 @@ class Calibration(Contents, Fitted):
     # ------------------------------------------------------------------------------- tables and contents
 
     def provenance(self, content: str = "") -> dict[str, str]:
-        """Cards of a table of matrices: the calibration (hash of its content), and what the errors are made from."""
+        """Cards of a table of matrices: the calibration (hash of its content), and the origin of the errors."""
         verdict = self.verdict
         drawn = (
             "draws of the posterior"
@@ -517,7 +517,7 @@ class Calibration(Contents, Fitted):
     ) -> Columns:
         """The matrix elements, their standard errors and FLAG, each with its description; NaN and 32 where `outside`.
 
-        Raises `DataError` for a filter that neither the calibration nor the package knows.
+        Raises `DataError` for a filter that neither the calibration nor the package has.
         """
         inside = np.flatnonzero(~outside)
         elements, covariance = self.matrix(x[inside], y[inside], settings[inside])

@@ -25,14 +25,14 @@ MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on 
 DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
 SINGULAR = 1e-12  # eigenvalue of a correlation that is 0 but for rounding
 UNMEASURED = 5e-4
-"""Error of q and u (median over the field) that something of which the data say nothing may make."""
+"""Error of q and u (median over the field) allowed to a mistake without any data on it."""
 _POINTS = 64
 
 Vector = Float[np.ndarray, " p"]
 
 
 class Check(NamedTuple):
-    """One property of a product: whether it holds, and in words what was found."""
+    """One property of a product: whether it holds, and the evidence in words."""
 
     name: str
     passed: bool
@@ -171,7 +171,7 @@ def _physics(calibration: Calibration) -> Check:
 
 
 def _protection(calibration: Calibration) -> Iterator[Check]:
-    """A statement of what could hide, as large as the data leave it; what they do not measure at all fails.
+    """A statement of mistakes that could hide, at the limits of the data; unmeasured ones fail.
 
     It may do no more to stars than `UNMEASURED`.
     """

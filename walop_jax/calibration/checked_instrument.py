@@ -25,7 +25,7 @@ from walop_jax.model.ray import Ray
 from walop_jax.model.specification import THROUGHPUT, Model
 
 OFF_AXIS = 0.9  # of the field limit, where the optics are tried
-LARGEST_FIELD = 0.3  # deg: beyond, a description says nothing of the optics
+LARGEST_FIELD = 0.3  # deg: beyond, a description does not cover the optics
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -1,4 +1,4 @@
-"""Mistakes that could hide: single ones that the data of a calibration would not have shown, and what they do to stars.
+"""Mistakes that could hide: single ones below the detection limits of a calibration, and their errors of stars.
 
 A mistake moves the parameters of the fit by δθ; of what acts on starlight itself the light of stars changes as well.
 Stars are seen through m + δm and calibrated with m + ∂m/∂θ δθ, so that q and u are wrong by
@@ -60,7 +60,7 @@ class CouldHide(NamedTuple):
 
     @property
     def in_words(self) -> str:
-        """Name, and the size at which it would just be seen, or the usual one of what the data do not measure."""
+        """Name, and the size at which it would just be detected, or the usual one of an unmeasured mistake."""
         size = (
             f"{rounded(self.size, '.2g')} {self.unit}"
             if self.unit
@@ -100,7 +100,7 @@ def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
     if not errors.size:
         return ()
     acting = acting_effects(calibration)
-    ahead = [  # asked of what is not measured alone
+    ahead = [  # of unmeasured mistakes alone
         not measured and number in acting and is_ahead(calibration, acting[number])
         for number, measured in enumerate(hidden.measured)
     ]
@@ -221,7 +221,7 @@ def change_by_effect(
     x: Vector,
     y: Vector,
 ) -> Float[np.ndarray, "p a 3"]:
-    """Instrument matrix with an effect that stands at its size, less the one without, in one setting."""
+    """Instrument matrix with an effect at its size, less the one without, in one setting."""
     after, before = (
         planned_matrices(model, plan_for_settings(model, setting, filters), x, y)
         for model in (with_effect(instrument, effect), instrument)

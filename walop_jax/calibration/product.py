@@ -1,4 +1,4 @@
-"""The file of a calibration, `calibration.fits`: what a fit has learnt, complete in one file (docs: files).
+"""The file of a calibration, `calibration.fits`: the result of a fit, complete in one file (docs: files).
 
 Of an instrument with A arms RESIDUAL has 4 A − 1 planes. Moving elements ELEM1, … of a map stand at ANGLE1, … PRODVERS
 is 2 for an instrument that is none of the first three or has not two arms, for further moving elements and for lamps,
@@ -98,7 +98,7 @@ Cards = dict[str, tuple[Any, str]]
 def write_calibration(
     path: str | os.PathLike[str], calibration: Calibration | Product, *, overwrite: bool = False
 ) -> None:
-    """Write a calibration, or what was read of one, with checksums; the file appears whole or not at all.
+    """Write a calibration, or the content of a file of one, with checksums; the file appears whole or not at all.
 
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only, and for a
     parameter whose name could not be read again.
@@ -114,7 +114,7 @@ def write_calibration(
 
 
 def content_of(hdus: Iterable[Any]) -> str:
-    """SHA-256 of words, columns and images, as they stand in a file; the order of extensions does not matter.
+    """SHA-256 of words, columns and images, as in a file; the order of extensions does not matter.
 
     Not of dates, software, paths, and of what others have added.
     """
@@ -241,7 +241,7 @@ def _primary(c: Product, version: int) -> fits.PrimaryHDU:
     primary = fits.PrimaryHDU()
     for name, (value, comment) in cards.items():
         if isinstance(value, float) and not np.isfinite(value):
-            continue  # FITS headers know no NaN; a missing card is read as one
+            continue  # FITS headers have no NaN; a missing card is read as one
         primary.header[name] = (in_ascii(value) if isinstance(value, str) else value, comment)
     primary.header["INSTRUME"] = c.instrument  # blanks inside a name count
     for number, (name, release) in enumerate(c.versions.items(), start=1):
@@ -250,7 +250,7 @@ def _primary(c: Product, version: int) -> fits.PrimaryHDU:
 
 
 def _validity_cards(c: Product) -> Cards:
-    """Dates, temperatures and filters that the product may be applied to, for a look: EXPOSURES says the same."""
+    """Dates, temperatures and filters that the product may be applied to, for a look: EXPOSURES has the same."""
     cards: Cards = {}
     for values, names, comment in (
         (c.exposures.mjd, ("MJD-BEG", "MJD-END"), "[d] UTC of the exposures"),
@@ -289,7 +289,7 @@ def _residual_hdus(residuals: ResidualMap) -> list[fits.ImageHDU]:
 
 
 def _hidden_hdu(hidden: Hidden) -> fits.ImageHDU:
-    """An image (mistake, parameter) of what each mistake does to the parameters; no data where there is none."""
+    """An image (mistake, parameter) of the shifts of the parameters by each mistake; no data where there is none."""
     hdu = fits.ImageHDU(hidden.changes if len(hidden) else None, name="HIDDEN")
     for number in range(len(hidden)):
         for word, (attribute, usual) in _MISTAKE.items():
@@ -330,7 +330,7 @@ def product_path(run: str | os.PathLike[str]) -> Path:
 
 
 class _Reader:
-    """The parts of an open file by name; every method raises `DataError` for what is amiss."""
+    """The parts of an open file by name; every method raises `DataError` for an invalid entry."""
 
     def __init__(self, opened: OpenFile) -> None:
         self.path, self.header, self.opened = opened.path, opened.hdus[0].header, opened.hdus
@@ -582,7 +582,7 @@ def _number(header: fits.Header, name: str, place: Place, missing: float | None 
 
 
 def _listed(table: Mapping[str, Any], model_lines: Sequence[str]) -> tuple[Parameter, ...]:
-    """The parameters of a file, with starts (NaN: unknown) and ties as far as the lines of its model say them."""
+    """The parameters of a file, with starts (NaN: unknown) and ties as far as the lines of its model contain them."""
     try:
         written = tomllib.loads("\n".join(model_lines)).get("parameters", {})
     except tomllib.TOMLDecodeError:

@@ -131,7 +131,7 @@ def _main_setting(
 
 
 def residual_map(result: FitResult) -> ResidualMap:
-    """The map of what a fit leaves: from the sums of its last pass, or by one more pass over the points.
+    """The map of the residuals of a fit: from the sums of its last pass, or by one more pass over the points.
 
     >>> walop.residual_map(result).excess()["m21"]  # doctest: +SKIP
     """
@@ -171,7 +171,7 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
 
 
 def residual_map_of_pixels(frame: FrameSums) -> ResidualMap:
-    """The map of what the values leave of whole frames: from the sums of cells, with what is smooth in their middle."""
+    """The residual map of whole frames: from the sums of cells, with smooth quantities in their middle."""
     likelihood, cells = frame.likelihood, frame.cells
     exposures = likelihood.calset.exposures
     measured = frame.sums.used.any(axis=(1, 2))  # not those of a table beside the frames

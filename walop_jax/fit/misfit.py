@@ -1,5 +1,5 @@
-"""Disagreement of model and data: χ² per intensity by camera, exposure kind, filter and wavelength, and what it
-would be in the elements of the instrument matrix.
+"""Disagreement of model and data: χ² per intensity by camera, exposure kind, filter and wavelength, and its
+equivalent in the elements of the instrument matrix.
 
 A residual of the light through the polariser is, at each field point and setting, expanded as
 Δq_m = Δm21 + Δm22 q + Δm23 u (and Δu_m likewise) by least squares over the polariser angles; the rms over the

@@ -367,7 +367,7 @@ class ResponseBlock:
         flat = last.reshape(*last.shape[:-2], -1)
         return flat if self.whole else np.ascontiguousarray(flat[..., self.chosen])
 
-    # -------------------------------------------------------------------------------- what is multiplied by factors
+    # -------------------------------------------------------------------------------- cores, ahead of their factors
 
     def _pattern(self, factors: tuple[Any, ...]) -> Float[np.ndarray, "m n"]:
         """Product of factors at every site."""

@@ -34,11 +34,11 @@ from walop_jax.likelihood.frames import (
 )
 from walop_jax.likelihood.inverses import whitening
 
-SINGULAR = 1e-12  # of the largest eigenvalue: directions of the parameters that the data say nothing of
+SINGULAR = 1e-12  # of the largest eigenvalue: directions of the parameters without data
 
 
 def _shares(edges: Vector) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "c p"]]:
-    """Places of the points along a side of the frame, and what each cell between `edges` gives to them."""
+    """Places of the points along a side of the frame, and the contribution of each cell between `edges` to them."""
     cells, (nodes, weights) = len(edges) - 1, legendre.leggauss(limits.COMPRESSED_POINTS)
     count = len(nodes)
     scaled = legendre.legvander(nodes, count - 1) * (np.arange(count) + 0.5) * weights[:, None]
@@ -109,7 +109,7 @@ def _with_gradient(
     unit: Float[np.ndarray, "p e k"],
     place: tuple[Vector, Vector],
 ) -> Float[np.ndarray, "p e k"]:
-    """The pull at points without what is a change of the flux, with the gradient of all pixels."""
+    """The pull at points without its component along the flux, with the gradient of all pixels."""
     matrix = information_of(sums, weight.T, unit.T).transpose(3, 2, 0, 1)
     inverse = np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0)
     pull = np.einsum("pekl,pel->pek", matrix, inverse * pull)

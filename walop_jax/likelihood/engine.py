@@ -272,7 +272,7 @@ def normal_equations(
 
 
 def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:
-    """Sums over blocks of points, so that what is needed in between stays in the processor's cache.
+    """Sums over blocks of points, so that intermediate results stay in the processor's cache.
 
     Points that make no whole number of blocks, and few points, are one block.
     """
@@ -284,7 +284,7 @@ def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldT
 
 
 def summed(function: Callable[[Any], Any], parts: Any) -> Any:
-    """Sums of what a function gives for each of the parts along the first axis, one part after the other."""
+    """Sums of the results of a function for the slices along the first axis, one after the other."""
     first = jax.eval_shape(function, jax.tree.map(lambda v: v[0], parts))
     nothing = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), first)
     return jax.lax.scan(

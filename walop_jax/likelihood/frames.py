@@ -54,7 +54,7 @@ Vector = Float[np.ndarray, " n"]
 FRAME = Rectangle(np.array([-1.0, -1.0]), np.array([1.0, 1.0]))
 
 
-# ------------------------------------------------------------------------------- what pixels say, cell by cell
+# ------------------------------------------------------------------------------- sums over pixels, cell by cell
 
 
 class CellSums(NamedTuple):
@@ -280,7 +280,7 @@ def _at(solve: Any, likelihood: Likelihood, instrument: Instrument, x: Vector, y
 
 @dataclasses.dataclass(frozen=True)
 class FrameSums:
-    """Sums over the pixels of a set, for each cell, at some values of the parameters, and what was smooth there.
+    """Sums over the pixels of a set, for each cell, at some values of the parameters, and the smooth quantities there.
 
     One strip of image rows in `every` was gone through.
     """
@@ -386,7 +386,7 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
             pixels, jnp.asarray(series), across, along, jnp.zeros(cells.side), flux_known, together
         )
         if int(strip.impossible):
-            frames.block(top * cells.grid.width, bottom * cells.grid.width)  # says which
+            frames.block(top * cells.grid.width, bottom * cells.grid.width)  # names the pixel
         return np.asarray(strip.moments), jax.tree.map(
             lambda leaf: np.asarray(leaf)[..., :columns], strip.cells
         )
@@ -534,7 +534,7 @@ def gauss_newton(frame: FrameSums) -> Matrix:
     """Gauss–Newton matrix of half of χ² of all pixels in all parameters."""
     matrices = _on_nodes(frame, NODES, 1)
     if frame.every == 1:
-        # K of a cell that lies in its middle errs by the square of its side: so blocks of four say by how much.
+        # K of a cell that lies in its middle errs by the square of its side: so blocks of four give the error.
         correction = (frame.cells.side**2 - 1) / (3 * frame.cells.side**2)
         matrices = (1.0 + correction) * matrices - correction * _on_nodes(frame, NODES, 2)
     matrices = matrices.reshape(NODES**2, *matrices.shape[2:])

@@ -1,4 +1,4 @@
-"""Linear algebra of quantities whose units differ by orders of magnitude: in units of what each row or column holds.
+"""Linear algebra of quantities whose units differ by orders of magnitude: scaled row by row and column by column.
 
 What is taken for rounding, and left out, then depends on no unit.
 """

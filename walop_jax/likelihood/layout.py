@@ -326,7 +326,7 @@ class PointReader:
 
     @cached_property
     def _moon(self) -> tuple[np.ndarray, Vector, Vector]:
-        """Rows of the exposures of the Moon sky, and where the Moon stands then."""
+        """Rows of the exposures of the Moon sky, and the positions of the Moon then."""
         e: Exposures = self.calset.exposures
         rows = np.flatnonzero(e.direct("moon"))
         if not rows.size:

@@ -1,4 +1,4 @@
-"""A calibration set and a model brought together: what a fit, a sampler or a diagnosis works on."""
+"""A calibration set and a model combined: the basis of fits, samplers and diagnoses."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Census(NamedTuple):
 
 
 class DataTerms(NamedTuple):
-    """χ² of the data, its half gradient and its Gauss–Newton matrix in all parameters, no priors; what was used."""
+    """χ² of the data, its half gradient and Gauss–Newton matrix in all parameters, no priors; the census."""
 
     data: float
     gradient: Vector
@@ -146,7 +146,7 @@ class PriorRows:
 
 
 def prior_rows(model: Model) -> PriorRows:
-    """All that a model says of its free parameters beforehand."""
+    """Priors and weak pulls of the free parameters of a model."""
     rows = []
     for i in model.free.tolist():
         p = model.parameters[i]
@@ -311,7 +311,7 @@ class Likelihood:
     def posterior(
         self, values: Vector, terms: DataTerms, noise_scale: float, optics: OpticsUsed
     ) -> Posterior:
-        """The posterior from what the data say."""
+        """The posterior from the terms of the data."""
         rows, select, pull = self.priors, self.model.selection(), self.priors.residuals(values)
         gradient = terms.gradient / noise_scale**2
         gradient[rows.index] += pull / rows.width
@@ -353,7 +353,7 @@ class Likelihood:
 
     @cached_property
     def census(self) -> Census:
-        """Count of what is used of the set: a pass of its own; an expansion brings its own census with it."""
+        """Census of the used rows of the set, by a separate pass; an expansion brings its own census with it."""
         return self._joined("counting", self._counted)
 
     @property

@@ -20,7 +20,7 @@ import jax
 from walop_jax.model.compiled import float64, usual_threads
 
 Progress = Callable[[str], None]
-"""Is given a line about what is being done."""
+"""Receives a line on the progress of the work."""
 
 TOLD_EVERY = 1.0  # s
 
@@ -39,7 +39,7 @@ class Runner:
         return vars(dataclasses.replace(self, progress=None))
 
     def tell(self, text: str) -> None:
-        """Report what is being done, if progress is wanted."""
+        """Report progress, if somebody listens."""
         if self.progress is not None:
             self.progress(text)
 
