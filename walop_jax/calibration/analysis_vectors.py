@@ -105,7 +105,7 @@ class AnalysisVectors:
     # ------------------------------------------------------------------------------------ asking
 
     def reduced(self, settings: Settings) -> Settings:
-        """The settings without differences that do not matter to these optics: fewer distinct ones."""
+        """The settings, equal where these optics are: fewer distinct ones."""
         depends, neutral = needs(self.instrument).conditions, Settings.default(len(settings))
         return dataclasses.replace(
             settings,
@@ -154,7 +154,7 @@ class AnalysisVectors:
 
     @functools.cached_property
     def turns(self) -> Mapping[int, float]:
-        """Angles (rad) by which those that do so turn the sky."""
+        """Rotations (rad) of the sky by the effects that have one."""
         angles = {number: turn_of(self.instrument, effect) for number, effect in self.acting.items()}
         return {number: turn for number, turn in angles.items() if turn}
 

@@ -1,4 +1,4 @@
-"""A calibration: all that a fit has learnt of an instrument, and all that `calibration.fits` holds (`product`).
+"""A calibration: an instrument as fitted, the content of `calibration.fits` (`product`).
 
 It is made from a fit or read from a file, and is asked for the matrix anywhere in the field.
 """
@@ -194,7 +194,7 @@ class Product(Contents):
     def content_hash(self) -> str:
         """The content hash of the file that it was read from, or of the one that it would be written as.
 
-        SHA-256 of all that a calibration says of the instrument: not of dates, paths and versions.
+        SHA-256 of the instrument as calibrated: not of dates, paths and versions.
         """
         from walop_jax.calibration.product import content_of, hdus_of
 
@@ -233,7 +233,7 @@ class Calibration(Contents, Fitted):
         """The calibration by a fit, with the verdict on it: of a diagnosis the mean over the models still possible.
 
         `residuals` is what the model leaves over the field (`residual_map`), worth its pass for large sets.
-        Raises RuntimeError for a fit that nobody has examined.
+        Raises RuntimeError for a fit without a verdict.
         """
         calset = result.calset
         calibration = cls(

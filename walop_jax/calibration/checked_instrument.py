@@ -113,7 +113,7 @@ def checked(source: str | os.PathLike[str]) -> CheckedInstrument:
 
 
 def _retardance(design: Instrument, plan: Plan) -> dict[str, float]:
-    """Of all plates, in waves: as the circular part of their Mueller matrix has it, whatever they turn or dim."""
+    """Retardances of all plates (waves) from the circular part of their Mueller matrix, free of rotation and losses."""
     axis, retardances = jnp.zeros(()), {}
     ray = Ray.entering(axis, axis, (plan.wavelength, plan.conditions))
     for kind in (Retarder, SpectralElement, WavePlate):

@@ -87,8 +87,8 @@ def off_by(median: float, largest: float) -> str:
 def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
     """The mistakes that could hide in the data of a calibration, the largest error in the median of the field first.
 
-    In the usual setting, where one exposure gives q and u. None where nobody asked, and without those that do nothing
-    there.
+    In the usual setting, where one exposure gives q and u. None where they were not computed;
+    those without an error there are left out.
     """
     hidden = calibration.hidden
     if hidden is None or not len(hidden):
@@ -156,7 +156,7 @@ def acting_effects(calibration: Calibration) -> Mapping[int, Effect]:
 
 
 def moves_with(effect: Effect, instrument: Instrument) -> frozenset[str]:
-    """Column prefixes of the moving elements that an effect is all about: it does nothing where these are out."""
+    """Column prefixes of the moving elements that an effect depends on: it vanishes where these are out."""
     bare = dataclasses.replace(instrument, effects=())
     elements = itertools.chain(*slots.trains(bare.patched()).values())
     moving = {element.name: element.moves for element in elements if element.moves is not None}

@@ -535,7 +535,7 @@ class _Reader:
         )
 
     def hidden(self, parameters: int) -> Hidden | None:
-        """The mistakes of the extension HIDDEN; None in products that nobody asked for them."""
+        """The mistakes of the extension HIDDEN; None in products without them."""
         if "HIDDEN" not in self.hdus:
             return None
         header, place = self.hdus["HIDDEN"].header, Place(self.path, "HIDDEN")

@@ -22,7 +22,7 @@ def summary(
 ) -> dict[str, Any]:
     """The content of `summary.json`, key by key as in docs: files. Frozen parameters have sigma 0.
 
-    Raises RuntimeError for a fit that nobody has examined.
+    Raises RuntimeError for a fit without a verdict.
     """
     verdict = result.checked_verdict()
     parameters = {

@@ -1,4 +1,4 @@
-"""Calibrations and tables as arguments of commands, and tables with what a calibration adds to them.
+"""Calibrations and tables as arguments of commands, and tables with the columns that a calibration adds.
 
 A calibration may be given in memory, by its file or by the folder of a run. What is given in place of one of them is a
 TypeError: what it is, and what to give.
@@ -79,7 +79,7 @@ def catalogue_of(effects: Effects) -> tuple[EffectKind, ...]:
 
 
 def path_of(given: Any, what: str, advice: str) -> Path:
-    """A path. Raises TypeError for what is none and stands for `what`; `advice` says what to give."""
+    """A path. Raises TypeError for anything else, naming the argument `what`, with `advice`."""
     if not isinstance(given, str | os.PathLike):
         raise TypeError(f"{reprlib.repr(given)} is not {what}; give {advice}")
     return Path(given)
@@ -92,7 +92,7 @@ def fit_of(given: Any) -> Any:
 
 
 def calibration_of(given: Product, effects: Effects = None) -> Calibration:
-    """A calibration: as given, that of a fit or a diagnosis, or that of a product or run, with what its file says.
+    """A calibration: as given, that of a fit or a diagnosis, or that of a product or run, read from its file.
 
     Raises `DataError` for a file that cannot be read.
     """
@@ -187,7 +187,7 @@ def table_outcome(
     extra: Mapping[str, Any] | None = None,
     remade: Callable[[Any], tuple[Any, Sequence[str]]] | None = None,
 ) -> Outcome[Any]:
-    """A table with what a calibration adds to it, written if it has an output.
+    """A table with the columns added by a calibration, written if it has an output.
 
     The bits of FLAG that are `counted` have a warning each, unless it is empty; `extra` goes into the document. Columns
     of the table that are not used or are replaced are named. `remade` makes another table of that, with remarks.

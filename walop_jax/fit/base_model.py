@@ -99,7 +99,7 @@ def _level(calset: CalibrationSet) -> float:
 
 
 def gauges(model: Model, flux_known: bool) -> list[str]:
-    """Parameters that fluxes take up: the scale of the throughput, or all that the cameras of an arm have in common."""
+    """Parameters degenerate with fluxes: the scale of the throughput, or all terms common to the cameras of an arm."""
     cameras = model.template.cameras
     if flux_known and not cameras.split:
         return []

@@ -44,7 +44,7 @@ class Clipped:
 
     @property
     def share(self) -> float:
-        """Flagged rows of all that took part."""
+        """Flagged fraction of the used rows."""
         return self.rows / max(self.used, 1)
 
     @property

@@ -133,7 +133,7 @@ class FitResult(Fitted):
 
     @property
     def nearly_explains_data(self) -> bool:
-        """True if χ² is so little too large that the stated errors may be all that is wrong."""
+        """True if the excess of χ² is small enough for the stated errors alone to explain."""
         return self.dof > 0 and not self.explains_data and bool(self.chi2 < NEARLY * self.dof)
 
     @property
@@ -181,7 +181,7 @@ class FitResult(Fitted):
         return dataclasses.replace(self, verdict=dataclasses.replace(verdict, against=against))
 
     def checked_verdict(self) -> Verdict:
-        """The verdict; raises RuntimeError for a fit that nobody has examined."""
+        """The verdict; raises RuntimeError for a fit without one."""
         if self.verdict is None:
             raise RuntimeError(
                 "nobody has examined the residuals of this fit: call walop_jax.diagnosis.trust.examined(fit), as "
@@ -193,7 +193,7 @@ class FitResult(Fitted):
     def trusted(self) -> bool:
         """True if no doubt about the fit forbids its use (`Verdict.trusted`).
 
-        Raises RuntimeError for a fit that nobody has examined.
+        Raises RuntimeError for a fit without a verdict.
         """
         return self.checked_verdict().trusted
 

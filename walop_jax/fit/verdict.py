@@ -99,7 +99,7 @@ NO_STRUCTURE = Structure()
 NOT_MEASURED = (
     "the calibration data hold no information on {}; Q_HIDDEN, U_HIDDEN of stars have it, Q_ERR, U_ERR do not"
 )
-"""A remark on what could be wrong by its usual size, whatever the data are."""
+"""Remark on mistakes without information in the data, at their usual sizes."""
 EFFECT, DATA = "effect", "data"
 """Kinds of mistakes that could hide: of the model of the instrument, of what the set states of its data."""
 

@@ -460,7 +460,7 @@ class ResponseBlock:
         return self._alone(added * cameras) * (self.weight if self.linear else 1.0)
 
     def _alone(self, values: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "m k n"]:
-        """Values that come in once, whatever sites there are."""
+        """Values that enter once, for any number of sites."""
         pairs = self._pairs(values)[None]
         return np.concatenate([pairs, *([np.zeros_like(pairs)] * (self.sites - 1))])
 

@@ -282,7 +282,7 @@ def _at(solve: Any, likelihood: Likelihood, instrument: Instrument, x: Vector, y
 class FrameSums:
     """Sums over the pixels of a set, for each cell, at some values of the parameters, and the smooth quantities there.
 
-    One strip of image rows in `every` was gone through.
+    The sums run over one strip of image rows in `every`.
     """
 
     likelihood: Likelihood
@@ -335,7 +335,7 @@ def _frames(likelihood: Likelihood) -> tuple[FrameIntensities, Int[np.ndarray, "
 
 
 def strips_of(likelihood: Likelihood) -> int:
-    """Number of strips of image rows in which the frames of a set are gone through."""
+    """Number of strips of image rows in one pass over the frames of a set."""
     cells = Cells.of(_frames(likelihood)[0].grid)
     return -(-cells.shape[0] // _cell_rows(cells))
 
@@ -468,7 +468,7 @@ def expand_pixels(
 ) -> PixelPosterior:
     """As `Likelihood.expand`, by one pass over all pixels of frames, or over one strip in `every`.
 
-    A table beside the frames is gone through row by row.
+    A table beside the frames is expanded row by row.
 
     Raises what `frame_sums` raises.
     """

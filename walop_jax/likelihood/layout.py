@@ -348,7 +348,7 @@ class PointReader:
 class MeasuredPoints:
     """The measurements of a set, batch by batch as `layout` cuts it; the last batch is filled up with weight 0.
 
-    They are read once if the layout keeps them in memory, else anew whenever they are gone through.
+    They are read once if the layout keeps them in memory, else anew in every pass.
     """
 
     reader: PointReader

@@ -261,7 +261,7 @@ def _largest(
     catalogue: Sequence[EffectKind],
     carried: Carried | None,
 ) -> Break | None:
-    """The change that stands out most, of those alike the first that is carried; None where chance does as well."""
+    """The most significant change, of those alike the first that is carried; None where chance does as well."""
     tried = Tried.of(solution).without(_other_shapes(data, solution.system.laws))
     kind, cell, i = tried.largest()
     z = tried.z(kind)
