@@ -282,7 +282,7 @@ def matrices(
 
         def with_covariance(*columns: Array, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
             elements, slopes = (
-                values.reshape(len(values), size, *values.shape[3:]) for values in exact(*columns)
+                result.reshape(len(result), size, *result.shape[3:]) for result in exact(*columns)
             )
             return elements, slopes @ covariance @ np.swapaxes(slopes, 1, 2)
 
