@@ -164,12 +164,12 @@ class AnalysisVectors:
         """Change of the vectors by each effect of `acting` that is in the beam, for a flat spectrum."""
         if setting.key not in self._acting_in:
             self._acting_in[setting.key] = {
-                n: one for n, one in self.acting.items() if acts_in(one, self.instrument, setting)
+                n: entry for n, entry in self.acting.items() if acts_in(entry, self.instrument, setting)
             }
         acting = self._acting_in[setting.key]
         if not acting:
             return {}
-        table = self._kept(lambda one: self._acting_table(one, acting), setting, "added")
+        table = self._kept(lambda entry: self._acting_table(entry, acting), setting, "added")
         values = table(x, y).reshape(len(x), len(acting), self.cameras, 3)
         return dict(zip(acting, np.moveaxis(values, 1, 0), strict=True))
 
@@ -267,9 +267,7 @@ class AnalysisVectors:
         def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
             """Change of the vectors in the order point, (effect, camera, Stokes)."""
             bare = vectors(self.instrument, x, y)
-            changes = [
-                vectors(with_effect(self.instrument, effect), x, y) - bare for effect in acting.values()
-            ]
+            changes = [vectors(with_effect(self.instrument, one), x, y) - bare for one in acting.values()]
             return np.stack(changes, axis=1).reshape(len(x), -1)
 
         def error(interpolated: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p f"]) -> float:

@@ -172,12 +172,10 @@ def moves_with(effect: Effect, instrument: Instrument) -> frozenset[str]:
 def acts_in(effect: Effect, instrument: Instrument, settings: Settings) -> bool:
     """True if an effect does anything to the light of a star in a setting (one row): it is in the beam there."""
     changes = [
-        change
-        for terms in effect.first_order(dataclasses.replace(instrument, effects=()))
-        for _, change in terms
+        term for pair in effect.first_order(dataclasses.replace(instrument, effects=())) for _, term in pair
     ]
     if changes and all(
-        change.kind in (*OF_POLARISER, "rotator") for change in changes
+        term.kind in (*OF_POLARISER, "rotator") for term in changes
     ):  # of sources, of the angle of the sky
         return False
     needed = moves_with(effect, instrument)
@@ -188,8 +186,7 @@ def is_ahead(calibration: Calibration, effect: Effect) -> bool:
     """True if an effect acts on the light from the sky ahead of the polariser, or turns the sky."""
     instrument, zero = calibration.model.instrument(calibration.values), jnp.zeros(())
     after, before = (
-        np.asarray(light.telescope(model, zero, zero))
-        for model in (with_effect(instrument, effect), instrument)
+        np.asarray(light.telescope(m, zero, zero)) for m in (with_effect(instrument, effect), instrument)
     )
     return bool(np.any(after != before)) or turn_of(instrument, effect) != 0.0
 
@@ -202,11 +199,9 @@ def with_effect(instrument: Instrument, effect: Effect) -> Instrument:
 def turn_of(instrument: Instrument, effect: Effect) -> float:
     """Angle (rad) by which an effect turns the sky against the instrument, beyond ROTATOR."""
     changes = [
-        change
-        for terms in effect.first_order(dataclasses.replace(instrument, effects=()))
-        for _, change in terms
+        term for pair in effect.first_order(dataclasses.replace(instrument, effects=())) for _, term in pair
     ]
-    if changes and all(change.kind != "rotator" for change in changes):
+    if changes and all(term.kind != "rotator" for term in changes):
         return 0.0
     zeros = (model.patched().rotator_zero for model in (with_effect(instrument, effect), instrument))
     after, before = (0.0 if zero is None else float(zero) for zero in zeros)
@@ -223,7 +218,7 @@ def change_by_effect(
 ) -> Float[np.ndarray, "p a 3"]:
     """Instrument matrix with an effect at its size, less the one without, in one setting."""
     after, before = (
-        planned_matrices(model, plan_for_settings(model, setting, filters), x, y)
-        for model in (with_effect(instrument, effect), instrument)
+        planned_matrices(m, plan_for_settings(m, setting, filters), x, y)
+        for m in (with_effect(instrument, effect), instrument)
     )
     return after - before

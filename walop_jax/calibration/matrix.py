@@ -245,9 +245,7 @@ def _matrix_and_slopes(
     size = values_of(instrument).size
 
     def at(*columns: Array) -> tuple[np.ndarray, np.ndarray]:
-        vectors, slopes = (
-            np.asarray(derivatives)[..., 0, :, :] for derivatives in _slopes(instrument, plan, *columns)
-        )
+        vectors, slopes = (np.asarray(d)[..., 0, :, :] for d in _slopes(instrument, plan, *columns))
         a, b = (np.moveaxis(slopes[..., arms, :], 1, -1) for arms in (first, second))
         total = (vectors[:, first, :1] + vectors[:, second, :1])[..., None]
         m = light.instrument_matrix(vectors, instrument.cameras.pairs)
@@ -281,9 +279,7 @@ def matrices(
         exact = _matrix_and_slopes(instrument, plan)
 
         def with_covariance(*columns: Array, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
-            elements, slopes = (
-                result.reshape(len(result), size, *result.shape[3:]) for result in exact(*columns)
-            )
+            elements, slopes = (a.reshape(len(a), size, *a.shape[3:]) for a in exact(*columns))
             return elements, slopes @ covariance @ np.swapaxes(slopes, 1, 2)
 
         values[rows], errors[rows] = in_chunks(with_covariance, x[rows], y[rows], *_numbers(settings[rows]))

@@ -68,12 +68,12 @@ def _point_sums(
     stokes = light.stokes(instrument, point.sight(plan))
     weight = point.weight * chosen[:, None]
     change = _changes(vectors, stokes, unit, instrument.cameras.pairs) * (flux * weight)[:, None]
-    flux_known, shared = plan.exposures.flux_known, engine.sharing(instrument, plan, point)
+    fixed, shared = plan.exposures.flux_known, engine.sharing(instrument, plan, point)
     change = jnp.moveaxis(change, 1, 0)  # exposures next to cameras
-    change = jnp.moveaxis(project_flux(change, unit * weight, flux_known, shared), 0, 1)
+    change = jnp.moveaxis(project_flux(change, unit * weight, fixed, shared), 0, 1)
     measured = (point.weight[:, 0] > 0) & chosen
     freedom = jnp.sum(
-        jnp.where(measured, unit.shape[-1] - jnp.where(flux_known, 0.0, instrument.cameras.fluxes), 0.0)
+        jnp.where(measured, unit.shape[-1] - jnp.where(fixed, 0.0, instrument.cameras.fluxes), 0.0)
     )
     chi2 = jnp.sum(jnp.where(chosen[:, None], residual, 0.0) ** 2)
     right = jnp.einsum("edk,ek->d", change, residual)
@@ -193,10 +193,8 @@ def residual_map_of_pixels(frame: FrameSums) -> ResidualMap:
         change = _changes(vectors, stokes, np.asarray(smooth.unit)[..., exposure], pairs)
         right += np.einsum("cdk,kc->dc", change, pull[:, exposure])
         matrix += np.einsum("cdk,klc,cfl->dfc", change, matrices[:, :, exposure], change, optimize=True)
-    freedom_per_pixel = likelihood.cameras - np.where(
-        likelihood.flux_known, 0.0, frame.instrument.cameras.fluxes
-    )
-    freedom = np.einsum("e,erc->rc", freedom_per_pixel[chosen], frame.sums.used[chosen])
+    degrees = likelihood.cameras - np.where(likelihood.flux_known, 0.0, frame.instrument.cameras.fluxes)
+    freedom = np.einsum("e,erc->rc", degrees[chosen], frame.sums.used[chosen])
     shaped = (
         frame.sums.chi2[chosen].sum(axis=0),
         freedom,

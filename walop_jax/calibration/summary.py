@@ -39,7 +39,7 @@ def summary(
         "message": result.minimum.message,
         "seconds": seconds,
         "versions": software_versions(),
-        "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in result.calset.inputs],
+        "inputs": [{"path": str(e.path), "sha256": e.sha256} for e in result.calset.inputs],
         "trusted": verdict.trusted,
         "quality": int(verdict.quality),
         "doubts": list(verdict.doubts),
@@ -48,14 +48,8 @@ def summary(
         "hidden": None
         if result.hidden is None
         else [
-            dict(
-                zip(
-                    ("name", "size", "unit", "kind", "measured"),
-                    (*entry, kind, measured),
-                    strict=True,
-                )
-            )
-            for entry, kind, measured in zip(
+            dict(zip(("name", "size", "unit", "kind", "measured"), (*e, kind, measured), strict=True))
+            for e, kind, measured in zip(
                 result.hidden.each(), result.hidden.kinds, result.hidden.measured, strict=True
             )
         ],

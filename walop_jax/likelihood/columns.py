@@ -73,12 +73,10 @@ def own_columns(
         structure = jax.tree.structure(effect)
         if structure not in plans:
             plans[structure] = Likelihood.of(likelihood.calset, likelihood.model, (effect,))
-        probed = plans[structure]
-        instrument = probed.model.instrument(values)
-        matrices = [
-            used_rows(_own(instrument, probed.plan, (effect,), batch), batch) for batch in probed.points
-        ]
-        columns.append(np.concatenate(matrices))
+        probe = plans[structure]
+        instrument = probe.model.instrument(values)
+        rows = [used_rows(_own(instrument, probe.plan, (effect,), batch), batch) for batch in probe.points]
+        columns.append(np.concatenate(rows))
     return np.concatenate(columns, axis=1)
 
 
@@ -96,11 +94,8 @@ def _own_at_point(
 
     _, push = jax.linearize(counts, neutral)
     flat, to_tree = ravel_pytree(neutral)
-    batch = min(limits.AMPLITUDES_AT_ONCE, max(flat.size, 1))
-    change = (
-        jax.lax.map(lambda amplitude: push(to_tree(amplitude)), jnp.eye(flat.size), batch_size=batch)
-        * point.weight
-    )
+    size = min(limits.AMPLITUDES_AT_ONCE, max(flat.size, 1))
+    change = jax.lax.map(lambda row: push(to_tree(row)), jnp.eye(flat.size), batch_size=size) * point.weight
     _, along = jax.jvp(lambda f: real_counts(at_neutral, plan, unit, f), (flux,), (jnp.ones_like(flux),))
     projected = project_flux(
         change, along * point.weight, plan.exposures.flux_known, sharing(instrument, plan, point)
@@ -388,11 +383,9 @@ class ResponseBlock:
         # Points that no exposure measures are in no pair.
         batch = max(1, int(limits.RESPONSE_NUMBERS // max(1, self.sites * self.cameras * len(self.chosen))))
         for first in range(0, len(of_vectors), batch):
-            batch_slots = of_vectors[first : first + batch]
-            change = np.stack(
-                [fringes[slot] if slot in fringes else self.change(slot) for slot in batch_slots]
-            )
-            self._cores |= dict(zip(batch_slots, self._met(change), strict=True))
+            group = of_vectors[first : first + batch]
+            change = np.stack([fringes[slot] if slot in fringes else self.change(slot) for slot in group])
+            self._cores |= dict(zip(group, self._met(change), strict=True))
         for slot in every:
             if slot not in self._cores:
                 self._cores[slot] = self._core(slot)
@@ -402,15 +395,15 @@ class ResponseBlock:
         distinct = list(dict.fromkeys(gaps))
         if not distinct:
             return {}
-        sites = [np.stack([coordinate, -coordinate], 1)[:, : self.sites] for coordinate in (self.x, self.y)]
+        sites = [np.stack([c, -c], 1)[:, : self.sites] for c in (self.x, self.y)]
         padded = np.pad(np.array(distinct), (0, -len(distinct) % GAPS_TOGETHER), mode="edge")
         slopes = [
             np.asarray(_fringes_at(self.of.instrument, self.of.fringe_plan, batch, *sites))
             for batch in np.split(padded, len(padded) // GAPS_TOGETHER)
         ]
-        joined_slopes = np.concatenate(slopes, axis=3)
+        joined = np.concatenate(slopes, axis=3)
         return {
-            ("fringes", place, gap): joined_slopes[:, :, plate, i]
+            ("fringes", place, gap): joined[:, :, plate, i]
             for i, gap in enumerate(distinct)
             for plate, place in enumerate(self.of.fringed)
         }
@@ -422,17 +415,15 @@ class ResponseBlock:
     def _met(self, change: Float[np.ndarray, "s p m b k 4"]) -> Float[np.ndarray, "s m k n"]:
         """Analysis vectors that change, with the light of the exposures."""
         count = change.shape[0]
-        incoming = np.transpose(self.found.light.taken, (1, 3, 0, 4, 2))  # m k p 4 e
+        beam = np.transpose(self.found.light.taken, (1, 3, 0, 4, 2))  # m k p 4 e
         counts = np.zeros((count, self.sites, self.cameras, *self.used.shape))
         for band in np.unique(self.band):
             in_band = self.band == band
             at = np.flatnonzero(in_band.any(axis=0))
-            band_counts = (
-                np.transpose(change[:, :, :, band], (2, 3, 1, 0, 4)) @ incoming[..., at]
-            )  # m k p s e
+            sums = np.transpose(change[:, :, :, band], (2, 3, 1, 0, 4)) @ beam[..., at]  # m k p s e
             if not in_band[:, at].all():
-                band_counts = band_counts * in_band[:, at][:, None]
-            counts[..., at] += np.transpose(band_counts, (3, 0, 1, 2, 4))
+                sums = sums * in_band[:, at][:, None]
+            counts[..., at] += np.transpose(sums, (3, 0, 1, 2, 4))
         flat = counts.reshape(*counts.shape[:3], -1)
         return (flat if self.whole else flat[..., self.chosen]) * (self.share * self.flux)
 

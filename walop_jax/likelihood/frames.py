@@ -372,7 +372,7 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
     across = jnp.asarray(chebyshev.polynomials(s, smooth.count).T)
     unit = np.asarray(smooth.coefficients.unit)[..., exposures]
     series = np.swapaxes(unit.reshape(smooth.count, smooth.count, *unit.shape[1:]), 0, 1)
-    flux_known = jnp.asarray(likelihood.flux_known[exposures])
+    fixed = jnp.asarray(likelihood.flux_known[exposures])
     together = instrument.cameras.together
     read = RowReader(frames, height, width)
 
@@ -382,9 +382,7 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
         pixels = read(top, bottom)
         t = np.minimum((top + np.arange(height) + 0.5) * cells.size[1] - 1.0, 1.0)
         along = jnp.asarray(chebyshev.polynomials(t, smooth.count))
-        strip = strip_sums(
-            pixels, jnp.asarray(series), across, along, jnp.zeros(cells.side), flux_known, together
-        )
+        strip = strip_sums(pixels, jnp.asarray(series), across, along, jnp.zeros(cells.side), fixed, together)
         if int(strip.impossible):
             frames.block(top * cells.grid.width, bottom * cells.grid.width)  # names the pixel
         return np.asarray(strip.moments), jax.tree.map(

@@ -244,12 +244,8 @@ def median_counts(calset: CalibrationSet) -> Float[np.ndarray, "e k"]:
 
     Of a set with more than `limits.MEDIAN_POINTS` points, slabs spread evenly over it are enough.
     """
-    n, slab, largest_sample = len(calset.points), limits.MEDIAN_SLAB, limits.MEDIAN_POINTS
-    starts = (
-        range(0, n, slab)
-        if n <= largest_sample
-        else np.linspace(0, n - slab, largest_sample // slab).astype(int)
-    )
+    n, slab, limit = len(calset.points), limits.MEDIAN_SLAB, limits.MEDIAN_POINTS
+    starts = range(0, n, slab) if n <= limit else np.linspace(0, n - slab, limit // slab).astype(int)
     counts = []
     for start in starts:
         block = calset.intensities.block(int(start), min(int(start) + slab, n))
@@ -289,11 +285,9 @@ class PointReader:
         batches, last = [], len(block.x) - 1
         for first in range(0, len(block.x), size):
             rows = np.arange(first, first + size)
-            columns = {
-                f.name: getattr(block, f.name)[np.minimum(rows, last)] for f in dataclasses.fields(block)
-            }
-            columns["used"] &= (rows <= last)[:, None]
-            batches.append(self.point_data(Block(**columns)))
+            data = {f.name: getattr(block, f.name)[np.minimum(rows, last)] for f in dataclasses.fields(block)}
+            data["used"] &= (rows <= last)[:, None]
+            batches.append(self.point_data(Block(**data)))
         return batches
 
     def point_data(self, block: Block) -> PointData:

@@ -67,15 +67,12 @@ def directions(instrument: Instrument, plan: Plan) -> Directions:
     if light.is_dispersed(instrument):
         rows = np.tile(rows, 2)
     index = np.flatnonzero(rows.any(axis=1))
-    colour, occupied = [], []
+    colour, used = [], []
     for reached in rows[index]:
-        k = next(
-            (k for k, occupied_rows in enumerate(occupied) if not (occupied_rows & reached).any()),
-            len(occupied),
-        )
-        if k == len(occupied):
-            occupied.append(np.zeros(rows.shape[1], bool))
-        occupied[k] = occupied[k] | reached
+        k = next((k for k, rows_used in enumerate(used) if not (rows_used & reached).any()), len(used))
+        if k == len(used):
+            used.append(np.zeros(rows.shape[1], bool))
+        used[k] = used[k] | reached
         colour.append(k)
     return Directions(index, np.array(colour, int), rows[index])
 
@@ -98,8 +95,8 @@ def band_rows(
 
 
 def _rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
-    values, *arguments = primals
-    along, rows, slopes = _slopes(values, *arguments)
+    values, *inputs = primals
+    along, rows, slopes = _slopes(values, *inputs)
     change = jnp.zeros_like(rows)
     if not isinstance(tangents[0], SymbolicZero):
         # Share of every direction in the change of every row.
@@ -107,12 +104,8 @@ def _rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, A
         share = share.at[along.colour].add(tangents[0][along.index][:, None] * along.reached)
         change = jnp.einsum("cr,cbrs->brs", share, slopes)
     if not all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(tangents[1:])):
-        slopes_of_arguments = jax.tree.map(
-            _instantiated, tangents[1:], is_leaf=lambda leaf: isinstance(leaf, SymbolicZero)
-        )
-        change = (
-            change + jax.jvp(lambda *o: band_rows.fun(values, *o), tuple(arguments), slopes_of_arguments)[1]
-        )
+        steps = jax.tree.map(_instantiated, tangents[1:], is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
+        change = change + jax.jvp(lambda *o: band_rows.fun(values, *o), tuple(inputs), steps)[1]
     return rows, change
 
 
