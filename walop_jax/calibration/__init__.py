@@ -1,1 +1,1 @@
-"""Calibrations: what a fit has learnt of an instrument, its files, and its matrix anywhere in the field."""
+"""Calibrations: an instrument as fitted, its files, and its matrix anywhere in the field."""

@@ -43,8 +43,8 @@ def p_forms(
         inverse = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], 1) / (a * d - b * c)[:, None, None]
         along = stars / np.hypot(stars[..., :1], stars[..., 1:])
         s = np.concatenate([np.ones((*stars.shape[:2], 1)), stars], axis=2)
-        left = np.einsum("pnc,pcr->pnr", along, inverse)
-        return np.einsum("pnr,pns->pnrs", left, s).reshape(*stars.shape[:2], 6)
+        row = np.einsum("pnc,pcr->pnr", along, inverse)
+        return np.einsum("pnr,pns->pnrs", row, s).reshape(*stars.shape[:2], 6)
 
 
 def measures_u(matrix: Float[np.ndarray, "p 2 3"]) -> Bool[np.ndarray, " p"]:
@@ -56,20 +56,20 @@ def change_of_qu(
     assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
 ) -> Float[np.ndarray, " p"]:
     """Largest error of q and u at each field point for stars polarised by up to `p`; NaN where not measured."""
-    found = np.full(len(assumed), np.nan)
+    errors = np.full(len(assumed), np.nan)
     if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
-        return found
+        return errors
     good = measures_u(assumed)
     inverse = np.linalg.inv(assumed[good, :, 1:])
     change = (true - assumed)[good]
     offset = np.linalg.norm(inverse @ change[:, :, :1], axis=(1, 2))
-    found[good] = offset + p * np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
-    return found
+    errors[good] = offset + p * np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
+    return errors
 
 
 def largest_change(
     assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
 ) -> float:
     """Largest of `change_of_qu` over the field; NaN when no point holds both q and u."""
-    found = change_of_qu(assumed, true, p)
-    return float(np.nanmax(found)) if np.isfinite(found).any() else float("nan")
+    errors = change_of_qu(assumed, true, p)
+    return float(np.nanmax(errors)) if np.isfinite(errors).any() else float("nan")

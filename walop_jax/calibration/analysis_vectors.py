@@ -55,7 +55,7 @@ def colour_nodes(count: int) -> Float[np.ndarray, " c"]:
 def colour_weights(teff: Float[np.ndarray, " p"], count: int) -> Float[np.ndarray, "p c"]:
     """Weights of the functions (flat spectrum, then `colour_nodes`) for sources of temperature `teff` (K).
 
-    NaN is a flat photon spectrum; what is cooler than `COOLEST` is taken as that.
+    NaN is a flat photon spectrum; sources cooler than `COOLEST` are taken as that.
     """
     flat = np.isnan(teff)
     t = 2.0 * np.minimum(COOLEST / np.where(flat, COOLEST, teff), 1.0) - 1.0
@@ -99,13 +99,13 @@ class AnalysisVectors:
     @property
     def named(self) -> list[tuple[str, str]]:
         """Names and units of `parameters`."""
-        known = self.calibration.model.parameters
-        return [(known[int(p)].name, known[int(p)].unit) for p in self.parameters]
+        parameters = self.calibration.model.parameters
+        return [(parameters[int(p)].name, parameters[int(p)].unit) for p in self.parameters]
 
     # ------------------------------------------------------------------------------------ asking
 
     def reduced(self, settings: Settings) -> Settings:
-        """The settings without what makes no difference to these optics: fewer of them are different."""
+        """The settings, equal where these optics are: fewer distinct ones."""
         depends, neutral = needs(self.instrument).conditions, Settings.default(len(settings))
         return dataclasses.replace(
             settings,
@@ -154,9 +154,9 @@ class AnalysisVectors:
 
     @functools.cached_property
     def turns(self) -> Mapping[int, float]:
-        """Angles (rad) by which those that do so turn the sky."""
-        each = {number: turn_of(self.instrument, one) for number, one in self.acting.items()}
-        return {number: turn for number, turn in each.items() if turn}
+        """Rotations (rad) of the sky by the effects that have one."""
+        angles = {number: turn_of(self.instrument, effect) for number, effect in self.acting.items()}
+        return {number: turn for number, turn in angles.items() if turn}
 
     def added(
         self, setting: Settings, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
@@ -164,12 +164,12 @@ class AnalysisVectors:
         """Change of the vectors by each effect of `acting` that is in the beam, for a flat spectrum."""
         if setting.key not in self._acting_in:
             self._acting_in[setting.key] = {
-                n: one for n, one in self.acting.items() if acts_in(one, self.instrument, setting)
+                n: entry for n, entry in self.acting.items() if acts_in(entry, self.instrument, setting)
             }
         acting = self._acting_in[setting.key]
         if not acting:
             return {}
-        table = self._kept(lambda one: self._acting_table(one, acting), setting, "added")
+        table = self._kept(lambda entry: self._acting_table(entry, acting), setting, "added")
         values = table(x, y).reshape(len(x), len(acting), self.cameras, 3)
         return dict(zip(acting, np.moveaxis(values, 1, 0), strict=True))
 
@@ -226,9 +226,9 @@ class AnalysisVectors:
         def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
             return self.exact(setting, x, y, teff).reshape(len(x), -1)
 
-        def error(found: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p t k 3"]) -> float:
-            there = found.reshape(len(found), COLOURS + 1, self.cameras, 3)
-            between = np.einsum("tc,pcks->ptks", weights, there)
+        def error(interpolated: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p t k 3"]) -> float:
+            on_nodes = interpolated.reshape(len(interpolated), COLOURS + 1, self.cameras, 3)
+            between = np.einsum("tc,pcks->ptks", weights, on_nodes)
             return float(np.abs(between - truth).max() / truth.max())
 
         # As many colours as on the nodes, for whose number the program is there.
@@ -239,17 +239,19 @@ class AnalysisVectors:
     def _derivative_table(self, setting: Settings) -> FieldTable:
         plan, bands = self._plan(setting, [np.nan, *colour_nodes(DERIVATIVE_COLOURS).tolist()])
         plain = plain_positions(self.instrument).size
-        wanted = np.concatenate([self._uncertain, plain + np.arange(self.cameras)])
+        columns = np.concatenate([self._uncertain, plain + np.arange(self.cameras)])
 
         def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
             """Derivatives in the order point, (colour, camera, Stokes, parameter)."""
             values = vector_slopes(self.instrument, plan, x, y)
-            return np.moveaxis(values[:, wanted][:, :, bands], 1, -1).reshape(len(x), -1)
+            return np.moveaxis(values[:, columns][:, :, bands], 1, -1).reshape(len(x), -1)
 
-        def error(found: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p f"]) -> float:
-            found, truth = (values.reshape(-1, len(wanted)) for values in (found, truth))
+        def error(interpolated: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p f"]) -> float:
+            interpolated, truth = (values.reshape(-1, len(columns)) for values in (interpolated, truth))
             largest = np.abs(truth).max(axis=0)
-            return float(np.max(np.abs(found - truth).max(axis=0) / np.where(largest > 0, largest, 1.0)))
+            return float(
+                np.max(np.abs(interpolated - truth).max(axis=0) / np.where(largest > 0, largest, 1.0))
+            )
 
         return self._accurate(exact, DERIVATIVE_NODES, DERIVATIVE_TOLERANCE, error)
 
@@ -258,18 +260,18 @@ class AnalysisVectors:
         flat = dataclasses.replace(setting, teff=np.full(1, np.nan))
 
         def vectors(
-            there: Instrument, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
+            instrument: Instrument, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
         ) -> Float[np.ndarray, "p k 3"]:
-            return sky_vectors(there, plan_for_settings(there, flat, filters), x, y)[:, 0, :, :3]
+            return sky_vectors(instrument, plan_for_settings(instrument, flat, filters), x, y)[:, 0, :, :3]
 
         def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
             """Change of the vectors in the order point, (effect, camera, Stokes)."""
             bare = vectors(self.instrument, x, y)
-            each = [vectors(with_effect(self.instrument, one), x, y) - bare for one in acting.values()]
-            return np.stack(each, axis=1).reshape(len(x), -1)
+            changes = [vectors(with_effect(self.instrument, one), x, y) - bare for one in acting.values()]
+            return np.stack(changes, axis=1).reshape(len(x), -1)
 
-        def error(found: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p f"]) -> float:
-            return float(np.abs(found - truth).max() / max(np.abs(truth).max(), 1e-300))
+        def error(interpolated: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p f"]) -> float:
+            return float(np.abs(interpolated - truth).max() / max(np.abs(truth).max(), 1e-300))
 
         return self._accurate(exact, DERIVATIVE_NODES, ADDED_TOLERANCE, error)
 

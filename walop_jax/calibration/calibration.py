@@ -1,4 +1,4 @@
-"""A calibration: all that a fit has learnt of an instrument, and all that `calibration.fits` holds (`product`).
+"""A calibration: an instrument as fitted, the content of `calibration.fits` (`product`).
 
 It is made from a fit or read from a file, and is asked for the matrix anywhere in the field.
 """
@@ -194,7 +194,7 @@ class Product(Contents):
     def content_hash(self) -> str:
         """The content hash of the file that it was read from, or of the one that it would be written as.
 
-        SHA-256 of all that a calibration says of the instrument: not of dates, paths and versions.
+        SHA-256 of the instrument as calibrated: not of dates, paths and versions.
         """
         from walop_jax.calibration.product import content_of, hdus_of
 
@@ -230,13 +230,13 @@ class Calibration(Contents, Fitted):
 
     @classmethod
     def from_fit(cls, result: FitResult, residuals: ResidualMap | None = None) -> Calibration:
-        """The calibration that a fit gives, with the verdict on it: of a diagnosis the mean over what it leaves open.
+        """The calibration by a fit, with the verdict on it: of a diagnosis the mean over the models still possible.
 
         `residuals` is what the model leaves over the field (`residual_map`), worth its pass for large sets.
-        Raises RuntimeError for a fit that nobody has examined.
+        Raises RuntimeError for a fit without a verdict.
         """
         calset = result.calset
-        made = cls(
+        calibration = cls(
             model=result.model,
             values=result.values,
             covariance=0.5 * (result.covariance + result.covariance.T),
@@ -251,7 +251,7 @@ class Calibration(Contents, Fitted):
             residuals=residuals,
             hidden=result.hidden,
         )
-        return made if result.averaged is None else result.averaged(made)
+        return calibration if result.averaged is None else result.averaged(calibration)
 
     def with_covariance(self, covariance: Matrix, errors_from: str) -> Calibration:
         """The calibration with the covariance of a posterior, made of errors from `errors_from`, as made now."""
@@ -409,8 +409,8 @@ class Calibration(Contents, Fitted):
             return self.filters[name]
         if name in BUILTIN_FILTERS or single_wavelength(name) is not None:
             return builtin_filter(name)
-        known = (*self.filters, *BUILTIN_FILTERS)
-        raise DataError(f"FILTER: the calibration has no filter {name!r}; {nearest(name, known)}")
+        names = (*self.filters, *BUILTIN_FILTERS)
+        raise DataError(f"FILTER: the calibration has no filter {name!r}; {nearest(name, names)}")
 
     def flags(
         self,
@@ -426,9 +426,9 @@ class Calibration(Contents, Fitted):
         flags = np.zeros(len(x), np.int64)
         if values is not None:
             blocks = values.reshape(len(x), values.shape[1] // 3, 3)[:, :, 1:]
-            known = np.all(np.isfinite(values), axis=1)
+            finite = np.all(np.isfinite(values), axis=1)
             with np.errstate(divide="ignore", invalid="ignore"):
-                condition = np.linalg.cond(np.where(known[:, None, None], blocks, np.eye(*blocks.shape[1:])))
+                condition = np.linalg.cond(np.where(finite[:, None, None], blocks, np.eye(*blocks.shape[1:])))
             flags[~(condition <= HIGH_CROSSTALK)] |= Quality.HIGH_CROSSTALK
         margin = 0.5 / MAP_SIZE * (self.field[1] - self.field[0])
         low_x, low_y = self.field[0] - margin, self.field[2] - margin
@@ -495,7 +495,7 @@ class Calibration(Contents, Fitted):
     # ------------------------------------------------------------------------------- tables and contents
 
     def provenance(self, content: str = "") -> dict[str, str]:
-        """Cards of a table of matrices: the calibration (hash of its content), and what the errors are made from."""
+        """Cards of a table of matrices: the calibration (hash of its content), and the origin of the errors."""
         verdict = self.verdict
         drawn = (
             "draws of the posterior"
@@ -517,12 +517,12 @@ class Calibration(Contents, Fitted):
     ) -> Columns:
         """The matrix elements, their standard errors and FLAG, each with its description; NaN and 32 where `outside`.
 
-        Raises `DataError` for a filter that neither the calibration nor the package knows.
+        Raises `DataError` for a filter that neither the calibration nor the package has.
         """
         inside = np.flatnonzero(~outside)
-        there, covariance = self.matrix(x[inside], y[inside], settings[inside])
-        values, errors = np.full((2, len(x), there.shape[1]), np.nan)
-        values[inside] = there
+        elements, covariance = self.matrix(x[inside], y[inside], settings[inside])
+        values, errors = np.full((2, len(x), elements.shape[1]), np.nan)
+        values[inside] = elements
         errors[inside] = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
         flag = np.full(len(x), Quality.BEYOND_FIELD, np.int32)
         flag[inside] = self.flags(x[inside], y[inside], settings[inside], values[inside])
@@ -534,9 +534,9 @@ class Calibration(Contents, Fitted):
         for name, column in zip(names, errors.T, strict=True):
             columns[f"{name}_ERR"] = column, f"standard error of {name}"
         if len(names) == 6:
-            known = np.full(len(x), np.nan)
-            known[inside] = p_errors(there, covariance)
-            columns["P_ERR"] = known, "error of p of a star with p <= 5 %, of the calibration alone"
+            error_of_p = np.full(len(x), np.nan)
+            error_of_p[inside] = p_errors(elements, covariance)
+            columns["P_ERR"] = error_of_p, "error of p of a star with p <= 5 %, of the calibration alone"
         columns["FLAG"] = flag, "16 high cross-talk, 32 beyond the calibrated field, 64 filter or temperature"
         return columns
 

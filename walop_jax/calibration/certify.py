@@ -25,14 +25,14 @@ MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on 
 DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
 SINGULAR = 1e-12  # eigenvalue of a correlation that is 0 but for rounding
 UNMEASURED = 5e-4
-"""Error of q and u (median over the field) that something of which the data say nothing may make."""
+"""Error of q and u (median over the field) allowed to a mistake without any data on it."""
 _POINTS = 64
 
 Vector = Float[np.ndarray, " p"]
 
 
 class Check(NamedTuple):
-    """One property of a product: whether it holds, and in words what was found."""
+    """One property of a product: whether it holds, and the evidence in words."""
 
     name: str
     passed: bool
@@ -54,8 +54,8 @@ def validity(product: Product) -> Validity:
 
 
 def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
-    known = values[np.isfinite(values)]
-    return (float(known.min()), float(known.max())) if known.size else (float("nan"), float("nan"))
+    finite = values[np.isfinite(values)]
+    return (float(finite.min()), float(finite.max())) if finite.size else (float("nan"), float("nan"))
 
 
 def certify(product: Product, catalogue: tuple[EffectKind, ...] = EFFECTS) -> list[Check]:
@@ -88,10 +88,10 @@ def _verdict(product: Product) -> list[Check]:
     unexplained, ill = bool(bits & Quality.UNEXPLAINED), bool(bits & Quality.ILL_CONDITIONED)
     reached = "the minimum was reached" if v.converged else "no"
     why = [doubt.sentence for doubt in v.against if doubt.blocking and doubt.sentence]
-    found = (f"χ²/dof = {v.chi2 / max(v.dof, 1):.4g}", *(() if unexplained else why[:1]))
+    evidence = (f"χ²/dof = {v.chi2 / max(v.dof, 1):.4g}", *(() if unexplained else why[:1]))
     return [
         Check("converged", v.converged and not bits & Quality.NOT_CONVERGED, reached),
-        Check("explains the data", v.trusted and not unexplained, "; ".join(found)),
+        Check("explains the data", v.trusted and not unexplained, "; ".join(evidence)),
         Check("conditioned", not ill, "ill-conditioned" if ill else "yes"),
     ]
 
@@ -114,13 +114,13 @@ def _covariance(product: Product) -> Check:
 
 
 def _validity(product: Product) -> Check:
-    known = validity(product)
-    unknown = [name for name in known.filters if name not in product.filters and name not in BUILTIN_FILTERS]
-    good = bool(np.isfinite(known.mjd[0])) and not unknown
-    found = f"MJD {known.mjd[0]:.2f} to {known.mjd[1]:.2f}, {', '.join(known.filters)}"
-    if np.isfinite(known.temperature[0]):
-        found += f", {known.temperature[0]:.1f} to {known.temperature[1]:.1f} Celsius"
-    return Check("validity", good, found + (f"; no curve of {', '.join(unknown)}" if unknown else ""))
+    span = validity(product)
+    unknown = [name for name in span.filters if name not in product.filters and name not in BUILTIN_FILTERS]
+    good = bool(np.isfinite(span.mjd[0])) and not unknown
+    text = f"MJD {span.mjd[0]:.2f} to {span.mjd[1]:.2f}, {', '.join(span.filters)}"
+    if np.isfinite(span.temperature[0]):
+        text += f", {span.temperature[0]:.1f} to {span.temperature[1]:.1f} Celsius"
+    return Check("validity", good, text + (f"; no curve of {', '.join(unknown)}" if unknown else ""))
 
 
 def _parents(product: Product) -> Check:
@@ -158,18 +158,20 @@ def _physics(calibration: Calibration) -> Check:
     vectors = analysis.exact(setting, x, y)[:, 0]
     least = np.min(1.0 - np.hypot(vectors[..., 1], vectors[..., 2]) / vectors[..., 0], axis=0)
     cameras = analysis.instrument.cameras
-    found = ", ".join(
+    transmissions = ", ".join(
         f"{'/'.join(cameras.names[k] for k in arm)} {rounded(least[list(arm)].min(), '.2g')}"
         for arm in cameras.arms
     )
     good = bool(np.all(vectors[..., 0] > 0)) and bool(np.all(least > -DARKEST))
     return Check(
-        "physics", good, f"least transmission for any polarisation, over that of unpolarised light: {found}"
+        "physics",
+        good,
+        f"least transmission for any polarisation, over that of unpolarised light: {transmissions}",
     )
 
 
 def _protection(calibration: Calibration) -> Iterator[Check]:
-    """A statement of what could hide, as large as the data leave it; what they do not measure at all fails.
+    """A statement of mistakes that could hide, at the limits of the data; unmeasured ones fail.
 
     It may do no more to stars than `UNMEASURED`.
     """
@@ -182,7 +184,7 @@ def _protection(calibration: Calibration) -> Iterator[Check]:
         stated = f"{off_by(*mistakes[0].error)} from {mistakes[0].in_words}"
     yield Check("protection", True, stated)
     unseen = unmeasured(mistakes).items()
-    known = not any(one.error[0] > UNMEASURED for _, one in unseen)
-    text = "; ".join(f"not {name}: {off_by(*one.error)} at the usual size" for name, one in unseen)
+    measured = not any(mistake.error[0] > UNMEASURED for _, mistake in unseen)
+    text = "; ".join(f"not {name}: {off_by(*mistake.error)} at the usual size" for name, mistake in unseen)
     text = text or "; ".join(f"not {name}" for name in calibration.hidden.not_measured())
-    yield Check("measured", known, text or "all that acts on starlight")
+    yield Check("measured", measured, text or "all that acts on starlight")

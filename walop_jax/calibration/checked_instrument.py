@@ -25,7 +25,7 @@ from walop_jax.model.ray import Ray
 from walop_jax.model.specification import THROUGHPUT, Model
 
 OFF_AXIS = 0.9  # of the field limit, where the optics are tried
-LARGEST_FIELD = 0.3  # deg: beyond, a description says nothing of the optics
+LARGEST_FIELD = 0.3  # deg: beyond, a description does not cover the optics
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -89,8 +89,8 @@ class CheckedInstrument(Displayed):
 def checked(source: str | os.PathLike[str]) -> CheckedInstrument:
     """Read an instrument and send light through it; see `walop_jax.instrument` for errors."""
     design = Instrument.read(source, elements=defined_elements())
-    asked = needs(design)
-    plan = blank_plan(design, asked.conditions, asked.median)
+    requirements = needs(design)
+    plan = blank_plan(design, requirements.conditions, requirements.median)
     edge = OFF_AXIS * min(design.field_limit, LARGEST_FIELD)
     for x, y in ((0.0, 0.0), (edge, -edge)):
         vectors = np.asarray(jax.jit(point_vectors)(design, plan, jnp.asarray(x), jnp.asarray(y)))
@@ -107,18 +107,18 @@ def checked(source: str | os.PathLike[str]) -> CheckedInstrument:
         arms={arm.name: arm.path for arm in design.arms},
         moving=design.moving(),
         optical=tuple(model.names[i] for i in optical_indices(model.template)),
-        conditions=tuple(sorted(asked.conditions)),
+        conditions=tuple(sorted(requirements.conditions)),
         retardance=_retardance(design, plan),
     )
 
 
 def _retardance(design: Instrument, plan: Plan) -> dict[str, float]:
-    """Of all plates, in waves: as the circular part of their Mueller matrix has it, whatever they turn or dim."""
-    axis, found = jnp.zeros(()), {}
+    """Retardances of all plates (waves) from the circular part of their Mueller matrix, free of rotation and losses."""
+    axis, retardances = jnp.zeros(()), {}
     ray = Ray.entering(axis, axis, (plan.wavelength, plan.conditions))
     for kind in (Retarder, SpectralElement, WavePlate):
         for place in design.places(kind):
             if (matrix := design.element(place).mueller(ray)) is not None:
                 row = np.reshape(matrix, (-1, 4, 4))[0, 3]
-                found[place] = float(np.arctan2(np.hypot(row[1], row[2]), row[3]) / (2.0 * np.pi))
-    return found
+                retardances[place] = float(np.arctan2(np.hypot(row[1], row[2]), row[3]) / (2.0 * np.pi))
+    return retardances

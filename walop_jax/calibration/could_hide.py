@@ -1,4 +1,4 @@
-"""Mistakes that could hide: single ones that the data of a calibration would not have shown, and what they do to stars.
+"""Mistakes that could hide: single ones below the detection limits of a calibration, and their errors of stars.
 
 A mistake moves the parameters of the fit by δθ; of what acts on starlight itself the light of stars changes as well.
 Stars are seen through m + δm and calibrated with m + ∂m/∂θ δθ, so that q and u are wrong by
@@ -60,7 +60,7 @@ class CouldHide(NamedTuple):
 
     @property
     def in_words(self) -> str:
-        """Name, and the size at which it would just be seen, or the usual one of what the data do not measure."""
+        """Name, and the size at which it would just be detected, or the usual one of an unmeasured mistake."""
         size = (
             f"{rounded(self.size, '.2g')} {self.unit}"
             if self.unit
@@ -72,10 +72,10 @@ class CouldHide(NamedTuple):
 def unmeasured(mistakes: Iterable[CouldHide]) -> dict[str, CouldHide]:
     """Mistakes that the data do not measure, by their names: what one measurement would show together."""
     together: dict[str, list[CouldHide]] = {}
-    for one in mistakes:
-        if not one.measured:
-            together.setdefault(one.remedy, []).append(one)
-    return {", ".join(one.name for one in some): some[0] for some in together.values()}
+    for mistake in mistakes:
+        if not mistake.measured:
+            together.setdefault(mistake.remedy, []).append(mistake)
+    return {", ".join(mistake.name for mistake in group): group[0] for group in together.values()}
 
 
 def off_by(median: float, largest: float) -> str:
@@ -87,8 +87,8 @@ def off_by(median: float, largest: float) -> str:
 def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
     """The mistakes that could hide in the data of a calibration, the largest error in the median of the field first.
 
-    In the usual setting, where one exposure gives q and u. None where nobody asked, and without those that do nothing
-    there.
+    In the usual setting, where one exposure gives q and u. None where they were not computed;
+    those without an error there are left out.
     """
     hidden = calibration.hidden
     if hidden is None or not len(hidden):
@@ -100,7 +100,7 @@ def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
     if not errors.size:
         return ()
     acting = acting_effects(calibration)
-    ahead = [  # asked of what is not measured alone
+    ahead = [  # of unmeasured mistakes alone
         not measured and number in acting and is_ahead(calibration, acting[number])
         for number, measured in enumerate(hidden.measured)
     ]
@@ -109,8 +109,8 @@ def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
         zip(np.median(errors, axis=1).tolist(), errors.max(axis=1).tolist(), strict=True),
         strict=True,
     )
-    found = [one for one in itertools.starmap(CouldHide, columns) if one.error[1] > 0.0]
-    return tuple(sorted(found, key=lambda one: (-one.error[0], -one.error[1])))
+    mistakes = [mistake for mistake in itertools.starmap(CouldHide, columns) if mistake.error[1] > 0.0]
+    return tuple(sorted(mistakes, key=lambda mistake: (-mistake.error[0], -mistake.error[1])))
 
 
 def hidden_errors(
@@ -121,7 +121,7 @@ def hidden_errors(
     assert hidden is not None
     filters = calibration.curves(settings)
     matrix, slopes = matrix_slopes(instrument, settings, filters, x, y)
-    acting, found = acting_effects(calibration), np.empty((len(hidden), len(x)))
+    acting, errors = acting_effects(calibration), np.empty((len(hidden), len(x)))
     for number, moved in enumerate(hidden.changes):
         change, turn = -slopes @ moved, 0.0
         if number in acting:
@@ -129,8 +129,8 @@ def hidden_errors(
             turn = turn_of(instrument, effect)
             if acts_in(effect, instrument, settings):
                 change = change + change_by_effect(instrument, effect, settings, filters, x, y)
-        found[number] = change_of_qu(matrix, matrix + change) + 2.0 * LARGEST_P * abs(turn)
-    return found
+        errors[number] = change_of_qu(matrix, matrix + change) + 2.0 * LARGEST_P * abs(turn)
+    return errors
 
 
 # ------------------------------------------------------------------------------------ what acts on starlight itself
@@ -146,36 +146,36 @@ def acting_effects(calibration: Calibration) -> Mapping[int, Effect]:
     """The effects of `Hidden.acts` by number, as far as the catalogue of the calibration has them."""
     hidden, model = calibration.hidden, calibration.model
     context = effect_context(model.template, calibration.exposures)
-    known = {kind.name for kind in model.catalogue}
-    found = {}
+    names = {kind.name for kind in model.catalogue}
+    effects = {}
     for number, text in enumerate(() if hidden is None else hidden.acts):
         values: dict[str, Any] = json.loads(text) if text else {}
-        if (name := values.pop("effect", "")) in known:
-            found[number] = effect_by_name(name, model.catalogue).of(context, **values)
-    return found
+        if (name := values.pop("effect", "")) in names:
+            effects[number] = effect_by_name(name, model.catalogue).of(context, **values)
+    return effects
 
 
 def moves_with(effect: Effect, instrument: Instrument) -> frozenset[str]:
-    """Column prefixes of the moving elements that an effect is all about: it does nothing where these are out."""
+    """Column prefixes of the moving elements that an effect depends on: it vanishes where these are out."""
     bare = dataclasses.replace(instrument, effects=())
-    every = itertools.chain(*slots.trains(bare.patched()).values())
-    moving = {one.name: one.moves for one in every if one.moves is not None}
-    found: set[str] = set()
+    elements = itertools.chain(*slots.trains(bare.patched()).values())
+    moving = {element.name: element.moves for element in elements if element.moves is not None}
+    prefixes: set[str] = set()
     for _, change in itertools.chain.from_iterable(effect.first_order(bare)):
-        own = {moving[name] for name in change.place.split(".") if name in moving}
-        if change.where in ("ahead of", "behind") or not own:
+        moved = {moving[name] for name in change.place.split(".") if name in moving}
+        if change.where in ("ahead of", "behind") or not moved:
             return frozenset()
-        found |= own
-    return frozenset(found)
+        prefixes |= moved
+    return frozenset(prefixes)
 
 
 def acts_in(effect: Effect, instrument: Instrument, settings: Settings) -> bool:
     """True if an effect does anything to the light of a star in a setting (one row): it is in the beam there."""
     changes = [
-        one for each in effect.first_order(dataclasses.replace(instrument, effects=())) for _, one in each
+        term for pair in effect.first_order(dataclasses.replace(instrument, effects=())) for _, term in pair
     ]
     if changes and all(
-        one.kind in (*OF_POLARISER, "rotator") for one in changes
+        term.kind in (*OF_POLARISER, "rotator") for term in changes
     ):  # of sources, of the angle of the sky
         return False
     needed = moves_with(effect, instrument)
@@ -186,7 +186,7 @@ def is_ahead(calibration: Calibration, effect: Effect) -> bool:
     """True if an effect acts on the light from the sky ahead of the polariser, or turns the sky."""
     instrument, zero = calibration.model.instrument(calibration.values), jnp.zeros(())
     after, before = (
-        np.asarray(light.telescope(one, zero, zero)) for one in (with_effect(instrument, effect), instrument)
+        np.asarray(light.telescope(m, zero, zero)) for m in (with_effect(instrument, effect), instrument)
     )
     return bool(np.any(after != before)) or turn_of(instrument, effect) != 0.0
 
@@ -199,11 +199,11 @@ def with_effect(instrument: Instrument, effect: Effect) -> Instrument:
 def turn_of(instrument: Instrument, effect: Effect) -> float:
     """Angle (rad) by which an effect turns the sky against the instrument, beyond ROTATOR."""
     changes = [
-        one for each in effect.first_order(dataclasses.replace(instrument, effects=())) for _, one in each
+        term for pair in effect.first_order(dataclasses.replace(instrument, effects=())) for _, term in pair
     ]
-    if changes and all(one.kind != "rotator" for one in changes):
+    if changes and all(term.kind != "rotator" for term in changes):
         return 0.0
-    zeros = (one.patched().rotator_zero for one in (with_effect(instrument, effect), instrument))
+    zeros = (model.patched().rotator_zero for model in (with_effect(instrument, effect), instrument))
     after, before = (0.0 if zero is None else float(zero) for zero in zeros)
     return float(np.deg2rad(after - before))
 
@@ -216,9 +216,9 @@ def change_by_effect(
     x: Vector,
     y: Vector,
 ) -> Float[np.ndarray, "p a 3"]:
-    """Instrument matrix with an effect that stands at its size, less the one without, in one setting."""
+    """Instrument matrix with an effect at its size, less the one without, in one setting."""
     after, before = (
-        planned_matrices(one, plan_for_settings(one, setting, filters), x, y)
-        for one in (with_effect(instrument, effect), instrument)
+        planned_matrices(m, plan_for_settings(m, setting, filters), x, y)
+        for m in (with_effect(instrument, effect), instrument)
     )
     return after - before

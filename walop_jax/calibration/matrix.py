@@ -121,12 +121,12 @@ class ResidualMap:
 
     def excess(self) -> dict[str, float]:
         """Rms over the field of every quantity beyond its standard errors; negative if below, as chance has it."""
-        found = {}
+        rms = {}
         for name, value, error in zip(self.names, self.values, self.errors, strict=True):
-            known = np.isfinite(value)
-            variance = float(np.mean(value[known] ** 2 - error[known] ** 2)) if known.any() else np.nan
-            found[name] = float(np.sign(variance) * np.sqrt(abs(variance)))
-        return found
+            finite = np.isfinite(value)
+            variance = float(np.mean(value[finite] ** 2 - error[finite] ** 2)) if finite.any() else np.nan
+            rms[name] = float(np.sign(variance) * np.sqrt(abs(variance)))
+        return rms
 
     def significance(self) -> float:
         """Excess scatter of all corrections over their errors, in standard deviations."""
@@ -161,14 +161,16 @@ def _slopes_at(
     """
 
     def one(x: Scalar, y: Scalar, *numbers: Scalar) -> tuple[Float[Array, "b k 3"], Float[Array, "d b k 3"]]:
-        here, to_instrument = with_numbers(plan, *numbers) if numbers else plan, with_values(instrument)
+        settings, to_instrument = with_numbers(plan, *numbers) if numbers else plan, with_values(instrument)
 
         def vectors(values: Float[Array, " n"], local: Float[Array, " k"]) -> Float[Array, "b k 3"]:
-            there, rows = to_instrument(values), optics.band_rows(values, instrument, here, x, y)
-            return (light.camera_vectors(there, rows, local, x, y) @ light.telescope(there, x, y))[..., :3]
+            changed, rows = to_instrument(values), optics.band_rows(values, instrument, settings, x, y)
+            return (light.camera_vectors(changed, rows, local, x, y) @ light.telescope(changed, x, y))[
+                ..., :3
+            ]
 
-        found = linearised(instrument, vectors, instrument.throughput.at(x, y))
-        return found.value, jnp.concatenate([found.plain, found.local])
+        derivatives = linearised(instrument, vectors, instrument.throughput.at(x, y))
+        return derivatives.value, jnp.concatenate([derivatives.plain, derivatives.local])
 
     return jax.vmap(one)(*columns)
 
@@ -213,14 +215,14 @@ def in_chunks(
         slices = [column[start : start + size] for column in columns]
         missing = size - len(slices[0])
         # Padding with the last row keeps the arithmetic as tame as that of the data.
-        result = function(*(array(np.pad(part, (0, missing), mode="edge")) for part in slices))
-        return [np.asarray(part)[: size - missing] for part in result]
+        result = function(*(array(np.pad(rows, (0, missing), mode="edge")) for rows in slices))
+        return [np.asarray(rows)[: size - missing] for rows in result]
 
     # The first slice compiles; a slice keeps one core busy.
-    parts = [solved(0)]
+    chunks = [solved(0)]
     with ThreadPoolExecutor(usual_threads()) as pool:
-        parts += pool.map(solved, range(size, count, size))
-    return tuple(np.concatenate(parts) for parts in zip(*parts, strict=True))
+        chunks += pool.map(solved, range(size, count, size))
+    return tuple(np.concatenate(pieces) for pieces in zip(*chunks, strict=True))
 
 
 # ----------------------------------------------------------------------------------------------------------- the matrix
@@ -243,7 +245,7 @@ def _matrix_and_slopes(
     size = values_of(instrument).size
 
     def at(*columns: Array) -> tuple[np.ndarray, np.ndarray]:
-        vectors, slopes = (np.asarray(part)[..., 0, :, :] for part in _slopes(instrument, plan, *columns))
+        vectors, slopes = (np.asarray(d)[..., 0, :, :] for d in _slopes(instrument, plan, *columns))
         a, b = (np.moveaxis(slopes[..., arms, :], 1, -1) for arms in (first, second))
         total = (vectors[:, first, :1] + vectors[:, second, :1])[..., None]
         m = light.instrument_matrix(vectors, instrument.cameras.pairs)
@@ -276,11 +278,11 @@ def matrices(
         plan = dataclasses.replace(plan_for_settings(instrument, layout, filters), work=len(x))
         exact = _matrix_and_slopes(instrument, plan)
 
-        def part(*columns: Array, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
-            found, slopes = (one.reshape(len(one), size, *one.shape[3:]) for one in exact(*columns))
-            return found, slopes @ covariance @ np.swapaxes(slopes, 1, 2)
+        def with_covariance(*columns: Array, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
+            elements, slopes = (a.reshape(len(a), size, *a.shape[3:]) for a in exact(*columns))
+            return elements, slopes @ covariance @ np.swapaxes(slopes, 1, 2)
 
-        values[rows], errors[rows] = in_chunks(part, x[rows], y[rows], *_numbers(settings[rows]))
+        values[rows], errors[rows] = in_chunks(with_covariance, x[rows], y[rows], *_numbers(settings[rows]))
     return values, errors
 
 
@@ -344,11 +346,11 @@ def slopes_over_field(
     def exact(x: Vector, y: Vector) -> tuple[np.ndarray, np.ndarray]:
         return matrix_slopes(instrument, setting, filters, x, y)
 
-    def error(found: tuple[np.ndarray, np.ndarray], truth: tuple[np.ndarray, np.ndarray]) -> float:
-        ours, theirs = (
-            np.sqrt(np.sum(slopes @ covariance * slopes, axis=-1)) for _, slopes in (found, truth)
+    def error(interpolated: tuple[np.ndarray, np.ndarray], truth: tuple[np.ndarray, np.ndarray]) -> float:
+        errors, true_errors = (
+            np.sqrt(np.sum(slopes @ covariance * slopes, axis=-1)) for _, slopes in (interpolated, truth)
         )
-        return float(np.max(np.abs(ours - theirs) / np.where(theirs > 0, theirs, 1.0)))
+        return float(np.max(np.abs(errors - true_errors) / np.where(true_errors > 0, true_errors, 1.0)))
 
     corners = Rectangle(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]))
     table = None

@@ -21,10 +21,10 @@ class MatrixTable(Table):
     meanings: Mapping[int, str] = {}
 
     def __str__(self) -> str:
-        whole = {"X", "Y"} <= set(self.colnames) and self._elements()
+        complete = {"X", "Y"} <= set(self.colnames) and self._elements()
         return (
             "\n".join(map(self._block, range(len(self))))
-            if whole and len(self) <= self.FEW
+            if complete and len(self) <= self.FEW
             else super().__str__()
         )
 
@@ -36,8 +36,8 @@ class MatrixTable(Table):
     def _block(self, row: int) -> str:
         def number(name: str) -> float:
             column: Any = self[name]
-            given = name in ("X", "Y") and column.unit is not None  # in a unit of the user's
-            return float((column.quantity.to_value("deg") if given else np.asarray(column))[row])
+            has_unit = name in ("X", "Y") and column.unit is not None  # in a unit of the user's
+            return float((column.quantity.to_value("deg") if has_unit else np.asarray(column))[row])
 
         x, y = (with_minus_sign(f"{number(name):+.3f}°") for name in ("X", "Y"))
         cells = [
@@ -52,7 +52,7 @@ class MatrixTable(Table):
             "  " + "".join(f"{cell:<{width}}" for cell in cells[k : k + 3]) for k in range(0, len(cells), 3)
         ]
         if "P_ERR" in self.colnames:
-            known, flag = f"{two_digits(100 * number('P_ERR'))} %", int(number("FLAG"))
-            lines.append(f"  error of p of a star with p ≤ 5 %, calibration alone: {known}; FLAG {flag}")
+            error_of_p, flag = f"{two_digits(100 * number('P_ERR'))} %", int(number("FLAG"))
+            lines.append(f"  error of p of a star with p ≤ 5 %, calibration alone: {error_of_p}; FLAG {flag}")
             lines += [f"  FLAG {bit}: {meaning}" for bit, meaning in self.meanings.items() if flag & bit]
         return "\n".join(line.rstrip() for line in lines)

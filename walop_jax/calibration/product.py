@@ -1,4 +1,4 @@
-"""The file of a calibration, `calibration.fits`: what a fit has learnt, complete in one file (docs: files).
+"""The file of a calibration, `calibration.fits`: the result of a fit, complete in one file (docs: files).
 
 Of an instrument with A arms RESIDUAL has 4 A − 1 planes. Moving elements ELEM1, … of a map stand at ANGLE1, … PRODVERS
 is 2 for an instrument that is none of the first three or has not two arms, for further moving elements and for lamps,
@@ -98,7 +98,7 @@ Cards = dict[str, tuple[Any, str]]
 def write_calibration(
     path: str | os.PathLike[str], calibration: Calibration | Product, *, overwrite: bool = False
 ) -> None:
-    """Write a calibration, or what was read of one, with checksums; the file appears whole or not at all.
+    """Write a calibration, or the content of a file of one, with checksums; the file appears whole or not at all.
 
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only, and for a
     parameter whose name could not be read again.
@@ -114,7 +114,7 @@ def write_calibration(
 
 
 def content_of(hdus: Iterable[Any]) -> str:
-    """SHA-256 of words, columns and images, as they stand in a file; the order of extensions does not matter.
+    """SHA-256 of words, columns and images, as in a file; the order of extensions does not matter.
 
     Not of dates, software, paths, and of what others have added.
     """
@@ -155,7 +155,7 @@ def hdus_of(c: Product, path: object) -> list[Any]:
         },
         "WARNINGS": {"TEXT": _strings(in_ascii(text) for text in c.verdict.warnings)},
     }
-    made = {
+    hdus = {
         name: table_hdu(name, columns, path, TABLES[name])
         for name, columns in tables.items()
         if len(next(iter(columns.values())))
@@ -170,9 +170,9 @@ def hdus_of(c: Product, path: object) -> list[Any]:
         images += _residual_hdus(c.residuals)
     if c.hidden is not None:
         images.append(_hidden_hdu(c.hidden))
-    parameters, filters = made.pop("PARAMETERS"), made.pop("FILTERS")
+    parameters, filters = hdus.pop("PARAMETERS"), hdus.pop("FILTERS")
     exposures = set_table_hdu("EXPOSURES", c.exposures.columns(), path)
-    return [_primary(c, version), parameters, *images, filters, exposures, *made.values()]
+    return [_primary(c, version), parameters, *images, filters, exposures, *hdus.values()]
 
 
 def _parameter_columns(c: Product) -> dict[str, np.ndarray]:
@@ -241,7 +241,7 @@ def _primary(c: Product, version: int) -> fits.PrimaryHDU:
     primary = fits.PrimaryHDU()
     for name, (value, comment) in cards.items():
         if isinstance(value, float) and not np.isfinite(value):
-            continue  # FITS headers know no NaN; a missing card is read as one
+            continue  # FITS headers have no NaN; a missing card is read as one
         primary.header[name] = (in_ascii(value) if isinstance(value, str) else value, comment)
     primary.header["INSTRUME"] = c.instrument  # blanks inside a name count
     for number, (name, release) in enumerate(c.versions.items(), start=1):
@@ -250,15 +250,15 @@ def _primary(c: Product, version: int) -> fits.PrimaryHDU:
 
 
 def _validity_cards(c: Product) -> Cards:
-    """Dates, temperatures and filters that the product may be applied to, for a look: EXPOSURES says the same."""
+    """Dates, temperatures and filters that the product may be applied to, for a look: EXPOSURES has the same."""
     cards: Cards = {}
     for values, names, comment in (
         (c.exposures.mjd, ("MJD-BEG", "MJD-END"), "[d] UTC of the exposures"),
         (c.exposures.temp, ("TEMPMIN", "TEMPMAX"), "[Celsius] of the exposures"),
     ):
-        known = values[np.isfinite(values)]
-        if known.size:
-            cards |= {names[0]: (float(known.min()), comment), names[1]: (float(known.max()), comment)}
+        finite = values[np.isfinite(values)]
+        if finite.size:
+            cards |= {names[0]: (float(finite.min()), comment), names[1]: (float(finite.max()), comment)}
     for number, name in enumerate(np.unique(c.exposures.filter).tolist(), start=1):
         cards[f"FILTER{number}"] = (name, "")
     return cards
@@ -289,7 +289,7 @@ def _residual_hdus(residuals: ResidualMap) -> list[fits.ImageHDU]:
 
 
 def _hidden_hdu(hidden: Hidden) -> fits.ImageHDU:
-    """An image (mistake, parameter) of what each mistake does to the parameters; no data where there is none."""
+    """An image (mistake, parameter) of the shifts of the parameters by each mistake; no data where there is none."""
     hdu = fits.ImageHDU(hidden.changes if len(hidden) else None, name="HIDDEN")
     for number in range(len(hidden)):
         for word, (attribute, usual) in _MISTAKE.items():
@@ -330,7 +330,7 @@ def product_path(run: str | os.PathLike[str]) -> Path:
 
 
 class _Reader:
-    """The parts of an open file by name; every method raises `DataError` for what is amiss."""
+    """The parts of an open file by name; every method raises `DataError` for an invalid entry."""
 
     def __init__(self, opened: OpenFile) -> None:
         self.path, self.header, self.opened = opened.path, opened.hdus[0].header, opened.hdus
@@ -442,12 +442,12 @@ class _Reader:
 
     def versions(self) -> dict[str, str]:
         """Versions of the software by name."""
-        found: dict[str, str] = {}
+        versions: dict[str, str] = {}
         for number in range(1, _LONGEST_SOFTWARE_LIST):
             name, _, version = self.text(f"SOFT{number}").partition(" ")
             if name:
-                found[name] = version
-        return found
+                versions[name] = version
+        return versions
 
     # ---------------------------------------------------------------------------- tables and images
 
@@ -485,14 +485,14 @@ class _Reader:
 
     def positions(self, name: str) -> dict[str, float]:
         """Angles (deg) of the moving elements that were in the beam for an image, by column prefix."""
-        header, found = self.hdus[name].header, dict[str, float]()
-        while (card := f"ELEM{len(found) + 1}") in header:
-            prefix, angle = header[card], header.get(f"ANGLE{len(found) + 1}")
-            known = isinstance(prefix, str) and PREFIX.fullmatch(prefix) and prefix not in found
-            if not known or isinstance(angle, bool) or not isinstance(angle, int | float):
+        header, angles = self.hdus[name].header, dict[str, float]()
+        while (card := f"ELEM{len(angles) + 1}") in header:
+            prefix, angle = header[card], header.get(f"ANGLE{len(angles) + 1}")
+            valid = isinstance(prefix, str) and PREFIX.fullmatch(prefix) and prefix not in angles
+            if not valid or isinstance(angle, bool) or not isinstance(angle, int | float):
                 raise Place(self.path, name).fail(f"is {prefix!r} at {angle!r}", card, _AGAIN)
-            found[prefix] = float(angle)
-        return found
+            angles[prefix] = float(angle)
+        return angles
 
     def maps(self) -> MatrixMaps:
         """The maps of the matrix, of as many arms as there are images."""
@@ -535,7 +535,7 @@ class _Reader:
         )
 
     def hidden(self, parameters: int) -> Hidden | None:
-        """The mistakes of the extension HIDDEN; None in products that nobody asked for them."""
+        """The mistakes of the extension HIDDEN; None in products without them."""
         if "HIDDEN" not in self.hdus:
             return None
         header, place = self.hdus["HIDDEN"].header, Place(self.path, "HIDDEN")
@@ -582,18 +582,18 @@ def _number(header: fits.Header, name: str, place: Place, missing: float | None 
 
 
 def _listed(table: Mapping[str, Any], model_lines: Sequence[str]) -> tuple[Parameter, ...]:
-    """The parameters of a file, with starts (NaN: unknown) and ties as far as the lines of its model say them."""
+    """The parameters of a file, with starts (NaN: unknown) and ties as far as the lines of its model contain them."""
     try:
         written = tomllib.loads("\n".join(model_lines)).get("parameters", {})
     except tomllib.TOMLDecodeError:
         written = {}
-    found = []
+    parameters = []
     for name, _, _, unit, mean, width, free in zip(*(table[n] for n in TABLES["PARAMETERS"]), strict=True):
         entry, prior = written.get(name, {}), (float(mean), float(width)) if np.isfinite(width) else None
         start = float(entry.get("start", np.nan if prior is None else mean))
         tie = entry.get("tie")
         part = str(name).partition(".")[0]  # names are all that a file has
-        found.append(
+        parameters.append(
             Parameter(str(name), str(unit), "", "", start, prior, bool(free), 1.0, tie=tie, part=part)
         )
-    return tuple(found)
+    return tuple(parameters)

@@ -68,15 +68,17 @@ def _point_sums(
     stokes = light.stokes(instrument, point.sight(plan))
     weight = point.weight * chosen[:, None]
     change = _changes(vectors, stokes, unit, instrument.cameras.pairs) * (flux * weight)[:, None]
-    known, shared = plan.exposures.flux_known, engine.sharing(instrument, plan, point)
+    fixed, shared = plan.exposures.flux_known, engine.sharing(instrument, plan, point)
     change = jnp.moveaxis(change, 1, 0)  # exposures next to cameras
-    change = jnp.moveaxis(project_flux(change, unit * weight, known, shared), 0, 1)
-    seen = (point.weight[:, 0] > 0) & chosen
-    freedom = jnp.sum(jnp.where(seen, unit.shape[-1] - jnp.where(known, 0.0, instrument.cameras.fluxes), 0.0))
+    change = jnp.moveaxis(project_flux(change, unit * weight, fixed, shared), 0, 1)
+    measured = (point.weight[:, 0] > 0) & chosen
+    freedom = jnp.sum(
+        jnp.where(measured, unit.shape[-1] - jnp.where(fixed, 0.0, instrument.cameras.fluxes), 0.0)
+    )
     chi2 = jnp.sum(jnp.where(chosen[:, None], residual, 0.0) ** 2)
     right = jnp.einsum("edk,ek->d", change, residual)
-    left = jnp.einsum("edk,efk->df", change, change)[np.triu_indices(len(right))]
-    return jnp.concatenate([jnp.stack([chi2, freedom]), right, left])
+    matrix = jnp.einsum("edk,efk->df", change, change)[np.triu_indices(len(right))]
+    return jnp.concatenate([jnp.stack([chi2, freedom]), right, matrix])
 
 
 def _batch_sums(
@@ -129,7 +131,7 @@ def _main_setting(
 
 
 def residual_map(result: FitResult) -> ResidualMap:
-    """The map of what a fit leaves: from the sums of its last pass, or by one more pass over the points.
+    """The map of the residuals of a fit: from the sums of its last pass, or by one more pass over the points.
 
     >>> walop.residual_map(result).excess()["m21"]  # doctest: +SKIP
     """
@@ -161,46 +163,48 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | No
     slabs = likelihood.runner.each("residual map", work, layout.points, layout.slab)
     total = functools.reduce(np.add, slabs).reshape(-1, count)
     n = len(residual_names(len(instrument.cameras.pairs)))
-    left = np.zeros((count, n, n))
+    matrices = np.zeros((count, n, n))
     i, j = np.triu_indices(n)
-    left[:, i, j] = left[:, j, i] = total[2 + n :].T
-    sums = _MapSums(chi2=total[0], freedom=total[1], right=total[2 : 2 + n], left=left)
+    matrices[:, i, j] = matrices[:, j, i] = total[2 + n :].T
+    sums = _MapSums(chi2=total[0], freedom=total[1], right=total[2 : 2 + n], left=matrices)
     return _solved_map(grid, setting, sums)
 
 
-def residual_map_of_pixels(found: FrameSums) -> ResidualMap:
-    """The map of what the values leave of whole frames: from the sums of cells, with what is smooth in their middle."""
-    likelihood, cells = found.likelihood, found.cells
+def residual_map_of_pixels(frame: FrameSums) -> ResidualMap:
+    """The residual map of whole frames: from the sums of cells, with smooth quantities in their middle."""
+    likelihood, cells = frame.likelihood, frame.cells
     exposures = likelihood.calset.exposures
-    seen = found.sums.used.any(axis=(1, 2))  # not those of a table beside the frames
-    setting, chosen = _main_setting(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in & seen)
+    measured = frame.sums.used.any(axis=(1, 2))  # not those of a table beside the frames
+    setting, chosen = _main_setting(
+        Settings.of(exposures, likelihood.plan.moving), exposures.clp_in & measured
+    )
     blocks = (POINTS_PER_CELL**0.5 / cells.side, max(cells.shape) / limits.CELLS)
     together = int(np.ceil(max(1.0, *blocks)))
     s, t = np.meshgrid(*cells.middles())
-    smooth = found.smooth(s.ravel(), t.ravel())
-    pairs = found.instrument.cameras.pairs
+    smooth = frame.smooth(s.ravel(), t.ravel())
+    pairs = frame.instrument.cameras.pairs
     n = len(residual_names(len(pairs)))
-    right, left = np.zeros((n, s.size)), np.zeros((n, n, s.size))
-    matrices = information(found).reshape(likelihood.cameras, likelihood.cameras, len(chosen), -1)
-    pull = found.sums.pull.reshape(likelihood.cameras, len(chosen), -1)
+    right, matrix = np.zeros((n, s.size)), np.zeros((n, n, s.size))
+    matrices = information(frame).reshape(likelihood.cameras, likelihood.cameras, len(chosen), -1)
+    pull = frame.sums.pull.reshape(likelihood.cameras, len(chosen), -1)
     for exposure in np.flatnonzero(chosen):
         band = likelihood.plan.band_of[exposure, 0]
         vectors, stokes = np.asarray(smooth.vectors)[:, band], np.asarray(smooth.stokes)[:, exposure]
         change = _changes(vectors, stokes, np.asarray(smooth.unit)[..., exposure], pairs)
         right += np.einsum("cdk,kc->dc", change, pull[:, exposure])
-        left += np.einsum("cdk,klc,cfl->dfc", change, matrices[:, :, exposure], change, optimize=True)
-    each = likelihood.cameras - np.where(likelihood.flux_known, 0.0, found.instrument.cameras.fluxes)
-    freedom = np.einsum("e,erc->rc", each[chosen], found.sums.used[chosen])
+        matrix += np.einsum("cdk,klc,cfl->dfc", change, matrices[:, :, exposure], change, optimize=True)
+    degrees = likelihood.cameras - np.where(likelihood.flux_known, 0.0, frame.instrument.cameras.fluxes)
+    freedom = np.einsum("e,erc->rc", degrees[chosen], frame.sums.used[chosen])
     shaped = (
-        found.sums.chi2[chosen].sum(axis=0),
+        frame.sums.chi2[chosen].sum(axis=0),
         freedom,
         right.reshape(n, *s.shape),
-        left.reshape(n, n, *s.shape),
+        matrix.reshape(n, n, *s.shape),
     )
     sums = [in_blocks(values, together) for values in shaped]
     grid = cells.blocks(together, sums[0].shape)
-    chi2, freedom, right, left = (values.reshape(*values.shape[:-2], -1) for values in sums)
-    return _solved_map(grid, setting, _MapSums(chi2, freedom, right, np.moveaxis(left, 2, 0)))
+    chi2, freedom, right, matrix = (values.reshape(*values.shape[:-2], -1) for values in sums)
+    return _solved_map(grid, setting, _MapSums(chi2, freedom, right, np.moveaxis(matrix, 2, 0)))
 
 
 class _MapSums(NamedTuple):
@@ -217,16 +221,16 @@ def _solved_map(grid: Grid, setting: Settings, sums: _MapSums) -> ResidualMap:
     matrix, n = sums.left, len(sums.right)
     size = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))
     scaled = matrix / np.where(size > 0, size, 1.0)[:, :, None] / np.where(size > 0, size, 1.0)[:, None]
-    known = np.linalg.eigvalsh(scaled)[:, 0] > 1e-9
+    regular = np.linalg.eigvalsh(scaled)[:, 0] > 1e-9
     inverse = np.full(matrix.shape, np.nan)
-    inverse[known] = np.linalg.inv(matrix[known])
-    found = np.einsum("cij,jc->ic", inverse, sums.right)
+    inverse[regular] = np.linalg.inv(matrix[regular])
+    solution = np.einsum("cij,jc->ic", inverse, sums.right)
     errors = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2)).T
     shape = (grid.height, grid.width)
     return ResidualMap(
         grid=grid,
         filter=str(setting.filter[0]),
-        values=found.reshape(n, *shape),
+        values=solution.reshape(n, *shape),
         errors=errors.reshape(n, *shape),
         chi2=(sums.chi2 / np.where(sums.freedom > 0, sums.freedom, np.nan)).reshape(shape),
         positions=setting.inside(),

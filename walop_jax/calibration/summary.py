@@ -22,14 +22,14 @@ def summary(
 ) -> dict[str, Any]:
     """The content of `summary.json`, key by key as in docs: files. Frozen parameters have sigma 0.
 
-    Raises RuntimeError for a fit that nobody has examined.
+    Raises RuntimeError for a fit without a verdict.
     """
     verdict = result.checked_verdict()
     parameters = {
         p.name: {"value": float(value), "sigma": float(sigma), "unit": p.unit}
         for p, value, sigma in zip(result.model.parameters, result.values, result.sigma, strict=True)
     }
-    known = result.answer() if result.answer is not None and result.converged else None
+    accuracy = result.answer() if result.answer is not None and result.converged else None
     return {
         "chi2": result.chi2,
         "dof": result.dof,
@@ -39,7 +39,7 @@ def summary(
         "message": result.minimum.message,
         "seconds": seconds,
         "versions": software_versions(),
-        "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in result.calset.inputs],
+        "inputs": [{"path": str(e.path), "sha256": e.sha256} for e in result.calset.inputs],
         "trusted": verdict.trusted,
         "quality": int(verdict.quality),
         "doubts": list(verdict.doubts),
@@ -48,12 +48,12 @@ def summary(
         "hidden": None
         if result.hidden is None
         else [
-            dict(zip(("name", "size", "unit", "kind", "measured"), (*one, kind, measured), strict=True))
-            for one, kind, measured in zip(
+            dict(zip(("name", "size", "unit", "kind", "measured"), (*e, kind, measured), strict=True))
+            for e, kind, measured in zip(
                 result.hidden.each(), result.hidden.kinds, result.hidden.measured, strict=True
             )
         ],
-        "accuracy_of_p": None if known is None else known.document(),
+        "accuracy_of_p": None if accuracy is None else accuracy.document(),
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),
         "free_parameters": len(result.model.free),

@@ -54,7 +54,7 @@ def affected(
     nights, warnings, replaced, replacing = [], [], list[str](), list[str]()
     job.begin("reading")
     for name, table in named_tables(catalogues):
-        before, after = (calibration_for(one, table, effects, force=True) for one in (old, new))
+        before, after = (calibration_for(product, table, effects, force=True) for product in (old, new))
         replaced.append(before.content_hash())
         replacing.append(after.content_hash())
         rows = read_catalogue(
@@ -67,12 +67,12 @@ def affected(
             warnings.append(f"{name}: was made with a calibration that is neither the old nor the new one")
         job.tell(f"{len(rows)} rows of {name}", "tabulating")
         with errors_naming(table.path):
-            shifts_here = list(nights_of(before, after, rows, name, limit))
-        nights += shifts_here
-        if beyond := sum(night.beyond for night in shifts_here):
+            shifts_of_catalogue = list(nights_of(before, after, rows, name, limit))
+        nights += shifts_of_catalogue
+        if beyond := sum(night.beyond for night in shifts_of_catalogue):
             warnings.append(
                 f"{name}: {beyond} stars have a filter or temperature that the new one does not cover"
             )
-    first, second = (", ".join(dict.fromkeys(one)) for one in (replaced, replacing))
+    first, second = (", ".join(dict.fromkeys(hashes)) for hashes in (replaced, replacing))
     shifts = Affected(first, second, limit, tuple(nights), tuple(warnings))
     return Outcome(shifts, saved_as=AFFECTED, warnings=shifts.warnings, trusted=not shifts.again)

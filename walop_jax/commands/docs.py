@@ -77,5 +77,5 @@ def pages() -> dict[str, str]:
 
 
 def about(text: str) -> str:
-    """The first sentence of a page, which stands below its title."""
+    """The first sentence of a page, below its title."""
     return text.splitlines()[2]

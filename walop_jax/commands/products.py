@@ -1,4 +1,4 @@
-"""Calibrations and tables as arguments of commands, and tables with what a calibration adds to them.
+"""Calibrations and tables as arguments of commands, and tables with the columns that a calibration adds.
 
 A calibration may be given in memory, by its file or by the folder of a run. What is given in place of one of them is a
 TypeError: what it is, and what to give.
@@ -79,7 +79,7 @@ def catalogue_of(effects: Effects) -> tuple[EffectKind, ...]:
 
 
 def path_of(given: Any, what: str, advice: str) -> Path:
-    """A path. Raises TypeError for what is none and stands for `what`; `advice` says what to give."""
+    """A path. Raises TypeError for anything else, naming the argument `what`, with `advice`."""
     if not isinstance(given, str | os.PathLike):
         raise TypeError(f"{reprlib.repr(given)} is not {what}; give {advice}")
     return Path(given)
@@ -92,18 +92,30 @@ def fit_of(given: Any) -> Any:
 
 
 def calibration_of(given: Product, effects: Effects = None) -> Calibration:
-    """A calibration: as given, that of a fit or a diagnosis, or that of a product or run, with what its file says.
+    """A calibration: as given, that of a fit or a diagnosis, or that of a product or run, read from its file.
 
     Raises `DataError` for a file that cannot be read.
     """
     from walop_jax.calibration.calibration import Calibration
     from walop_jax.calibration.product import read_calibration
 
+<<<<<<< HEAD
     held: Any = fit_of(given)
     if isinstance(held, Fitted) and not hasattr(held, "folder"):  # a `Run` is read again
         there = held if isinstance(held, Calibration) else Calibration.from_fit(held)  # pyright: ignore[reportArgumentType]
         return there if there.path is not None else dataclasses.replace(there, path=Path(IN_MEMORY))
     return read_calibration(folder_of(held), catalogue_of(effects))
+=======
+    source: Any = fit_of(given)
+    if isinstance(source, Fitted):
+        calibration = source if isinstance(source, Calibration) else Calibration.from_fit(source)  # pyright: ignore[reportArgumentType]
+        return (
+            calibration
+            if calibration.path is not None
+            else dataclasses.replace(calibration, path=Path(IN_MEMORY))
+        )
+    return read_calibration(folder_of(source), catalogue_of(effects))
+>>>>>>> h-w3
 
 
 def folder_of(run: Run | PathLike) -> Path:
@@ -119,14 +131,14 @@ def angles_of(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float
     """Angles (deg) by column prefix, also of texts such as CHWP=45."""
     if isinstance(at, Mapping):
         return {name.upper(): value for name, value in at.items()}
-    found = {}
+    angles = {}
     for text in at or ():
         prefix, _, angle = text.partition("=")
         try:
-            found[prefix.strip().upper()] = float(angle)
+            angles[prefix.strip().upper()] = float(angle)
         except ValueError:
             raise UsageError(f"{text!r} is no P=ANGLE, such as CHWP=45", "at") from None
-    return found
+    return angles
 
 
 def table_of(given: Any, columns: Mapping[str, Any]) -> InputTable:
@@ -139,11 +151,11 @@ def table_of(given: Any, columns: Mapping[str, Any]) -> InputTable:
     read = read_input_table(given) if isinstance(given, str | os.PathLike) else in_memory(given)
     if not named:
         return read
-    kept = {key: read.table[key] for key in read.table.colnames if str(key).upper() not in named}
-    made = in_memory(kept | named, str(read.path))
-    made.table.meta.update(read.table.meta)
-    made.remarks.extend(read.remarks)
-    return made
+    unchanged = {key: read.table[key] for key in read.table.colnames if str(key).upper() not in named}
+    combined = in_memory(unchanged | named, str(read.path))
+    combined.table.meta.update(read.table.meta)
+    combined.remarks.extend(read.remarks)
+    return combined
 
 
 def named_tables(given: Any) -> list[tuple[str, InputTable]]:
@@ -183,7 +195,7 @@ def table_outcome(
     extra: Mapping[str, Any] | None = None,
     remade: Callable[[Any], tuple[Any, Sequence[str]]] | None = None,
 ) -> Outcome[Any]:
-    """A table with what a calibration adds to it, written if it has an output.
+    """A table with the columns added by a calibration, written if it has an output.
 
     The bits of FLAG that are `counted` have a warning each, unless it is empty; `extra` goes into the document. Columns
     of the table that are not used or are replaced are named. `remade` makes another table of that, with remarks.
@@ -192,10 +204,10 @@ def table_outcome(
     from walop_jax.io.plain_tables import write_table
 
     lost = held.left_behind
-    made = extended(table, columns, {**cards, **left_out_cards(lost)})
-    made, others = (made, ()) if remade is None else remade(made)
+    extended_table = extended(table, columns, {**cards, **left_out_cards(lost)})
+    extended_table, other_remarks = (extended_table, ()) if remade is None else remade(extended_table)
     if output is not None:
-        write_table(output, made, overwrite=job.overwrite)
+        write_table(output, extended_table, overwrite=job.overwrite)
     counts = {bit: int((columns["FLAG"][0] & bit > 0).sum()) for bit in sorted(counted)}
     remarks = table.about(columns)
     document = {
@@ -210,11 +222,11 @@ def table_outcome(
     }
     about = (f"{counts[bit]} {sentence}" for bit, sentence in counted.items() if sentence and counts[bit])
     return Outcome(
-        made,
+        extended_table,
         document,
         warnings=(
             *held.warnings,
             *left_out_sentences(lost, held.path),
-            *(f"{table.path}: {sentence}" for sentence in (*remarks, *others, *warnings, *about)),
+            *(f"{table.path}: {sentence}" for sentence in (*remarks, *other_remarks, *warnings, *about)),
         ),
     )

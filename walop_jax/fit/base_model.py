@@ -99,7 +99,7 @@ def _level(calset: CalibrationSet) -> float:
 
 
 def gauges(model: Model, flux_known: bool) -> list[str]:
-    """Parameters that fluxes take up: the scale of the throughput, or all that the cameras of an arm have in common."""
+    """Parameters degenerate with fluxes: the scale of the throughput, or all terms common to the cameras of an arm."""
     cameras = model.template.cameras
     if flux_known and not cameras.split:
         return []
@@ -128,7 +128,7 @@ def model_for(
     instrument: Instrument | None = None,
     catalogue: Catalogue = EFFECTS,
 ) -> Model:
-    """The base model of a calibration set, changed as a model file (TOML text) says; `instrument` as for `base_model`.
+    """The base model of a calibration set, changed by a model file (TOML text); `instrument` as for `base_model`.
 
     `catalogue` are the effects that the file may name.
     Raises ValueError for anything in the text that does not exist or does not fit the data.
@@ -146,7 +146,7 @@ def model_for(
 
 
 def model_like(calset: CalibrationSet, old: Model) -> Model:
-    """The model `old` for another calibration set: its plates, effects, priors, ties and what it holds.
+    """The model `old` for another calibration set: its plates, effects, priors, ties and fixed parameters.
 
     Sky and standards are those of the new set. Raises ValueError for a set of another instrument.
     """

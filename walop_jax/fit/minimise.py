@@ -52,7 +52,7 @@ BADLY_PREDICTED, WELL_PREDICTED = 0.25, 0.75
 
 @runtime_checkable
 class Expansion(Protocol):
-    """Value, and half the gradient and Hessian, of what is minimised, at one place."""
+    """Value, and half the gradient and Hessian, of the objective, at one place."""
 
     @property
     def objective(self) -> float:
@@ -178,7 +178,7 @@ def distance_to_minimum(expansion: Expansion) -> tuple[float, float]:
     matrix, gradient = expansion.matrix, expansion.gradient
     if not (np.isfinite(matrix).all() and np.isfinite(gradient).all()):
         return np.inf, np.inf
-    # In units of what each is known to: in others a parameter that the data hardly see would fall below the rounding.
+    # In units of the error of each: in others a parameter that the data hardly see would fall below the rounding.
     size = np.sqrt(np.clip(np.diag(matrix), 0.0, None))
     informed = size > 0
     if not informed.any():

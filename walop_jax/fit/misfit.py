@@ -1,5 +1,5 @@
-"""Disagreement of model and data: χ² per intensity by camera, exposure kind, filter and wavelength, and what it
-would be in the elements of the instrument matrix.
+"""Disagreement of model and data: χ² per intensity by camera, exposure kind, filter and wavelength, and its
+equivalent in the elements of the instrument matrix.
 
 A residual of the light through the polariser is, at each field point and setting, expanded as
 Δq_m = Δm21 + Δm22 q + Δm23 u (and Δu_m likewise) by least squares over the polariser angles; the rms over the
@@ -64,10 +64,10 @@ class Misfit:
     def reasons(self, warnings: Sequence[str], folder: str | PathLike[str] | None) -> tuple[str, ...]:
         """The first reasons against a fit, its `warnings` among them, and the command that shows all of them."""
         reasons = tuple(dict.fromkeys((*self.advice(), *warnings, *self.sentences())))
-        more = len(reasons) - MOST_REASONS
+        omitted = len(reasons) - MOST_REASONS
         return (
             *reasons[:MOST_REASONS],
-            f"{more} more, with the misfit by camera and exposure: walop-jax report {folder}",
+            f"{omitted} more, with the misfit by camera and exposure: walop-jax report {folder}",
         )
 
     def sentences(self) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ _GAUSSIAN = 1.4826  # standard deviation over median absolute deviation
 
 @dataclasses.dataclass(frozen=True)
 class Clipped:
-    """A calibration set whose outlying rows are flagged, and the fit of what is left.
+    """A calibration set whose outlying rows are flagged, and the fit of the remaining rows.
 
     `rows` is how many (exposure, point) pairs were flagged, of `used` that took part before.
     """
@@ -44,7 +44,7 @@ class Clipped:
 
     @property
     def share(self) -> float:
-        """Flagged rows of all that took part."""
+        """Flagged fraction of the used rows."""
         return self.rows / max(self.used, 1)
 
     @property
@@ -59,9 +59,9 @@ def outlying(likelihood: Likelihood, residual: Float[np.ndarray, "p e k"]) -> Bo
 
 
 def clipped(calset: CalibrationSet, model: Model | None = None, beyond: float = BEYOND) -> Clipped:
-    """Flag (BAD_PIXEL) what lies `beyond` standard errors off, fit what is left, and again until nothing does.
+    """Flag (BAD_PIXEL) rows more than `beyond` standard errors off, fit the others, and repeat until none is.
 
-    The farthest go first, down to half of their distance: what is large enough bends a fit, and good rows then lie off
+    The farthest go first, down to half of their distance: large outliers bend a fit, and good rows then lie off
     as well. As long as it does, errors are taken as large as what is left. Stops where more than `MOST` of the rows
     are flagged, and where all of them lie off alike: that is for `FitResult.warnings` to say. Raises ValueError for
     `beyond` below `LEAST`, and what `fit` raises.

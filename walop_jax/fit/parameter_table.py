@@ -1,4 +1,4 @@
-"""The parameters of a fit as a table and as something to look at: values, priors, and what the data say of each."""
+"""The parameters of a fit as a table and in print: values, priors, and constraints by the data."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class ParameterValue(NamedTuple):
 
 
 class Fitted(Result):
-    """A model with values and a covariance of all its parameters, and what these say by name and as a table."""
+    """A model with values and a covariance of all its parameters, by name and as a table."""
 
     model: Model
     values: Vector
@@ -62,7 +62,7 @@ class Fitted(Result):
 
 
 def unconstrained(model: Model, sigma: Vector) -> tuple[str, ...]:
-    """Names of the free parameters of which the data say nothing: their error is the width of their prior."""
+    """Names of the free parameters without information in the data: their error is the width of their prior."""
     return tuple(
         p.name
         for p, s in zip(model.parameters, sigma, strict=True)
@@ -101,12 +101,12 @@ def parameter_rows(model: Model, values: Vector, sigma: Vector) -> tuple[tuple[s
         start = "" if same else with_minus_sign(f"{p.start + 0.0:.6g}")
         texts = value_and_error(float(value), float(s))
         rows.append((p.name, *texts, p.unit, start, prior, _state(p, idle)))
-    # First what was measured. Standards last: they are no part of the instrument.
+    # Measured parameters first. Standards last: they are no part of the instrument.
     return tuple(sorted(rows, key=lambda row: (row[0].startswith("standard."), row[-1] == PRIOR_WORDS)))
 
 
 def parameter_notes(model: Model, sigma: Vector) -> tuple[str, ...]:
-    """Notes on what a table of `parameter_rows` leaves out, and on parameters that the data do not constrain."""
+    """Notes on parameters missing in a table of `parameter_rows`, and on parameters that the data do not constrain."""
     hidden = len(model.positions(THROUGHPUT))
     idle = unconstrained(model, sigma)
     notes = [f"{hidden} throughput terms not shown; to_table() has them"] if hidden else []

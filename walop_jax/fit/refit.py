@@ -103,7 +103,7 @@ class FitResult(Fitted):
 
     @property
     def dof(self) -> int:
-        """Degrees of freedom: what the data and priors hold beyond fluxes and free parameters."""
+        """Degrees of freedom: data and priors less fluxes and free parameters."""
         return self.posterior.dof
 
     @property
@@ -133,7 +133,7 @@ class FitResult(Fitted):
 
     @property
     def nearly_explains_data(self) -> bool:
-        """True if χ² is so little too large that the stated errors may be all that is wrong."""
+        """True if the excess of χ² is small enough for the stated errors alone to explain."""
         return self.dof > 0 and not self.explains_data and bool(self.chi2 < NEARLY * self.dof)
 
     @property
@@ -181,7 +181,7 @@ class FitResult(Fitted):
         return dataclasses.replace(self, verdict=dataclasses.replace(verdict, against=against))
 
     def checked_verdict(self) -> Verdict:
-        """The verdict; raises RuntimeError for a fit that nobody has examined."""
+        """The verdict; raises RuntimeError for a fit without one."""
         if self.verdict is None:
             raise RuntimeError(
                 "nobody has examined the residuals of this fit: call walop_jax.diagnosis.trust.examined(fit), as "
@@ -191,9 +191,9 @@ class FitResult(Fitted):
 
     @property
     def trusted(self) -> bool:
-        """True if nothing that speaks against the fit forbids its use (`Verdict.trusted`).
+        """True if no doubt about the fit forbids its use (`Verdict.trusted`).
 
-        Raises RuntimeError for a fit that nobody has examined.
+        Raises RuntimeError for a fit without a verdict.
         """
         return self.checked_verdict().trusted
 
@@ -219,7 +219,7 @@ class FitResult(Fitted):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on what its table leaves out, what the data do not constrain, and mistakes they would not show."""
+        """Notes on parameters missing in its table, on unconstrained ones, and on undetectable mistakes."""
         notes = parameter_notes(self.model, self.sigma)
         if self.answer is not None or self.hidden is None or not len(self.hidden):
             return notes
@@ -245,7 +245,7 @@ class FitResult(Fitted):
 
 
 def check_constrained(model: Model, posterior: Posterior) -> None:
-    """Raise ValueError for a free parameter that neither data nor a prior know anything of."""
+    """Raise ValueError for a free parameter without data and without a prior."""
     idle = [model.parameters[i].name for i in model.free[np.diag(posterior.matrix) == 0.0]]
     if idle:
         raise ValueError(
@@ -326,7 +326,7 @@ def with_honest_errors(result: FitResult) -> FitResult:
 
 
 def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noiseless: bool) -> Iterator[Doubt]:
-    """Everything that speaks against a fit, with remarks. The only place where bits and trust are decided.
+    """All doubts about a fit, with remarks. The only place where bits and trust are decided.
 
     A χ² that is a few per cent too large while the residuals, once examined, show nothing but noise is put down to the
     stated errors.

@@ -1,4 +1,4 @@
-"""Errors from what a fit leaves: of data that scatter about the model by more than the errors that they state.
+"""Errors from the residuals of a fit: of data that scatter about the model by more than the errors that they state.
 
 Equation    C = H⁻¹ M H⁻¹ with H the Gauss–Newton matrix of data and priors, and M the covariance of its gradient:
                 scaled      M₀ = s² JᵀJ + P,  s² = χ²/dof
@@ -37,7 +37,7 @@ CELLS = 6  # of the field along a side
 
 
 class RobustErrors(NamedTuple):
-    """Covariance of the free parameters, and in words what it was made from."""
+    """Covariance of the free parameters, and its origin in words."""
 
     covariance: Matrix
     made_from: str

@@ -23,7 +23,7 @@ from walop_jax.model import materials
 from walop_jax.model.specification import Model, Vector
 
 FIRST_STRIPS = 8
-"""Strips of image rows that are fitted before all of them: twice what a throughput of fourth order asks for."""
+"""Strips of image rows that are fitted before all of them: twice the need of a throughput of fourth order."""
 
 PIXEL_SAMPLE = 1024
 """Pixels of whole frames on which their fit begins: the optics of so few are soon solved one by one."""
@@ -195,19 +195,19 @@ def _far_off(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
     """The best place for a model that is far from the data: errors scaled to its residuals, other orders tried."""
     budget, starts = most_passes(likelihood.model) - best.minimum.steps, 1
 
-    def search(label: str, values: Vector, scale: float, most: int) -> FoundMinimum:
+    def search(label: str, values: Vector, scale: float, maximum_steps: int) -> FoundMinimum:
         nonlocal budget
-        most = max(1, min(most, budget))
-        more = _search(likelihood, label, values, scale, best.posterior, maximum_steps=most)
-        budget -= more.minimum.steps
-        return more
+        maximum_steps = max(1, min(maximum_steps, budget))
+        attempt = _search(likelihood, label, values, scale, best.posterior, maximum_steps=maximum_steps)
+        budget -= attempt.minimum.steps
+        return attempt
 
     def rescaled(best: FoundMinimum) -> FoundMinimum:
         for _ in range(MAXIMUM_RESCALINGS):
             scale = float(np.sqrt(best.misfit)) if best.misfit > FAR_OFF else 1.0
             if budget <= 0 or abs(scale / best.posterior.noise_scale - 1.0) < 0.1:
                 break
-            # Half of what is left at most: the other orders are to be tried as well.
+            # Half of the budget at most: the other orders are to be tried as well.
             label = f"the model is far off; errors × {scale:.3g}"
             best = search(label, best.values, scale, max(FIRST_STEPS, budget // 2))
         return best

@@ -23,7 +23,7 @@ way is left."""
 
 
 def on_field_points(result: FitResult) -> FitResult:
-    """The same values and errors beside a set that stands for all pixels; any other fit comes back as it is."""
+    """The same values and errors beside a set that stands for all pixels; any other fit is unchanged."""
     if not isinstance(result.posterior, PixelPosterior):
         return result
     likelihood = Likelihood.of(compressed(result.posterior), result.model, interpolate=False)

@@ -1,4 +1,4 @@
-"""The verdict on a fit: what speaks against it, computed once; bits, words, exit codes and trust are read off it."""
+"""The verdict on a fit: all doubts about it, computed once; bits, words, exit codes and trust are read off it."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Quality(enum.IntFlag):
 
 @dataclasses.dataclass(frozen=True)
 class Doubt:
-    """One thing that speaks against a fit: a bit of `Quality`, a sentence for the user, and whether it forbids trust.
+    """A doubt about a fit: a bit of `Quality`, a sentence for the user, and whether it forbids trust.
 
     A remark has no bit and forbids nothing.
     """
@@ -99,7 +99,7 @@ NO_STRUCTURE = Structure()
 NOT_MEASURED = (
     "the calibration data hold no information on {}; Q_HIDDEN, U_HIDDEN of stars have it, Q_ERR, U_ERR do not"
 )
-"""A remark on what could be wrong by its usual size, whatever the data are."""
+"""Remark on mistakes without information in the data, at their usual sizes."""
 EFFECT, DATA = "effect", "data"
 """Kinds of mistakes that could hide: of the model of the instrument, of what the set states of its data."""
 
@@ -138,7 +138,7 @@ class Hidden:
         return zip(self.names, self.sizes, self.units, strict=True)
 
     def not_measured(self) -> tuple[str, ...]:
-        """Names of all that the data hold no information on, with what would measure it."""
+        """Names of all unmeasured mistakes, each with the measurement to take."""
         together: dict[str, list[str]] = {}
         for name, remedy, measured in zip(self.names, self.remedies, self.measured, strict=True):
             if not measured:
@@ -156,7 +156,7 @@ class Hidden:
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """Statistics of a fit and everything that speaks against it.
+    """Statistics of a fit and all doubts about it.
 
     The one rule of trust: a result is trusted if none of the doubts `against` it is blocking. `noise_scale` multiplied
     the errors of the data in the fit (1: as given); `structure` is what field points differ by; `covariance_from` names
@@ -176,14 +176,14 @@ class Verdict:
 
     @classmethod
     def recorded(cls, *, trusted: bool, quality: int, warnings: Sequence[str] = (), **others: Any) -> Verdict:
-        """The verdict that a file states; it does not say which sentence belongs to which bit."""
+        """The verdict that a file states; it does not relate sentences to bits."""
         remarks = tuple(Doubt(Quality(0), text, blocking=False) for text in warnings)
         bits = (Doubt(Quality(quality), "", blocking=not trusted),) if quality or not trusted else ()
         return cls(**others, against=(*bits, *remarks))
 
     @property
     def trusted(self) -> bool:
-        """True if nothing that speaks against the fit forbids its use."""
+        """True if no doubt about the fit forbids its use."""
         return not any(doubt.blocking for doubt in self.against)
 
     @property

@@ -68,16 +68,16 @@ def own_columns(
 
     Effects that differ in nothing but numbers share a program.
     """
-    found, plans = [], {}
+    columns, plans = [], {}
     for effect in effects:
         structure = jax.tree.structure(effect)
         if structure not in plans:
             plans[structure] = Likelihood.of(likelihood.calset, likelihood.model, (effect,))
-        own = plans[structure]
-        instrument = own.model.instrument(values)
-        parts = [used_rows(_own(instrument, own.plan, (effect,), batch), batch) for batch in own.points]
-        found.append(np.concatenate(parts))
-    return np.concatenate(found, axis=1)
+        probe = plans[structure]
+        instrument = probe.model.instrument(values)
+        rows = [used_rows(_own(instrument, probe.plan, (effect,), batch), batch) for batch in probe.points]
+        columns.append(np.concatenate(rows))
+    return np.concatenate(columns, axis=1)
 
 
 def _own_at_point(
@@ -94,8 +94,8 @@ def _own_at_point(
 
     _, push = jax.linearize(counts, neutral)
     flat, to_tree = ravel_pytree(neutral)
-    some = min(limits.AMPLITUDES_AT_ONCE, max(flat.size, 1))
-    change = jax.lax.map(lambda one: push(to_tree(one)), jnp.eye(flat.size), batch_size=some) * point.weight
+    size = min(limits.AMPLITUDES_AT_ONCE, max(flat.size, 1))
+    change = jax.lax.map(lambda row: push(to_tree(row)), jnp.eye(flat.size), batch_size=size) * point.weight
     _, along = jax.jvp(lambda f: real_counts(at_neutral, plan, unit, f), (flux,), (jnp.ones_like(flux),))
     projected = project_flux(
         change, along * point.weight, plan.exposures.flux_known, sharing(instrument, plan, point)
@@ -150,13 +150,13 @@ def _at_point(instrument: Instrument, plan: Plan, point: PointData) -> _AtPoint:
     else:
         opposite = counts[1]
     unit = light.with_ghosts(instrument, counts[0], opposite, point.source)
-    one = jnp.ones_like(unit)
-    seen = light.with_ghosts(instrument, jnp.zeros_like(unit), one, point.source)
+    direct = jnp.ones_like(unit)
+    ghost_share = light.with_ghosts(instrument, jnp.zeros_like(unit), direct, point.source)
     flux = best_flux(instrument, plan, unit, point)
     reported, along = jax.jvp(
         lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
     )
-    share, ghost = jnp.stack([one, seen])[:sites], Ghost(jnp.ones(unit.shape[1]))
+    share, ghost = jnp.stack([direct, ghost_share])[:sites], Ghost(jnp.ones(unit.shape[1]))
     opposite = ghost.seen(point.source < 0, opposite)
     added = {stage: add(reported, plan.exposures) for stage, add in ADDED.items() if stage != "median"}
     return _AtPoint(vectors, lights, share, counts, opposite, flux, flux * unit, added, along)
@@ -231,25 +231,25 @@ class Columns:
 
     def terms_of(self, change: Change) -> list[SlotTerm]:
         """Slots of a change, coefficients and factors. Raises `NoSlotError` for a sentence that has no slots."""
-        found = []
+        terms = []
         for size, sentence in change:
             if sentence not in self._known:
                 self._known[sentence] = self._terms(sentence)
-            found += [part._replace(size=size * part.size) for part in self._known[sentence]]
-        return found
+            terms += [term._replace(size=size * term.size) for term in self._known[sentence]]
+        return terms
 
     def _terms(self, sentence: Sentence) -> list[SlotTerm]:
         try:
-            parts = list(KINDS[sentence.kind].slots(self.patched, sentence))
+            terms = list(KINDS[sentence.kind].slots(self.patched, sentence))
         except NoSuchPlaceError as error:
             raise NoSlotError(str(error)) from None
         # Of the wavelengths in a band the light of an exposure has the mean.
-        inside = (part.slot[0] != "light" and "colour" in part.factors for part in parts)
-        if any(inside) or not all(self._holds(part.slot) for part in parts):
+        inside = (term.slot[0] != "light" and "colour" in term.factors for term in terms)
+        if any(inside) or not all(self._holds(term.slot) for term in terms):
             raise NoSlotError(sentence.text)
         if sentence.kind != "thermal" or "temperature" in self.plan.conditions.planned:
-            return parts
-        return [part._replace(factors=(*part.factors, "kelvin")) for part in parts]
+            return terms
+        return [term._replace(factors=(*term.factors, "kelvin")) for term in terms]
 
     def _holds(self, slot: Slot) -> bool:
         if slot[0] == "light":
@@ -260,12 +260,12 @@ class Columns:
 
     def survives(self, gaps: Sequence[float]) -> dict[float, bool]:
         """True where the bands leave anything of the fringes of air, by its thickness (µm)."""
-        every = list(dict.fromkeys(gaps))
-        if not every:
+        distinct = list(dict.fromkeys(gaps))
+        if not distinct:
             return {}
-        padded = np.pad(np.array(every), (0, -len(every) % (8 * GAPS_TOGETHER)), mode="edge")
-        left = np.asarray(_visible(self.instrument, self.fringe_plan, padded))
-        return {gap: bool(value > LEAST_SURVIVING) for gap, value in zip(every, left, strict=False)}
+        padded = np.pad(np.array(distinct), (0, -len(distinct) % (8 * GAPS_TOGETHER)), mode="edge")
+        visibility = np.asarray(_visible(self.instrument, self.fringe_plan, padded))
+        return {gap: bool(value > LEAST_SURVIVING) for gap, value in zip(distinct, visibility, strict=False)}
 
     @functools.cached_property
     def fringe_plan(self) -> Plan:
@@ -282,9 +282,9 @@ class Columns:
 
         A column of the measured counts would hold their noise, and find it in the residuals.
         """
-        known = self.plan.exposures.median_counts
-        if known is not None:
-            return np.asarray(known)
+        planned = self.plan.exposures.median_counts
+        if planned is not None:
+            return np.asarray(planned)
         _, residual = self.likelihood.residuals(self.values)
         residual = self.likelihood.sharing.independent(residual, inverse=True)
         counts, weight = map(self.likelihood.points.gathered, ("counts", "weight"))
@@ -310,22 +310,22 @@ class Columns:
         self, changes: Sequence[Change], exact: int
     ) -> tuple[Float[np.ndarray, "d a"], Float[np.ndarray, "d b"]]:
         """The columns of the first, `exact` changes, and those of the others in single precision."""
-        each = [self.terms_of(change) for change in changes]
+        changed_terms = [self.terms_of(change) for change in changes]
         likelihood, size = self.likelihood, limits.RESPONSES_TOGETHER
         used, cameras = likelihood.used, len(self.patched.cameras)
         length = cameras * int(used.sum())
-        parts = (
-            (each[:exact], np.empty((exact, length))),
-            (each[exact:], np.empty((len(changes) - exact, length), np.float32)),
+        precisions = (
+            (changed_terms[:exact], np.empty((exact, length))),
+            (changed_terms[exact:], np.empty((len(changes) - exact, length), np.float32)),
         )
-        every, first = list(dict.fromkeys(part.slot for some in each for part in some)), 0
+        distinct_slots, first = list(dict.fromkeys(term.slot for terms in changed_terms for term in terms)), 0
         for start in range(0, len(used), size):
             rows = cameras * int(used[start : start + size].sum())
-            block = ResponseBlock(self, start, every)
-            for some, found in parts:
-                block.fill(some, found[:, first : first + rows])
+            block = ResponseBlock(self, start, distinct_slots)
+            for terms, columns in precisions:
+                block.fill(terms, columns[:, first : first + rows])
             first += rows
-        return parts[0][1].T, parts[1][1].T
+        return precisions[0][1].T, precisions[1][1].T
 
 
 class ResponseBlock:
@@ -362,18 +362,18 @@ class ResponseBlock:
         flat = last.reshape(*last.shape[:-2], -1)
         return flat if self.whole else np.ascontiguousarray(flat[..., self.chosen])
 
-    # -------------------------------------------------------------------------------- what is multiplied by factors
+    # -------------------------------------------------------------------------------- cores, ahead of their factors
 
     def _pattern(self, factors: tuple[Any, ...]) -> Float[np.ndarray, "m n"]:
         """Product of factors at every site."""
         if factors not in self._patterns:
-            each = []
+            patterns = []
             for sign in (1.0, -1.0)[: self.sites]:
                 at = InExposures(self.of.exposures, sign * self.x[:, None], sign * self.y[:, None])
                 value = product(factors, at, self.of.patched.units)
-                whole = np.broadcast_to(np.nan_to_num(np.asarray(value)), self.used.shape)
-                each.append(whole.reshape(-1)[self.chosen])
-            self._patterns[factors] = np.stack(each)
+                over_field = np.broadcast_to(np.nan_to_num(np.asarray(value)), self.used.shape)
+                patterns.append(over_field.reshape(-1)[self.chosen])
+            self._patterns[factors] = np.stack(patterns)
         return self._patterns[factors]
 
     def _solve(self, every: Sequence[Slot]) -> None:
@@ -381,30 +381,30 @@ class ResponseBlock:
         of_vectors = [slot for slot in every if slot[0] == "fringes" or slot in self.of.of_vectors]
         fringes = self._fringes([slot[2] for slot in of_vectors if slot[0] == "fringes"])
         # Points that no exposure measures are in no pair.
-        some = max(1, int(limits.RESPONSE_NUMBERS // max(1, self.sites * self.cameras * len(self.chosen))))
-        for first in range(0, len(of_vectors), some):
-            part = of_vectors[first : first + some]
-            change = np.stack([fringes[slot] if slot in fringes else self.change(slot) for slot in part])
-            self._cores |= dict(zip(part, self._met(change), strict=True))
+        batch = max(1, int(limits.RESPONSE_NUMBERS // max(1, self.sites * self.cameras * len(self.chosen))))
+        for first in range(0, len(of_vectors), batch):
+            group = of_vectors[first : first + batch]
+            change = np.stack([fringes[slot] if slot in fringes else self.change(slot) for slot in group])
+            self._cores |= dict(zip(group, self._met(change), strict=True))
         for slot in every:
             if slot not in self._cores:
                 self._cores[slot] = self._core(slot)
 
     def _fringes(self, gaps: Sequence[float]) -> dict[Slot, np.ndarray]:
         """Slopes (p m b k 4) in fringes."""
-        every = list(dict.fromkeys(gaps))
-        if not every:
+        distinct = list(dict.fromkeys(gaps))
+        if not distinct:
             return {}
-        sites = [np.stack([one, -one], 1)[:, : self.sites] for one in (self.x, self.y)]
-        padded = np.pad(np.array(every), (0, -len(every) % GAPS_TOGETHER), mode="edge")
-        parts = [
-            np.asarray(_fringes_at(self.of.instrument, self.of.fringe_plan, some, *sites))
-            for some in np.split(padded, len(padded) // GAPS_TOGETHER)
+        sites = [np.stack([c, -c], 1)[:, : self.sites] for c in (self.x, self.y)]
+        padded = np.pad(np.array(distinct), (0, -len(distinct) % GAPS_TOGETHER), mode="edge")
+        slopes = [
+            np.asarray(_fringes_at(self.of.instrument, self.of.fringe_plan, batch, *sites))
+            for batch in np.split(padded, len(padded) // GAPS_TOGETHER)
         ]
-        whole = np.concatenate(parts, axis=3)
+        joined = np.concatenate(slopes, axis=3)
         return {
-            ("fringes", place, gap): whole[:, :, plate, i]
-            for i, gap in enumerate(every)
+            ("fringes", place, gap): joined[:, :, plate, i]
+            for i, gap in enumerate(distinct)
             for plate, place in enumerate(self.of.fringed)
         }
 
@@ -415,64 +415,64 @@ class ResponseBlock:
     def _met(self, change: Float[np.ndarray, "s p m b k 4"]) -> Float[np.ndarray, "s m k n"]:
         """Analysis vectors that change, with the light of the exposures."""
         count = change.shape[0]
-        taken = np.transpose(self.found.light.taken, (1, 3, 0, 4, 2))  # m k p 4 e
-        whole = np.zeros((count, self.sites, self.cameras, *self.used.shape))
+        beam = np.transpose(self.found.light.taken, (1, 3, 0, 4, 2))  # m k p 4 e
+        counts = np.zeros((count, self.sites, self.cameras, *self.used.shape))
         for band in np.unique(self.band):
-            here = self.band == band
-            at = np.flatnonzero(here.any(axis=0))
-            some = np.transpose(change[:, :, :, band], (2, 3, 1, 0, 4)) @ taken[..., at]  # m k p s e
-            if not here[:, at].all():
-                some = some * here[:, at][:, None]
-            whole[..., at] += np.transpose(some, (3, 0, 1, 2, 4))
-        flat = whole.reshape(*whole.shape[:3], -1)
+            in_band = self.band == band
+            at = np.flatnonzero(in_band.any(axis=0))
+            sums = np.transpose(change[:, :, :, band], (2, 3, 1, 0, 4)) @ beam[..., at]  # m k p s e
+            if not in_band[:, at].all():
+                sums = sums * in_band[:, at][:, None]
+            counts[..., at] += np.transpose(sums, (3, 0, 1, 2, 4))
+        flat = counts.reshape(*counts.shape[:3], -1)
         return (flat if self.whole else flat[..., self.chosen]) * (self.share * self.flux)
 
     def _core(self, slot: Slot) -> Float[np.ndarray, "m k n"]:
-        found = self.found
+        responses = self.found
         if slot[0] == "light":
             vectors = np.take_along_axis(
-                found.vectors.vectors, self.band[:, None, :, None, None], axis=2
+                responses.vectors.vectors, self.band[:, None, :, None, None], axis=2
             )  # p m e k 4
-            change = found.light.slopes[:, :, self.of.of_light[slot[:4]]]
+            change = responses.light.slopes[:, :, self.of.of_light[slot[:4]]]
             for star in slot[4:]:
                 change = change * (self.value == star)[:, None, :, None]
-            raw = np.einsum("pmeks,pmes->pmek", vectors, change) * found.light.factor
+            raw = np.einsum("pmeks,pmes->pmek", vectors, change) * responses.light.factor
             return self._pairs(raw) * self.share * self.flux
         stage, cameras = slot
         if stage == "counts":
-            return self._pairs(found.counts * cameras) * self.share * self.flux
+            return self._pairs(responses.counts * cameras) * self.share * self.flux
         if stage == "opposite":
-            return self._alone(found.opposite * cameras) * self.flux
+            return self._alone(responses.opposite * cameras) * self.flux
         added = (
-            np.broadcast_to(self.of.median, found.electrons.shape)
+            np.broadcast_to(self.of.median, responses.electrons.shape)
             if stage == "median"
-            else found.added[stage]
+            else responses.added[stage]
         )
         return self._alone(added * cameras) * (self.weight if self.linear else 1.0)
 
     def _alone(self, values: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "m k n"]:
-        """Values that come in once, whatever sites there are."""
-        own = self._pairs(values)[None]
-        return np.concatenate([own, *([np.zeros_like(own)] * (self.sites - 1))])
+        """Values that enter once, for any number of sites."""
+        pairs = self._pairs(values)[None]
+        return np.concatenate([pairs, *([np.zeros_like(pairs)] * (self.sites - 1))])
 
     # --------------------------------------------------------------------------------------------------- columns
 
-    def fill(self, changes: Sequence[Sequence[SlotTerm]], found: Float[np.ndarray, "a d"]) -> None:
+    def fill(self, changes: Sequence[Sequence[SlotTerm]], columns: Float[np.ndarray, "a d"]) -> None:
         """Write the columns of changes, for these points."""
         size = limits.COLUMNS_TOGETHER // 4
         for first in range(0, len(changes), size):
-            some = changes[first : first + size]
-            change = np.zeros((len(some), self.cameras, len(self.chosen)))
+            batch = changes[first : first + size]
+            change = np.zeros((len(batch), self.cameras, len(self.chosen)))
             behind = None if self.linear else np.zeros_like(change)
-            for a, parts in enumerate(some):
-                for slot, coefficient, factors in parts:
+            for a, terms in enumerate(batch):
+                for slot, coefficient, factors in terms:
                     core, pattern = self._cores[slot], self._pattern(factors)
                     into = change if behind is None or slot[0] not in ADDED else behind
                     for site in range(self.sites):
                         into[a] += core[site] * (coefficient * pattern[site])
             if behind is not None:
                 change = (self._reported(change) + behind) * self.weight
-            self._write(change, found[first : first + len(some)])
+            self._write(change, columns[first : first + len(batch)])
 
     def _reported(self, change: Float[np.ndarray, "a k n"]) -> Float[np.ndarray, "a k n"]:
         of, size = self.of, limits.COLUMNS_TOGETHER // 4
@@ -481,20 +481,20 @@ class ResponseBlock:
         pushed = np.asarray(_detectors(of.instrument, of.plan, self.found.electrons, cube))[: len(change)]
         return np.moveaxis(pushed, -1, 1).reshape(change.shape)
 
-    def _write(self, change: Float[np.ndarray, "a k n"], found: Float[np.ndarray, "a d"]) -> None:
+    def _write(self, change: Float[np.ndarray, "a k n"], columns: Float[np.ndarray, "a d"]) -> None:
         """Project the flux out and write rows in the order of the residuals."""
         along = self._pairs(self.found.along) * self.weight
-        known = self.of.likelihood.flux_known
+        flux_known = self.of.likelihood.flux_known
         shape = (*self.used.shape, self.cameras)
         if not self.shared.single:
 
             def cube(pairs: Float[np.ndarray, "... k n"]) -> np.ndarray:
                 return np.moveaxis(pairs, -2, -1).reshape(*pairs.shape[:-2], *shape)
 
-            left = project_flux(cube(change), cube(along), known, self.shared)
-            found[:] = -left[:, self.used].reshape(len(found), -1)
+            projected = project_flux(cube(change), cube(along), flux_known, self.shared)
+            columns[:] = -projected[:, self.used].reshape(len(columns), -1)
             return
-        free = np.where(np.broadcast_to(~known, self.used.shape).reshape(-1)[self.chosen], 1.0, 0.0)
+        free = np.where(np.broadcast_to(~flux_known, self.used.shape).reshape(-1)[self.chosen], 1.0, 0.0)
         together = self.shared.cameras
         groups = (
             [np.arange(self.cameras)]
@@ -502,12 +502,12 @@ class ResponseBlock:
             else [np.flatnonzero(g) for g in np.unique(together, axis=0)]
         )
         for group in groups:
-            own = along[group]
-            power = np.sum(own**2, axis=0)
-            unit = own * (free / np.sqrt(np.where(power > 0, power, 1.0)))
-            taken = np.einsum("akn,kn->an", change[:, group], unit)
-            change[:, group] -= taken[:, None] * unit
+            slopes = along[group]
+            power = np.sum(slopes**2, axis=0)
+            unit = slopes * (free / np.sqrt(np.where(power > 0, power, 1.0)))
+            amplitude = np.einsum("akn,kn->an", change[:, group], unit)
+            change[:, group] -= amplitude[:, None] * unit
         inside = self.used.reshape(-1)[self.chosen]
-        rows = found.reshape(len(found), -1, self.cameras)
+        rows = columns.reshape(len(columns), -1, self.cameras)
         for k in range(self.cameras):
             np.negative(change[:, k] if inside.all() else change[:, k][:, inside], out=rows[..., k])

@@ -34,18 +34,18 @@ from walop_jax.likelihood.frames import (
 )
 from walop_jax.likelihood.inverses import whitening
 
-SINGULAR = 1e-12  # of the largest eigenvalue: directions of the parameters that the data say nothing of
+SINGULAR = 1e-12  # of the largest eigenvalue: directions of the parameters without data
 
 
 def _shares(edges: Vector) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "c p"]]:
-    """Places of the points along a side of the frame, and what each cell between `edges` gives to them."""
+    """Places of the points along a side of the frame, and the contribution of each cell between `edges` to them."""
     cells, (nodes, weights) = len(edges) - 1, legendre.leggauss(limits.COMPRESSED_POINTS)
     count = len(nodes)
     scaled = legendre.legvander(nodes, count - 1) * (np.arange(count) + 0.5) * weights[:, None]
-    each = -(-cells // limits.COMPRESSED_BLOCKS)
-    places, shares = [], np.zeros((cells, count * -(-cells // each)))
-    for block, first in enumerate(range(0, cells, each)):
-        last = min(first + each, cells)
+    cells_per_block = -(-cells // limits.COMPRESSED_BLOCKS)
+    places, shares = [], np.zeros((cells, count * -(-cells // cells_per_block)))
+    for block, first in enumerate(range(0, cells, cells_per_block)):
+        last = min(first + cells_per_block, cells)
         middle, half = 0.5 * (edges[last] + edges[first]), 0.5 * (edges[last] - edges[first])
         at = (0.5 * (edges[first:last] + edges[first + 1 : last + 1]) - middle) / half
         places.append(middle + half * nodes)
@@ -58,8 +58,8 @@ def compressed(posterior: PixelPosterior) -> CalibrationSet:
 
     The rows of a table beside the frames are in it as they are.
     """
-    found = posterior.sums
-    cells, likelihood = found.cells, found.likelihood
+    sums = posterior.sums
+    cells, likelihood = sums.cells, sums.likelihood
     (s, over), (t, up) = (_shares(edges) for edges in cells.edges())
 
     def shared(values: np.ndarray) -> np.ndarray:
@@ -67,13 +67,13 @@ def compressed(posterior: PixelPosterior) -> CalibrationSet:
         moved = np.einsum("...rc,cs,rt->...ts", np.asarray(values), over, up, optimize=True)
         return np.moveaxis(moved.reshape(*moved.shape[:-2], -1), (-1, -2), (0, 1))
 
-    s, t = (part.ravel() for part in np.meshgrid(s, t))
-    unit = np.swapaxes(np.asarray(found.smooth(s, t).unit), 1, 2)
-    weight, pull, power = shared(found.sums.weight), shared(found.sums.pull), shared(found.sums.power)
+    s, t = (nodes.ravel() for nodes in np.meshgrid(s, t))
+    unit = np.swapaxes(np.asarray(sums.smooth(s, t).unit), 1, 2)
+    weight, pull, power = shared(sums.sums.weight), shared(sums.sums.pull), shared(sums.sums.power)
     used = (weight > 0).all(axis=2) & (power > 0)
     weight = np.where(used[..., None], weight, 0.0)
     x, y = cells.field(s, t)
-    pull = _with_gradient(found, pull, weight, unit, (x, y))
+    pull = _with_gradient(sums, pull, weight, unit, (x, y))
     safe = np.where(used[..., None], weight, 1.0)
     mean = np.where(used, power / np.sum(safe * unit**2, axis=2), 1.0)
     flux = np.where(likelihood.flux_known, 1.0, mean)[..., None]
@@ -90,7 +90,7 @@ def compressed(posterior: PixelPosterior) -> CalibrationSet:
         pixels=cells.grid.pixels,
         chi2=posterior.data,
         dof=posterior.dof,
-        values=dict(zip(names, found.values.tolist(), strict=True)),
+        values=dict(zip(names, sums.values.tolist(), strict=True)),
         frames=calset.inputs,
     )
     return dataclasses.replace(
@@ -103,19 +103,19 @@ def compressed(posterior: PixelPosterior) -> CalibrationSet:
 
 
 def _with_gradient(
-    found: FrameSums,
+    sums: FrameSums,
     pull: Float[np.ndarray, "p e k"],
     weight: Float[np.ndarray, "p e k"],
     unit: Float[np.ndarray, "p e k"],
     place: tuple[Vector, Vector],
 ) -> Float[np.ndarray, "p e k"]:
-    """The pull at points without what is a change of the flux, with the gradient of all pixels."""
-    matrix = information_of(found, weight.T, unit.T).transpose(3, 2, 0, 1)
+    """The pull at points without its component along the flux, with the gradient of all pixels."""
+    matrix = information_of(sums, weight.T, unit.T).transpose(3, 2, 0, 1)
     inverse = np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0)
     pull = np.einsum("pekl,pel->pek", matrix, inverse * pull)
-    slopes = unit_slopes_at(found.likelihood, found.instrument, *place)
+    slopes = unit_slopes_at(sums.likelihood, sums.instrument, *place)
     changes = np.einsum("pekl,peln->pekn", matrix, slopes, optimize=True)
-    lacking = -half_gradient(found) - np.einsum("pekn,pek->n", slopes, pull)
+    lacking = -half_gradient(sums) - np.einsum("pekn,pek->n", slopes, pull)
     normal = np.einsum("pekn,pekm->nm", slopes, changes, optimize=True)
     root = whitening(normal, SINGULAR)
     return pull + changes @ (root @ (root.T @ lacking))

@@ -134,16 +134,16 @@ def best_flux(
     instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], point: PointData
 ) -> Float[Array, "e f"]:
     """Flux that fits best: in closed form, refined by Newton steps where detectors are not linear in it."""
-    known, shared = plan.exposures.flux_known, sharing(instrument, plan)
-    flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, known, shared)
+    flux_known, shared = plan.exposures.flux_known, sharing(instrument, plan)
+    flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, flux_known, shared)
     if not light.is_linear(instrument):
         for _ in range(NEWTON_STEPS):
             counts, slope = jax.jvp(
                 lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
             )
             missing = (point.counts - counts) * point.weight
-            step, _ = eliminate_flux(missing, slope * point.weight, known, shared)
-            flux = jnp.where(known[:, None], flux, flux + step)
+            step, _ = eliminate_flux(missing, slope * point.weight, flux_known, shared)
+            flux = jnp.where(flux_known[:, None], flux, flux + step)
     return flux
 
 
@@ -206,9 +206,9 @@ def _star_responses(
 
 def unit_slopes(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e k n"]:
     """Derivatives of the counts of one point for light of unit flux with respect to all parameters."""
-    found = _linear_unit_counts(instrument, plan, point, None)
+    derivatives = _linear_unit_counts(instrument, plan, point, None)
     basis = instrument.throughput.basis(*field_sites(instrument, point))
-    return to_all(instrument, found.plain, found.local, basis)
+    return to_all(instrument, derivatives.plain, derivatives.local, basis)
 
 
 def _point_jacobian(
@@ -231,8 +231,8 @@ def _point_jacobian(
         counts, push_detector = jax.linearize(
             lambda v, n: light.detected(to_instrument(v), plan.exposures, n), values, counts
         )
-        each = jnp.eye(values.size)[plain_positions(instrument)]
-        all_values = jnp.concatenate([each, jnp.zeros((throughput.size, values.size))])
+        unit_steps = jnp.eye(values.size)[plain_positions(instrument)]
+        all_values = jnp.concatenate([unit_steps, jnp.zeros((throughput.size, values.size))])
         d_counts = jax.vmap(push_detector)(all_values, d_counts)
         along = push_detector(jnp.zeros_like(values), unit)
     shared = sharing(instrument, plan, point)
@@ -260,19 +260,19 @@ def normal_equations(
         return Normal(*map(np.asarray, _table_equations(instrument, plan, data, nodes)))
     size, chi2, gradient, matrix = values_of(instrument).size, 0.0, 0.0, 0.0
     for start in range(0, len(data.x), limits.BATCH):
-        part = data
+        points = data
         if len(data.x) > limits.BATCH:
-            part = jax.tree.map(
+            points = jax.tree.map(
                 lambda leaf, first=start: np.asarray(leaf)[first : first + limits.BATCH], data
             )
-        residual, slope = map(np.asarray, linearised_residuals(instrument, plan, part))
+        residual, slope = map(np.asarray, linearised_residuals(instrument, plan, points))
         r, jacobian = residual.reshape(-1), slope.reshape(-1, size)
         chi2, gradient, matrix = chi2 + r @ r, gradient + jacobian.T @ r, matrix + jacobian.T @ jacobian
     return Normal(chi2, gradient, matrix)
 
 
 def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:
-    """Sums over blocks of points, so that what is needed in between stays in the processor's cache.
+    """Sums over blocks of points, so that intermediate results stay in the processor's cache.
 
     Points that make no whole number of blocks, and few points, are one block.
     """
@@ -284,7 +284,7 @@ def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldT
 
 
 def summed(function: Callable[[Any], Any], parts: Any) -> Any:
-    """Sums of what a function gives for each of the parts along the first axis, one part after the other."""
+    """Sums of the results of a function for the slices along the first axis, one after the other."""
     first = jax.eval_shape(function, jax.tree.map(lambda v: v[0], parts))
     nothing = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), first)
     return jax.lax.scan(

@@ -59,8 +59,8 @@ class FieldTable(eqx.Module):
 
         def series(leaf: np.ndarray) -> np.ndarray:
             square = np.asarray(leaf).reshape(count, count, -1)
-            both = np.einsum("ai,bj,ijf->abf", to, to, square, optimize=True)
-            return both[i, j].reshape(-1, *np.shape(leaf)[1:])
+            coefficients = np.einsum("ai,bj,ijf->abf", to, to, square, optimize=True)
+            return coefficients[i, j].reshape(-1, *np.shape(leaf)[1:])
 
         return cls(rectangle, jax.tree.map(series, values), count, total)
 
@@ -81,8 +81,8 @@ class FieldTable(eqx.Module):
 
 def _terms(count: int, total: bool) -> tuple[Int[np.ndarray, " t"], Int[np.ndarray, " t"]]:
     i, j = np.indices((count, count)).reshape(2, -1)
-    kept = i + j < (count if total else 2 * count)
-    return i[kept], j[kept]
+    included = i + j < (count if total else 2 * count)
+    return i[included], j[included]
 
 
 def held_out(rectangle: Rectangle) -> tuple[Vector, Vector]:
@@ -120,9 +120,9 @@ def accurate_table(
     for count in counts:
         x, y = chebyshev.grid(rectangle, count)
         if truth is None:
-            both = exact(np.append(x, other_x), np.append(y, other_y))
+            solutions = exact(np.append(x, other_x), np.append(y, other_y))
             values, truth = (
-                jax.tree.map(lambda leaf, cut=cut: leaf[cut], both)
+                jax.tree.map(lambda leaf, cut=cut: leaf[cut], solutions)
                 for cut in (slice(0, len(x)), slice(len(x), None))
             )
         else:
@@ -152,12 +152,12 @@ def solved_optics(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> O
 
 def in_batches(solve: Callable[[Vector, Vector], Any], x: Vector, y: Vector) -> Any:
     """Results of `solve` at field positions (deg), a tree of arrays, as many at a time as it is compiled for."""
-    parts = []
+    batches = []
     for start in range(0, len(x), limits.BATCH):
         # The last batch is filled up with its last place.
         inside = np.minimum(np.arange(start, start + limits.BATCH), len(x) - 1)
-        parts.append(jax.tree.map(np.asarray, solve(x[inside], y[inside])))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(x)], *parts)
+        batches.append(jax.tree.map(np.asarray, solve(x[inside], y[inside])))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(x)], *batches)
 
 
 def accurate_nodes(
@@ -170,9 +170,9 @@ def accurate_nodes(
     finite, and with it all that is computed from it.
     """
 
-    def error(found: Optics, truth: Optics) -> float:
-        off = np.abs(found[0] - truth[0]).max(initial=0.0)
-        tilt = np.abs(found[1] - truth[1]) * scale[:, None, None, None]
+    def error(interpolated: Optics, truth: Optics) -> float:
+        off = np.abs(interpolated[0] - truth[0]).max(initial=0.0)
+        tilt = np.abs(interpolated[1] - truth[1]) * scale[:, None, None, None]
         return float(max(off, tilt.max(initial=0.0)))
 
     table, off = accurate_table(

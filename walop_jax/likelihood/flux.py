@@ -43,12 +43,12 @@ class Sharing(NamedTuple):
         return self.exposures is None and self.stars is None
 
     def summed(self, values: Float[Any, "... e k"]) -> Float[Any, "... e f"]:
-        """Sums over what has a flux in common, once for all cameras (f = 1) or camera by camera (f = k)."""
-        each = values.sum(axis=-1, keepdims=True) if self.cameras is None else values @ self.cameras
+        """Sums over intensities with a common flux, once for all cameras (f = 1) or camera by camera (f = k)."""
+        by_camera = values.sum(axis=-1, keepdims=True) if self.cameras is None else values @ self.cameras
         if self.exposures is None:
-            return each
+            return by_camera
         xp = _namespace(values)
-        groups = xp.einsum("...ek,es->...sk", each, self.exposures)
+        groups = xp.einsum("...ek,es->...sk", by_camera, self.exposures)
         return xp.einsum("...sk,es->...ek", groups, self.exposures)
 
     def independent(self, values: Float[Any, "... e k"], inverse: bool = False) -> Float[Any, "... e k"]:
@@ -89,7 +89,7 @@ def project_flux(
     flux_known: Bool[Any, ...] | bool = False,
     shared: Sharing = ALONE,
 ) -> Float[Any, "... k"]:
-    """Derivatives of weighted counts, `columns`, without what a change of the flux can take up.
+    """Derivatives of weighted counts, `columns`, without the component along a change of the flux.
 
     `along` is the derivative with respect to the flux; it and `flux_known` broadcast against the columns. Arrays of
     numpy stay so.

@@ -65,7 +65,7 @@ class Forward(eqx.Module):
     def of(cls, calset: CalibrationSet, model: Model, batch: int | None = None) -> Forward:
         """The forward model of a set that fits into memory, `batch` points at a time (None: by the kind of machine).
 
-        Raises RuntimeError when float64 is switched off, as the methods do: what a session compiles has its precision.
+        Raises RuntimeError when float64 is switched off, as the methods do: compiled programs keep their precision.
         """
         need_float64(WHAT)
         if batch is None:
@@ -129,7 +129,7 @@ class Forward(eqx.Module):
         """The instrument with these values in the place of its parameters."""
         return with_values(self.template)(self._tied(values))
 
-    # ------------------------------------------------------------------------------------ what is measured
+    # ------------------------------------------------------------------------------------ measurements
 
     def counts(
         self, values: Values | Instrument, flux: Float[Any, "p e *f"] | None = None
@@ -161,8 +161,8 @@ class Forward(eqx.Module):
 
     def residuals(self, values: Values | Instrument) -> Float[Array, " d"]:
         """(measured − model) / error of the used intensities, fluxes eliminated; by point, exposure, camera."""
-        every = jax.lax.map(lambda part: self._residuals(values, part), self.data)
-        return every.reshape(-1)[self.used]
+        residuals = jax.lax.map(lambda part: self._residuals(values, part), self.data)
+        return residuals.reshape(-1)[self.used]
 
     # ----------------------------------------------------------------------------------------- densities
 

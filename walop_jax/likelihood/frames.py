@@ -54,7 +54,7 @@ Vector = Float[np.ndarray, " n"]
 FRAME = Rectangle(np.array([-1.0, -1.0]), np.array([1.0, 1.0]))
 
 
-# ------------------------------------------------------------------------------- what pixels say, cell by cell
+# ------------------------------------------------------------------------------- sums over pixels, cell by cell
 
 
 class CellSums(NamedTuple):
@@ -83,7 +83,7 @@ def _terms(
     counts: Float[Array, "k e w"],
     sigma: Float[Array, "k e w"],
     open_: Bool[Array, "e w"],
-    known: Bool[Array, " e"],
+    flux_known: Bool[Array, " e"],
     together: Float[Array, "k k"] | None,
 ) -> tuple[CellSums, Int[Array, " w"]]:
     """The terms of the pixels of a piece of an image row, each a cell by itself, and those with impossible errors."""
@@ -100,18 +100,18 @@ def _terms(
     counts = jnp.where(used, counts, 0.0)
     light = unit * weight
     power = summed(light * unit)
-    flux = jnp.where(known[:, None], 1.0, summed(light * counts) / jnp.where(power > 0, power, 1.0))
-    left = counts - flux * unit
+    flux = jnp.where(flux_known[:, None], 1.0, summed(light * counts) / jnp.where(power > 0, power, 1.0))
+    residual = counts - flux * unit
     scaled = flux * weight
-    pull = scaled * left
-    found = CellSums(
+    pull = scaled * residual
+    sums = CellSums(
         weight=flux * scaled,
         pull=pull,
         power=jnp.sum(flux**3 * light * unit, axis=0),
-        chi2=jnp.sum(weight * left**2, axis=0),
+        chi2=jnp.sum(weight * residual**2, axis=0),
         used=used.astype(float),
     )
-    return found, jnp.sum(wrong, axis=0)
+    return sums, jnp.sum(wrong, axis=0)
 
 
 def _strip_sums(
@@ -120,7 +120,7 @@ def _strip_sums(
     across: Float[Array, "i w"],
     along: Float[Array, "h j"],
     side: Float[Array, " c"],
-    known: Bool[Array, " e"],
+    flux_known: Bool[Array, " e"],
     together: Float[Array, "k k"] | None,
 ) -> StripSums:
     cameras, exposures, height, width = rows.counts.shape
@@ -131,17 +131,17 @@ def _strip_sums(
         def cut(array: Array) -> Array:
             return jax.lax.dynamic_slice(array, (0, 0, row, start), (*array.shape[:2], 1, piece))[:, :, 0]
 
-        here = jax.lax.dynamic_slice_in_dim(across, start, piece, axis=1)
+        polynomials = jax.lax.dynamic_slice_in_dim(across, start, piece, axis=1)
         open_ = jax.lax.dynamic_slice(rows.open, (0, row, start), (exposures, 1, piece))[:, 0]
-        unit = (by_row[row] @ here).reshape(cameras, exposures, piece)
-        return _terms(unit, float64(cut(rows.counts)), float64(cut(rows.sigma)), open_, known, together)
+        unit = (by_row[row] @ polynomials).reshape(cameras, exposures, piece)
+        return _terms(unit, float64(cut(rows.counts)), float64(cut(rows.sigma)), open_, flux_known, together)
 
     def one_piece(first: Int[Array, ""], start: Int[Array, ""]) -> StripSums:
-        here = jax.lax.dynamic_slice_in_dim(across, start, piece, axis=1)
+        polynomials = jax.lax.dynamic_slice_in_dim(across, start, piece, axis=1)
 
         def add(sums: tuple[Any, Float[Array, "j m i"]], row: Int[Array, ""]) -> tuple[Any, None]:
             terms = terms_at(row, start)
-            moments = along[row][:, None, None] * (terms[0].pull.reshape(-1, piece) @ here.T)
+            moments = along[row][:, None, None] * (terms[0].pull.reshape(-1, piece) @ polynomials.T)
             return (jax.tree.map(jnp.add, sums[0], terms), sums[1] + moments), None
 
         terms = jax.eval_shape(terms_at, first, start)
@@ -159,12 +159,12 @@ def _strip_sums(
         joined = jax.tree.map(lambda v: jnp.moveaxis(v, 0, -2).reshape(*v.shape[1:-1], -1), pieces.cells)
         return StripSums(joined, pieces.moments.sum(axis=0), pieces.impossible.sum())
 
-    found = jax.lax.map(cell_row, jnp.arange(0, height, cell))
-    moments = jnp.swapaxes(found.moments.sum(axis=0), 1, 2)
+    cell_rows = jax.lax.map(cell_row, jnp.arange(0, height, cell))
+    moments = jnp.swapaxes(cell_rows.moments.sum(axis=0), 1, 2)
     return StripSums(
-        jax.tree.map(lambda v: jnp.moveaxis(v, 0, -2), found.cells),
+        jax.tree.map(lambda v: jnp.moveaxis(v, 0, -2), cell_rows.cells),
         moments.reshape(*moments.shape[:2], cameras, exposures),
-        found.impossible.sum(),
+        cell_rows.impossible.sum(),
     )
 
 
@@ -212,11 +212,11 @@ class Cells:
         """Edges of the columns and rows of cells, or of blocks of `together` × `together` of them, within the frame."""
         rows, columns = self.shape
         counts = ((columns, self.grid.width), (rows, self.grid.height))
-        found = [
-            np.minimum(np.append(np.arange(0, n, together), n) * self.side, most) / most * 2.0 - 1.0
-            for n, most in counts
+        edges = [
+            np.minimum(np.append(np.arange(0, n, together), n) * self.side, pixels) / pixels * 2.0 - 1.0
+            for n, pixels in counts
         ]
-        return found[0], found[1]
+        return edges[0], edges[1]
 
     def middles(self, together: int = 1) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " r"]]:
         """Middles of the columns and rows of cells, or of blocks of them."""
@@ -280,9 +280,9 @@ def _at(solve: Any, likelihood: Likelihood, instrument: Instrument, x: Vector, y
 
 @dataclasses.dataclass(frozen=True)
 class FrameSums:
-    """Sums over the pixels of a set, for each cell, at some values of the parameters, and what was smooth there.
+    """Sums over the pixels of a set, for each cell, at some values of the parameters, and the smooth quantities there.
 
-    One strip of image rows in `every` was gone through.
+    The sums run over one strip of image rows in `every`.
     """
 
     likelihood: Likelihood
@@ -329,13 +329,13 @@ class FrameSums:
 
 def _frames(likelihood: Likelihood) -> tuple[FrameIntensities, Int[np.ndarray, " r"]]:
     """The frames of a set that has some, and the exposures (positions) that they hold."""
-    found = frames_among(likelihood.calset)
-    assert found is not None
-    return found
+    selection = frames_among(likelihood.calset)
+    assert selection is not None
+    return selection
 
 
 def strips_of(likelihood: Likelihood) -> int:
-    """Number of strips of image rows in which the frames of a set are gone through."""
+    """Number of strips of image rows in one pass over the frames of a set."""
     cells = Cells.of(_frames(likelihood)[0].grid)
     return -(-cells.shape[0] // _cell_rows(cells))
 
@@ -345,10 +345,10 @@ def stands_for_pixels(likelihood: Likelihood, values: Vector) -> bool:
 
     There may be a table beside the frames.
     """
-    instrument, found = likelihood.model.instrument(values), frames_among(likelihood.calset)
-    if found is None or not light.is_linear(instrument) or likelihood.plan.exposures.shared is not None:
+    instrument, selection = likelihood.model.instrument(values), frames_among(likelihood.calset)
+    if selection is None or not light.is_linear(instrument) or likelihood.plan.exposures.shared is not None:
         return False
-    frames, exposures = found
+    frames, exposures = selection
     return _series(likelihood, instrument, Cells.of(frames.grid), exposures)[0] is not None
 
 
@@ -372,7 +372,7 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
     across = jnp.asarray(chebyshev.polynomials(s, smooth.count).T)
     unit = np.asarray(smooth.coefficients.unit)[..., exposures]
     series = np.swapaxes(unit.reshape(smooth.count, smooth.count, *unit.shape[1:]), 0, 1)
-    known = jnp.asarray(likelihood.flux_known[exposures])
+    fixed = jnp.asarray(likelihood.flux_known[exposures])
     together = instrument.cameras.together
     read = RowReader(frames, height, width)
 
@@ -382,20 +382,20 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
         pixels = read(top, bottom)
         t = np.minimum((top + np.arange(height) + 0.5) * cells.size[1] - 1.0, 1.0)
         along = jnp.asarray(chebyshev.polynomials(t, smooth.count))
-        found = strip_sums(pixels, jnp.asarray(series), across, along, jnp.zeros(cells.side), known, together)
-        if int(found.impossible):
-            frames.block(top * cells.grid.width, bottom * cells.grid.width)  # says which
-        return np.asarray(found.moments), jax.tree.map(
-            lambda leaf: np.asarray(leaf)[..., :columns], found.cells
+        strip = strip_sums(pixels, jnp.asarray(series), across, along, jnp.zeros(cells.side), fixed, together)
+        if int(strip.impossible):
+            frames.block(top * cells.grid.width, bottom * cells.grid.width)  # names the pixel
+        return np.asarray(strip.moments), jax.tree.map(
+            lambda leaf: np.asarray(leaf)[..., :columns], strip.cells
         )
 
     step = height * cells.grid.width * every
-    moments, parts = np.zeros(series.shape), []
-    for pull, part in runner.each("summing pixels", work, cells.grid.pixels, step):
+    moments, strip_cells = np.zeros(series.shape), []
+    for pull, cell_sums in runner.each("summing pixels", work, cells.grid.pixels, step):
         moments += pull
-        parts.append(part)
+        strip_cells.append(cell_sums)
     count = len(likelihood.flux_known)
-    sums = _assembled(parts, cells.shape[0], every)
+    sums = _assembled(strip_cells, cells.shape[0], every)
     sums = CellSums(*(_in_places(array, exposures, count, axis=-3) for array in sums))
     moments = _in_places(moments, exposures, count, axis=-1)
     return FrameSums(likelihood, values, cells, sums, moments, every, smooth, OpticsUsed(smooth.count, off))
@@ -403,9 +403,9 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
 
 def _in_places(values: np.ndarray, exposures: Int[np.ndarray, " r"], count: int, *, axis: int) -> np.ndarray:
     """Sums of some exposures among those of all, of which there are `count`; zeros for the others."""
-    whole = np.zeros((*values.shape[:axis], count, *values.shape[axis:][1:]))
-    np.moveaxis(whole, axis, 0)[exposures] = np.moveaxis(values, axis, 0)
-    return whole
+    padded = np.zeros((*values.shape[:axis], count, *values.shape[axis:][1:]))
+    np.moveaxis(padded, axis, 0)[exposures] = np.moveaxis(values, axis, 0)
+    return padded
 
 
 def _cell_rows(cells: Cells) -> int:
@@ -421,13 +421,13 @@ def _series(
     def exact(s: Vector, t: Vector) -> Smooth:
         return _at(_solve, likelihood, instrument, *cells.field(s, t))
 
-    def error(found: Smooth, truth: Smooth) -> float:
+    def error(interpolated: Smooth, truth: Smooth) -> float:
         off = [
-            float(np.abs(one - other).max())
-            for one, other in (
-                (found.unit[..., exposures], truth.unit[..., exposures]),
-                (found.vectors, truth.vectors),
-                (found.stokes[:, exposures], truth.stokes[:, exposures]),
+            float(np.abs(value - true_value).max())
+            for value, true_value in (
+                (interpolated.unit[..., exposures], truth.unit[..., exposures]),
+                (interpolated.vectors, truth.vectors),
+                (interpolated.stokes[:, exposures], truth.stokes[:, exposures]),
             )
         ]
         return max(off) if np.all(np.isfinite(off)) else float("nan")
@@ -435,18 +435,18 @@ def _series(
     return accurate_table(exact, FRAME, limits.NODES_PER_SIDE, TOLERANCE, error)
 
 
-def _assembled(parts: Sequence[CellSums], height: int, every: int) -> CellSums:
+def _assembled(strip_cells: Sequence[CellSums], height: int, every: int) -> CellSums:
     """The cells of one strip in `every` in their places, `height` rows of them; zeros in the others."""
 
     def column(*strips: np.ndarray) -> np.ndarray:
         rows = strips[0].shape[-2]
-        whole = np.zeros((*strips[0].shape[:-2], -(-height // rows) * rows, strips[0].shape[-1]))
+        joined = np.zeros((*strips[0].shape[:-2], -(-height // rows) * rows, strips[0].shape[-1]))
         for number, strip in enumerate(strips):
             first = number * every * rows
-            whole[..., first : first + rows, :] = strip
-        return whole[..., :height, :]
+            joined[..., first : first + rows, :] = strip
+        return joined[..., :height, :]
 
-    return jax.tree.map(column, *parts)
+    return jax.tree.map(column, *strip_cells)
 
 
 # ------------------------------------------------------------------------------- from sums to the parameters
@@ -466,18 +466,18 @@ def expand_pixels(
 ) -> PixelPosterior:
     """As `Likelihood.expand`, by one pass over all pixels of frames, or over one strip in `every`.
 
-    A table beside the frames is gone through row by row.
+    A table beside the frames is expanded row by row.
 
     Raises what `frame_sums` raises.
     """
     values = np.asarray(values, float)
-    found = frame_sums(likelihood, values, every)
-    terms = DataTerms(found.chi2, half_gradient(found), gauss_newton(found), found.census)
+    sums = frame_sums(likelihood, values, every)
+    terms = DataTerms(sums.chi2, half_gradient(sums), gauss_newton(sums), sums.census)
     beside = without_frames(likelihood.calset)
     if beside is not None:
         terms = terms.joined(Likelihood.of(beside, likelihood.model).data_terms(values)[0])
-    plain = likelihood.posterior(values, terms, noise_scale, found.optics)
-    return PixelPosterior(**{f.name: getattr(plain, f.name) for f in dataclasses.fields(plain)}, sums=found)
+    plain = likelihood.posterior(values, terms, noise_scale, sums.optics)
+    return PixelPosterior(**{f.name: getattr(plain, f.name) for f in dataclasses.fields(plain)}, sums=sums)
 
 
 def in_blocks(values: Float[np.ndarray, "... r c"], side: int) -> Float[np.ndarray, "... q d"]:
@@ -488,65 +488,65 @@ def in_blocks(values: Float[np.ndarray, "... r c"], side: int) -> Float[np.ndarr
     return np.add.reduceat(np.add.reduceat(values, rows, axis=-2), columns, axis=-1)
 
 
-def information(found: FrameSums, together: int = 1) -> Float[np.ndarray, "k k e r c"]:
+def information(frame: FrameSums, together: int = 1) -> Float[np.ndarray, "k k e r c"]:
     """Information of the pixels on the counts for light of unit flux: the K of each cell, or of blocks of cells."""
-    return information_of(found, in_blocks(found.sums.weight, together), found.unit(together))
+    return information_of(frame, in_blocks(frame.sums.weight, together), frame.unit(together))
 
 
 def information_of(
-    found: FrameSums, weight: Float[np.ndarray, "k ..."], unit: Float[np.ndarray, "k ..."]
+    frame: FrameSums, weight: Float[np.ndarray, "k ..."], unit: Float[np.ndarray, "k ..."]
 ) -> Float[np.ndarray, "k k ..."]:
     """K from Σ F²/σ² and the counts for light of unit flux, for any places: cameras, exposures, then these."""
-    k, likelihood = len(unit), found.likelihood
-    shared = found.instrument.cameras.together
+    k, likelihood = len(unit), frame.likelihood
+    shared = frame.instrument.cameras.together
     shared = np.ones((k, k)) if shared is None else np.asarray(shared)
     light = weight * unit
     power = np.einsum("k...,kl->l...", light * unit, shared)
-    known = likelihood.flux_known.reshape(-1, *(1,) * (unit.ndim - 2))
-    share = np.where(~known & (power > 0), light / np.where(power > 0, power, 1.0), 0.0)
+    flux_known = likelihood.flux_known.reshape(-1, *(1,) * (unit.ndim - 2))
+    share = np.where(~flux_known & (power > 0), light / np.where(power > 0, power, 1.0), 0.0)
     matrix = -np.einsum("kl,k...,l...->kl...", shared, share, light)
     matrix[np.arange(k), np.arange(k)] += weight
     return matrix
 
 
-def _on_nodes(found: FrameSums, count: int, together: int) -> Float[np.ndarray, "s t e k l"]:
+def _on_nodes(frame: FrameSums, count: int, together: int) -> Float[np.ndarray, "s t e k l"]:
     """The K of all cells, or of blocks of them, on Chebyshev nodes: Σ ℓ K."""
     to = chebyshev.to_coefficients(count)
-    over, up = (chebyshev.polynomials(place, count) @ to for place in found.cells.middles(together))
-    return np.einsum("klerc,cs,rt->stekl", information(found, together), over, up, optimize=True)
+    over, up = (chebyshev.polynomials(place, count) @ to for place in frame.cells.middles(together))
+    return np.einsum("klerc,cs,rt->stekl", information(frame, together), over, up, optimize=True)
 
 
-def half_gradient(found: FrameSums) -> Vector:
+def half_gradient(frame: FrameSums) -> Vector:
     """Half gradient of χ² of all pixels in all parameters."""
-    count = found.smooth.count
+    count = frame.smooth.count
     to = chebyshev.to_coefficients(count)
-    pull = np.einsum("jike,jt,is->stek", found.moments, to, to, optimize=True)
+    pull = np.einsum("jike,jt,is->stek", frame.moments, to, to, optimize=True)
     pull = pull.reshape(count**2, *pull.shape[2:])
-    gradient = np.zeros(len(found.values))
-    for here, slopes in _slopes_on_nodes(found, count):
-        gradient -= np.einsum("pekn,pek->n", slopes, pull[here], optimize=True)
+    gradient = np.zeros(len(frame.values))
+    for rows, slopes in _slopes_on_nodes(frame, count):
+        gradient -= np.einsum("pekn,pek->n", slopes, pull[rows], optimize=True)
     return gradient
 
 
-def gauss_newton(found: FrameSums) -> Matrix:
+def gauss_newton(frame: FrameSums) -> Matrix:
     """Gauss–Newton matrix of half of χ² of all pixels in all parameters."""
-    matrices = _on_nodes(found, NODES, 1)
-    if found.every == 1:
-        # K of a cell that lies in its middle errs by the square of its side: so blocks of four say by how much.
-        left = (found.cells.side**2 - 1) / (3 * found.cells.side**2)
-        matrices = (1.0 + left) * matrices - left * _on_nodes(found, NODES, 2)
+    matrices = _on_nodes(frame, NODES, 1)
+    if frame.every == 1:
+        # K of a cell that lies in its middle errs by the square of its side: so blocks of four give the error.
+        correction = (frame.cells.side**2 - 1) / (3 * frame.cells.side**2)
+        matrices = (1.0 + correction) * matrices - correction * _on_nodes(frame, NODES, 2)
     matrices = matrices.reshape(NODES**2, *matrices.shape[2:])
-    size = len(found.values)
+    size = len(frame.values)
     matrix = np.zeros((size, size))
-    for here, slopes in _slopes_on_nodes(found, NODES):
-        weighted = np.einsum("pekl,peln->pekn", matrices[here], slopes, optimize=True)
+    for rows, slopes in _slopes_on_nodes(frame, NODES):
+        weighted = np.einsum("pekl,peln->pekn", matrices[rows], slopes, optimize=True)
         matrix += slopes.reshape(-1, size).T @ weighted.reshape(-1, size)
     return 0.5 * (matrix + matrix.T)
 
 
-def _slopes_on_nodes(found: FrameSums, count: int) -> Iterator[tuple[slice, Float[np.ndarray, "p e k a"]]]:
+def _slopes_on_nodes(frame: FrameSums, count: int) -> Iterator[tuple[slice, Float[np.ndarray, "p e k a"]]]:
     """Derivatives of the counts on Chebyshev nodes, some at a time."""
-    x, y = found.cells.field(*chebyshev.grid(FRAME, count))
+    x, y = frame.cells.field(*chebyshev.grid(FRAME, count))
     for start in range(0, len(x), limits.BATCH):
-        here = slice(start, start + limits.BATCH)
-        yield here, unit_slopes_at(found.likelihood, found.instrument, x[here], y[here])
+        rows = slice(start, start + limits.BATCH)
+        yield rows, unit_slopes_at(frame.likelihood, frame.instrument, x[rows], y[rows])

@@ -1,4 +1,4 @@
-"""Linear algebra of quantities whose units differ by orders of magnitude: in units of what each row or column holds.
+"""Linear algebra of quantities whose units differ by orders of magnitude: scaled row by row and column by column.
 
 What is taken for rounding, and left out, then depends on no unit.
 """
@@ -51,8 +51,8 @@ def unit_columns(matrix: Matrix) -> tuple[Matrix, Float[np.ndarray, " _"]]:
 def root_of(matrices: Float[np.ndarray, "r n n"], least: float = 0.0) -> Float[np.ndarray, "r n b"]:
     """B with B Bᵀ the matrices, without eigenvalues below a share `least` of the largest (none: as many columns)."""
     value, vector = np.linalg.eigh(matrices)
-    kept = int((value > least * value[:, -1:]).sum(axis=1).max())
-    return vector[:, :, -kept:] * np.sqrt(np.clip(value[:, None, -kept:], 0.0, None))
+    rank = int((value > least * value[:, -1:]).sum(axis=1).max())
+    return vector[:, :, -rank:] * np.sqrt(np.clip(value[:, None, -rank:], 0.0, None))
 
 
 def of_low_rank(responses: Float[np.ndarray, "*p e k c"]) -> Float[np.ndarray, "*p e k c"]:

@@ -91,11 +91,11 @@ class Layout:
         such sets come.
         """
         planned = planned_instrument(calset, model)
-        whole = dataclasses.replace(planned, effects=(*planned.effects, *probes))
-        plan = plan_for(whole, calset.exposures, calset.filters, calset.sources)
-        if needs(whole).median:
+        probed = dataclasses.replace(planned, effects=(*planned.effects, *probes))
+        plan = plan_for(probed, calset.exposures, calset.filters, calset.sources)
+        if needs(probed).median:
             plan = with_median(plan, median_counts(calset))
-        mirrored = light.has_ghosts(whole)
+        mirrored = light.has_ghosts(probed)
         points, exposures = len(calset.points), len(calset.exposures)
         plan = dataclasses.replace(plan, work=points * exposures * sets)
         interpolated = points > limits.INTERPOLATE_ABOVE if interpolate is None else interpolate
@@ -103,20 +103,22 @@ class Layout:
         batch = min(batch or usual, points)
         allowed = limits.MEMORY if memory is None else memory
         fields = len(fields_of_stars(calset.sources))
-        each = bytes_per_point(exposures, calset.cameras, mirrored=mirrored, fields=fields)
-        kept = 2 * each * points <= allowed
+        point_bytes = bytes_per_point(exposures, calset.cameras, mirrored=mirrored, fields=fields)
+        in_memory = 2 * point_bytes * points <= allowed
         # Whole batches; and many of them, as pixels are read in whole rows of the frames.
-        most = min(
-            limits.LARGEST_SLAB, int(allowed) // (limits.READING * threads), each * points // limits.SLABS
+        slab_bytes = min(
+            limits.LARGEST_SLAB,
+            int(allowed) // (limits.READING * threads),
+            point_bytes * points // limits.SLABS,
         )
-        slab = batch * max(1, most // (each * batch))
+        slab = batch * max(1, slab_bytes // (point_bytes * batch))
         return cls(
             plan=plan,
             points=points,
             batch=batch,
             slab=slab,
-            kept=kept,
-            memory=2 * each * points if kept else limits.READING * threads * each * slab,
+            kept=in_memory,
+            memory=2 * point_bytes * points if in_memory else limits.READING * threads * point_bytes * slab,
             allowed=allowed,
             interpolated=interpolated,
             large=interpolated and points > limits.LARGE_ABOVE,
@@ -231,9 +233,9 @@ def thinned(calset: CalibrationSet, most: int, neighbours: int = limits.NEIGHBOU
     )
 
 
-def _spread(points: int, most: int, length: int) -> Int[np.ndarray, " s"]:
+def _spread(points: int, sample: int, length: int) -> Int[np.ndarray, " s"]:
     """The first points of runs spread evenly; multiples of the golden section are in step with no raster."""
-    places = np.mod(np.arange(max(1, most // length)) * 0.6180339887498949, 1.0)
+    places = np.mod(np.arange(max(1, sample // length)) * 0.6180339887498949, 1.0)
     return np.unique((places * (points // length)).astype(int)) * length
 
 
@@ -242,8 +244,8 @@ def median_counts(calset: CalibrationSet) -> Float[np.ndarray, "e k"]:
 
     Of a set with more than `limits.MEDIAN_POINTS` points, slabs spread evenly over it are enough.
     """
-    n, slab, most = len(calset.points), limits.MEDIAN_SLAB, limits.MEDIAN_POINTS
-    starts = range(0, n, slab) if n <= most else np.linspace(0, n - slab, most // slab).astype(int)
+    n, slab, limit = len(calset.points), limits.MEDIAN_SLAB, limits.MEDIAN_POINTS
+    starts = range(0, n, slab) if n <= limit else np.linspace(0, n - slab, limit // slab).astype(int)
     counts = []
     for start in starts:
         block = calset.intensities.block(int(start), min(int(start) + slab, n))
@@ -253,9 +255,9 @@ def median_counts(calset: CalibrationSet) -> Float[np.ndarray, "e k"]:
 
 def median_over_field(counts: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "e k"]:
     """Median over the field of the counts of each camera in each exposure, NaN left out; 0 where all are."""
-    seen = np.isfinite(counts[..., 0]).any(axis=0)
+    measured = np.isfinite(counts[..., 0]).any(axis=0)
     median = np.zeros(counts.shape[1:])
-    median[seen] = np.nanmedian(counts[:, seen], axis=0)
+    median[measured] = np.nanmedian(counts[:, measured], axis=0)
     return median
 
 
@@ -283,9 +285,9 @@ class PointReader:
         batches, last = [], len(block.x) - 1
         for first in range(0, len(block.x), size):
             rows = np.arange(first, first + size)
-            part = {f.name: getattr(block, f.name)[np.minimum(rows, last)] for f in dataclasses.fields(block)}
-            part["used"] &= (rows <= last)[:, None]
-            batches.append(self.point_data(Block(**part)))
+            data = {f.name: getattr(block, f.name)[np.minimum(rows, last)] for f in dataclasses.fields(block)}
+            data["used"] &= (rows <= last)[:, None]
+            batches.append(self.point_data(Block(**data)))
         return batches
 
     def point_data(self, block: Block) -> PointData:
@@ -318,7 +320,7 @@ class PointReader:
 
     @cached_property
     def _moon(self) -> tuple[np.ndarray, Vector, Vector]:
-        """Rows of the exposures of the Moon sky, and where the Moon stands then."""
+        """Rows of the exposures of the Moon sky, and the positions of the Moon then."""
         e: Exposures = self.calset.exposures
         rows = np.flatnonzero(e.direct("moon"))
         if not rows.size:
@@ -340,7 +342,7 @@ class PointReader:
 class MeasuredPoints:
     """The measurements of a set, batch by batch as `layout` cuts it; the last batch is filled up with weight 0.
 
-    They are read once if the layout keeps them in memory, else anew whenever they are gone through.
+    They are read once if the layout keeps them in memory, else anew in every pass.
     """
 
     reader: PointReader
@@ -350,8 +352,8 @@ class MeasuredPoints:
         """The batches of one slab, counted from 0."""
         if not self.layout.kept:
             return self._read(number)
-        each = self.layout.slab // self.layout.batch
-        return self._all[number * each : (number + 1) * each]
+        batches_per_slab = self.layout.slab // self.layout.batch
+        return self._all[number * batches_per_slab : (number + 1) * batches_per_slab]
 
     def _read(self, number: int) -> list[PointData]:
         size = self.layout.slab
@@ -370,8 +372,8 @@ class MeasuredPoints:
 
     def gathered(self, field: str) -> np.ndarray:
         """A field of the point data of all points in one array, without the padding: for sets that memory can hold."""
-        parts = [np.asarray(getattr(batch, field)) for batch in self]
-        return np.concatenate(parts)[: self.layout.points]
+        arrays = [np.asarray(getattr(batch, field)) for batch in self]
+        return np.concatenate(arrays)[: self.layout.points]
 
 
 @functools.lru_cache(maxsize=32)

@@ -1,4 +1,4 @@
-"""A calibration set and a model brought together: what a fit, a sampler or a diagnosis works on."""
+"""A calibration set and a model combined: the basis of fits, samplers and diagnoses."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Census(NamedTuple):
 
 
 class DataTerms(NamedTuple):
-    """χ² of the data, its half gradient and its Gauss–Newton matrix in all parameters, no priors; what was used."""
+    """χ² of the data, its half gradient and Gauss–Newton matrix in all parameters, no priors; the census."""
 
     data: float
     gradient: Vector
@@ -146,7 +146,7 @@ class PriorRows:
 
 
 def prior_rows(model: Model) -> PriorRows:
-    """All that a model says of its free parameters beforehand."""
+    """Priors and weak pulls of the free parameters of a model."""
     rows = []
     for i in model.free.tolist():
         p = model.parameters[i]
@@ -154,9 +154,9 @@ def prior_rows(model: Model) -> PriorRows:
             rows.append((i, *p.prior, True))
         elif p.loose is not None:
             rows.append((i, p.start, p.loose, False))
-    index, mean, width, known = zip(*rows, strict=True) if rows else ((), (), (), ())
+    index, mean, width, measured = zip(*rows, strict=True) if rows else ((), (), (), ())
     return PriorRows(
-        np.array(index, int), np.array(mean, float), np.array(width, float), np.array(known, bool)
+        np.array(index, int), np.array(mean, float), np.array(width, float), np.array(measured, bool)
     )
 
 
@@ -213,12 +213,12 @@ class Likelihood:
 
     def following(self, values: Vector) -> Likelihood:
         """The same with wavelength nodes that follow the retarders at a full vector of values; itself if they do."""
-        there = self.model.instrument(values)
-        if not outgrown(planned_instrument(self.calset, self.model), there, curves_of(self.calset)):
+        instrument = self.model.instrument(values)
+        if not outgrown(planned_instrument(self.calset, self.model), instrument, curves_of(self.calset)):
             return self
         return Likelihood.of(
             self.calset,
-            dataclasses.replace(self.model, template=there),
+            dataclasses.replace(self.model, template=instrument),
             memory=self.layout.allowed,
             runner=self.runner,
             interpolate=self.layout.interpolated,
@@ -311,7 +311,7 @@ class Likelihood:
     def posterior(
         self, values: Vector, terms: DataTerms, noise_scale: float, optics: OpticsUsed
     ) -> Posterior:
-        """The posterior from what the data say."""
+        """The posterior from the terms of the data."""
         rows, select, pull = self.priors, self.model.selection(), self.priors.residuals(values)
         gradient = terms.gradient / noise_scale**2
         gradient[rows.index] += pull / rows.width
@@ -353,7 +353,7 @@ class Likelihood:
 
     @cached_property
     def census(self) -> Census:
-        """Count of what is used of the set: a pass of its own; an expansion brings its own census with it."""
+        """Census of the used rows of the set, by a separate pass; an expansion brings its own census with it."""
         return self._joined("counting", self._counted)
 
     @property
@@ -377,8 +377,10 @@ class Likelihood:
         """
         instrument = self.model.instrument(values)
         nodes, _ = self.nodes(instrument)
-        parts = [engine.residuals(instrument, self.plan, batch, nodes) for batch in self.points]
-        flux, residual = (np.concatenate([np.asarray(part[i]) for part in parts]) for i in (0, 1))
+        batches = [engine.residuals(instrument, self.plan, batch, nodes) for batch in self.points]
+        flux, residual = (
+            np.concatenate([np.asarray(batch_result[i]) for batch_result in batches]) for i in (0, 1)
+        )
         return flux[: self.layout.points].mean(axis=-1), residual[: self.layout.points]
 
     def jacobian(self, values: Vector) -> Float[np.ndarray, "d f"]:
@@ -387,17 +389,17 @@ class Likelihood:
         Rows run over points, then exposures, then cameras, as in `residuals(values)[1][self.used]`.
         """
         instrument, select = self.model.instrument(values), self.model.selection()
-        parts = [
+        matrices = [
             used_rows(engine.linearised_residuals(instrument, self.plan, c)[1], c) @ select
             for c in self.points
         ]
-        return np.concatenate(parts)
+        return np.concatenate(matrices)
 
     def stokes(self, values: Vector) -> Float[np.ndarray, "p e 4"]:
         """Stokes vectors that enter the instrument, per unit flux."""
         instrument = self.model.instrument(values)
-        parts = [np.asarray(engine.incoming(instrument, self.plan, batch)) for batch in self.points]
-        return np.concatenate(parts)[: self.layout.points]
+        vectors = [np.asarray(engine.incoming(instrument, self.plan, batch)) for batch in self.points]
+        return np.concatenate(vectors)[: self.layout.points]
 
 
 def used_rows(columns: Array | np.ndarray, batch: engine.PointData) -> Float[np.ndarray, "d n"]:

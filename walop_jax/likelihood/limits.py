@@ -17,7 +17,7 @@ ACCELERATOR_BATCH = 512
 LARGE_BATCH = 1024
 """Field points whose optics are interpolated: each of them costs less, and the engine divides it further."""
 MEMORY = 2e9
-"""Bytes that point data may take unless told otherwise: half of them for a set that is kept, all for one read anew."""
+"""Default limit of the point data (bytes): half of them for a set that is kept, all for one read anew."""
 READING = 5
 """Bytes that reading takes for a moment, times those of the slab: the file, its float64, masks and a copy or two."""
 LARGEST_SLAB = 1 << 26
@@ -63,7 +63,7 @@ COMPRESSED_BLOCKS, COMPRESSED_POINTS = 6, 4
 STRIP_ROWS = 32
 """Image rows, at least, that are read together."""
 MEDIAN_POINTS = 65536
-"""Field points that the median of the counts is taken of: it is then known to half a per cent of its scatter."""
+"""Field points that the median of the counts is taken of: its error is then half a per cent of the scatter."""
 MEDIAN_SLAB = 4096
 """Field points that are read together for the median: whole rows of a frame."""
 NEIGHBOURS = 256

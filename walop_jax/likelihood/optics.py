@@ -67,12 +67,12 @@ def directions(instrument: Instrument, plan: Plan) -> Directions:
     if light.is_dispersed(instrument):
         rows = np.tile(rows, 2)
     index = np.flatnonzero(rows.any(axis=1))
-    colour, taken = [], []
+    colour, used = [], []
     for reached in rows[index]:
-        k = next((k for k, rows_taken in enumerate(taken) if not (rows_taken & reached).any()), len(taken))
-        if k == len(taken):
-            taken.append(np.zeros(rows.shape[1], bool))
-        taken[k] = taken[k] | reached
+        k = next((k for k, rows_used in enumerate(used) if not (rows_used & reached).any()), len(used))
+        if k == len(used):
+            used.append(np.zeros(rows.shape[1], bool))
+        used[k] = used[k] | reached
         colour.append(k)
     return Directions(index, np.array(colour, int), rows[index])
 
@@ -95,8 +95,8 @@ def band_rows(
 
 
 def _rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
-    values, *others = primals
-    along, rows, slopes = _slopes(values, *others)
+    values, *inputs = primals
+    along, rows, slopes = _slopes(values, *inputs)
     change = jnp.zeros_like(rows)
     if not isinstance(tangents[0], SymbolicZero):
         # Share of every direction in the change of every row.
@@ -104,8 +104,8 @@ def _rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, A
         share = share.at[along.colour].add(tangents[0][along.index][:, None] * along.reached)
         change = jnp.einsum("cr,cbrs->brs", share, slopes)
     if not all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(tangents[1:])):
-        rest = jax.tree.map(_instantiated, tangents[1:], is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
-        change = change + jax.jvp(lambda *o: band_rows.fun(values, *o), tuple(others), rest)[1]
+        steps = jax.tree.map(_instantiated, tangents[1:], is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
+        change = change + jax.jvp(lambda *o: band_rows.fun(values, *o), tuple(inputs), steps)[1]
     return rows, change
 
 
@@ -170,11 +170,11 @@ def linearised(
     """A quantity of all parameters and the local throughputs, and its derivatives at those of an instrument."""
     values, plain = values_of(instrument), plain_positions(instrument)
     value, push = jax.linearize(quantity, values, local)
-    each = jnp.eye(local.size).reshape(-1, *local.shape)
+    unit_steps = jnp.eye(local.size).reshape(-1, *local.shape)
     return LocalDerivatives(
         value,
         jax.vmap(lambda change: push(change, jnp.zeros_like(local)))(jnp.eye(values.size)[plain]),
-        jax.vmap(lambda change: push(jnp.zeros_like(values), change))(each),
+        jax.vmap(lambda change: push(jnp.zeros_like(values), change))(unit_steps),
     )
 
 

@@ -20,7 +20,7 @@ import jax
 from walop_jax.model.compiled import float64, usual_threads
 
 Progress = Callable[[str], None]
-"""Is given a line about what is being done."""
+"""Receives a line on the progress of the work."""
 
 TOLD_EVERY = 1.0  # s
 
@@ -39,7 +39,7 @@ class Runner:
         return vars(dataclasses.replace(self, progress=None))
 
     def tell(self, text: str) -> None:
-        """Report what is being done, if progress is wanted."""
+        """Report progress, if somebody listens."""
         if self.progress is not None:
             self.progress(text)
 
@@ -51,9 +51,9 @@ class Runner:
         began = last = time.perf_counter()
         with contextlib.closing(self._each(-(-points // slab), work)) as results:
             for count, result in enumerate(results, start=1):
-                now = time.perf_counter()
-                if now - last > TOLD_EVERY:
-                    last, ready, rate = now, min(count * slab, points), count * slab / (now - began)
+                time_now = time.perf_counter()
+                if time_now - last > TOLD_EVERY:
+                    last, ready, rate = time_now, min(count * slab, points), count * slab / (time_now - began)
                     self.tell(
                         f"{label}: {ready:,} of {points:,} points, {rate:,.0f} points/s, "
                         f"{(points - ready) / rate:.0f} s left of this pass"

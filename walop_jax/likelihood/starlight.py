@@ -26,15 +26,15 @@ def added_to_starlight(
     columns: Columns, changes: Sequence[Change], exposure: int
 ) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
     """Analysis vectors at the field points in the setting of an exposure, and what one unit of each change adds."""
-    each = [columns.terms_of(change) for change in changes]
-    slots = {part.slot for parts in each for part in parts}
+    changed_terms = [columns.terms_of(change) for change in changes]
+    slots = {term.slot for terms in changed_terms for term in terms}
     light = sorted(slot for slot in slots if slot[0] == "light" and slot[2] == "ahead of")
     ahead = generators_ahead(columns.patched, light)
-    points, size, found = len(columns.likelihood.used), limits.RESPONSES_TOGETHER, []
+    points, size, batches = len(columns.likelihood.used), limits.RESPONSES_TOGETHER, []
     for start in range(0, points, size):
-        parts = _at_points(ResponseBlock(columns, start, ()), each, exposure, ahead)
-        found.append(tuple(part[: points - start] for part in parts))
-    vectors, added = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        terms = _at_points(ResponseBlock(columns, start, ()), changed_terms, exposure, ahead)
+        batches.append(tuple(term[: points - start] for term in terms))
+    vectors, added = (np.concatenate(terms) for terms in zip(*batches, strict=True))
     return vectors, added
 
 
@@ -44,14 +44,14 @@ def _at_points(
     exposure: int,
     ahead: Mapping[Slot, np.ndarray],
 ) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
-    every, band = np.arange(len(block.x)), block.band[:, exposure]
-    vectors = np.asarray(block.found.vectors.vectors)[every, 0, band]  # p k 4
+    points, band = np.arange(len(block.x)), block.band[:, exposure]
+    vectors = np.asarray(block.found.vectors.vectors)[points, 0, band]  # p k 4
     added = np.zeros((*vectors.shape[:-1], 3, len(changes)))
     at = InExposures(block.of.exposures, block.x[:, None], block.y[:, None])
-    for a, parts in enumerate(changes):
-        for slot, coefficient, factors in parts:
+    for a, terms in enumerate(changes):
+        for slot, coefficient, factors in terms:
             if slot in block.of.of_vectors:
-                change = block.change(slot)[every, 0, band]
+                change = block.change(slot)[points, 0, band]
             elif slot in ahead:
                 change = vectors @ ahead[slot]
             elif slot[0] == "counts":
@@ -68,12 +68,12 @@ def _for_stars(
 ) -> Float[np.ndarray, " p"]:
     """Product of factors for stars in the setting of an exposure: at its time, temperature and angles nothing grows."""
     points, product = len(at.x), np.ones(len(at.x))
-    for one in factors:
-        if not isinstance(one, str):
+    for name in factors:
+        if not isinstance(name, str):
             shape = (points, len(at.number))
-            product = product * np.broadcast_to(one(at), shape)[:, exposure]
-        elif (known := factor(one)).depends_on == FIELD:
-            product = product * np.broadcast_to(known.value(at, units), (points, 1))[:, 0]
+            product = product * np.broadcast_to(name(at), shape)[:, exposure]
+        elif (field_factor := factor(name)).depends_on == FIELD:
+            product = product * np.broadcast_to(field_factor.value(at, units), (points, 1))[:, 0]
         else:
             return np.zeros(points)
     return product

@@ -1,4 +1,4 @@
-"""Normal equations of many nights under laws of time: pure linear algebra, which knows no instrument.
+"""Normal equations of many nights under laws of time: pure linear algebra, without any instrument.
 
 A unit (the exposures of one file in one night) says of the values θ of all parameters, counted from a common origin,
 

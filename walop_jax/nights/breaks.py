@@ -154,10 +154,10 @@ class Tried(NamedTuple):
             return 1.0
         after = np.vstack([step[1:], np.zeros_like(step[:1])])
 
-        def correlation(one: Any, other: Any, rest: Any) -> Any:
-            product = one * other
-            found = (one + other - rest) / (2.0 * np.sqrt(np.where(product > 0, product, 1.0)))
-            return np.where(product > 0, np.abs(found), 0.0)
+        def correlation(first: Any, second: Any, between: Any) -> Any:
+            product = first * second
+            correlations = (first + second - between) / (2.0 * np.sqrt(np.where(product > 0, product, 1.0)))
+            return np.where(product > 0, np.abs(correlations), 0.0)
 
         beside = np.maximum(correlation(step, once, after), correlation(after, once, step))
         rho = np.concatenate([correlation(step, after, once).ravel(), beside.ravel()])
@@ -261,7 +261,7 @@ def _largest(
     catalogue: Sequence[EffectKind],
     carried: Carried | None,
 ) -> Break | None:
-    """The change that stands out most, of those alike the first that is carried; None where chance does as well."""
+    """The most significant change, of those alike the first that is carried; None where chance does as well."""
     tried = Tried.of(solution).without(_other_shapes(data, solution.system.laws))
     kind, cell, i = tried.largest()
     z = tried.z(kind)

@@ -51,7 +51,7 @@ SIDEREAL = 1.00273791  # sidereal hours in an hour
 CLOCK = (
     0.2,
     0.05,
-)  # hours by which hour angles disagree with MJD, and their scatter, that tell of another clock
+)  # hours by which hour angles disagree with MJD, and their scatter: signs of another clock
 
 Vector = Float[np.ndarray, " _"]
 

@@ -126,7 +126,7 @@ class Survey(Displayed):
 
     @property
     def trusted(self) -> bool:
-        """True if nothing that speaks against it forbids its use."""
+        """True if no doubt about it forbids its use."""
         return self.verdict.trusted
 
     # ---------------------------------------------------------------------------------------------- at a moment

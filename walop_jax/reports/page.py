@@ -375,7 +375,7 @@ def _doubts(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _warnings(run: RunContents) -> tuple[str, ...]:
-    """All that speaks against the fit, and what its data would not have shown."""
+    """All doubts about the fit, and mistakes that its data would not have shown."""
     summary, sentences = run.summary, ()
     if summary["misfit"]:
         sentences = summary["misfit"].get("sentences", ())
@@ -444,7 +444,7 @@ def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
 
 
 def in_greek(text: str) -> str:
-    """A combination as FITS spells it, with the signs it stands for."""
+    """A combination as spelled in FITS, and its signs."""
     text = re.sub(r"(?<=\d) theta", "θ", text)
     return text.replace("theta", "θ").replace(" deg", "°").replace(" - ", " − ")
 

@@ -58,7 +58,7 @@ def unit_in_words(unit: str) -> str:
 def informed(
     names: Sequence[str], spread: Mapping[str, float], prior: Mapping[str, float]
 ) -> tuple[str, ...]:
-    """The names of which the data say something, most first: posterior narrower than the prior, where there is one.
+    """The names constrained by the data, best first: posterior narrower than the prior, where there is one.
 
     `spread` holds standard deviations of the posterior, `prior` those of the prior (NaN: none).
     """

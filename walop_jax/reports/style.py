@@ -97,7 +97,7 @@ class Canvas:
             raise TypeError(f"ax: give one Axes of matplotlib, for instance ax=axes[0, 0], not {kind}")
 
     def figure(self, width: float, height: float) -> Any:
-        """An empty figure; usual sizes in inches. Raises ValueError for axes that stand in no grid."""
+        """An empty figure; usual sizes in inches. Raises ValueError for axes outside a grid."""
         if self.ax is None:
             pad = 0.05 if self.width is None else 0.02
             layout = ConstrainedLayoutEngine(h_pad=pad + 0.01, w_pad=pad)

@@ -133,7 +133,7 @@ def names_in_words(names: Iterable[str]) -> str:
 
 
 def symbols_in_words(names: Sequence[str]) -> str:
-    """The symbols that figures of a posterior use, with the names they stand for."""
+    """The symbols that figures of a posterior use, and their names."""
     greek = {"\\delta": "δ", "\\kappa": "κ", "\\eta": "η", "\\ln": "ln"}
     symbols = []
     for name in names:

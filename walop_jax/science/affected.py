@@ -168,7 +168,7 @@ def shift(before: Stars, after: Stars) -> Float[np.ndarray, " s"]:
 
 
 def verdicts_differ(before: Stars, after: Stars) -> bool:
-    """True where one of the calibrations says of all stars that it is not to be trusted, and the other does not."""
+    """True if the bits of the verdicts, common to all stars, differ between the calibrations."""
     bad = Quality.NOT_CONVERGED | Quality.UNEXPLAINED
     first, second = (int(np.bitwise_and.reduce(stars.flag)) & bad for stars in (before, after))
     return first != second

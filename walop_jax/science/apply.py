@@ -323,7 +323,7 @@ class _Application:
     # ------------------------------------------------------------------------------ the catalogue as a whole
 
     def sample(self, most: int) -> Bool[np.ndarray, " s"]:
-        """Stars that stand for the catalogue, about `most` rows of them, spread by multiples of the golden section."""
+        """A sample of the stars, about `most` rows of them, spread by multiples of the golden section."""
         stars = np.arange(self.catalogue.star.max() + 1)
         return np.mod(stars * 0.6180339887498949, 1.0) < most / len(self.catalogue)
 

@@ -25,7 +25,7 @@ _ROUNDS = 16
 
 
 def linearised(calibration: Calibration, counts: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-    """Counts as linear detectors would report them, where the calibration knows their response."""
+    """Counts as linear detectors would report them, where the calibration has their response."""
     instrument = calibration.model.instrument(calibration.values)
     if light.is_linear(instrument):
         return counts

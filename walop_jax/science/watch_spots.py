@@ -36,7 +36,7 @@ def profile(x: Float[np.ndarray, " r"], y: Float[np.ndarray, " r"], place: Place
 
 
 class SpotFound(NamedTuple):
-    """A spot that stands out: T, the number of the camera or arm, and (x, y, R in degrees, m)."""
+    """A significant spot: T, the number of the camera or arm, and (x, y, R in degrees, m)."""
 
     strength: float
     unit: int
