@@ -248,6 +248,7 @@ def test_results_go_through_pickle_into_another_process(fitted: FittedSet, tmp_p
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     told = subprocess.run(
         [sys.executable, "-c", code, *whole],
+        check=False,
         cwd=tmp_path,
         env=environment,
         capture_output=True,

@@ -99,15 +99,8 @@ def calibration_of(given: Product, effects: Effects = None) -> Calibration:
     from walop_jax.calibration.calibration import Calibration
     from walop_jax.calibration.product import read_calibration
 
-<<<<<<< HEAD
-    held: Any = fit_of(given)
-    if isinstance(held, Fitted) and not hasattr(held, "folder"):  # a `Run` is read again
-        there = held if isinstance(held, Calibration) else Calibration.from_fit(held)  # pyright: ignore[reportArgumentType]
-        return there if there.path is not None else dataclasses.replace(there, path=Path(IN_MEMORY))
-    return read_calibration(folder_of(held), catalogue_of(effects))
-=======
     source: Any = fit_of(given)
-    if isinstance(source, Fitted):
+    if isinstance(source, Fitted) and not hasattr(source, "folder"):  # a `Run` is read again
         calibration = source if isinstance(source, Calibration) else Calibration.from_fit(source)  # pyright: ignore[reportArgumentType]
         return (
             calibration
@@ -115,7 +108,6 @@ def calibration_of(given: Product, effects: Effects = None) -> Calibration:
             else dataclasses.replace(calibration, path=Path(IN_MEMORY))
         )
     return read_calibration(folder_of(source), catalogue_of(effects))
->>>>>>> h-w3
 
 
 def folder_of(run: Run | PathLike) -> Path:
