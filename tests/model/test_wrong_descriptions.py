@@ -123,7 +123,7 @@ WRONG = {
     ),
     "camera behind no analyser": (
         ('["left", "right"]', '["left", "right", "third"]'),
-        r"\[cameras\] every camera must stand",
+        r"\[cameras\] every camera must be behind exactly one analyser",
     ),
     "one camera of two": (
         ('cameras = ["right", "left"]\n', 'cameras = ["right"]\n'),
