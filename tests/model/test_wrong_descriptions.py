@@ -109,7 +109,7 @@ WRONG = {
     "path": (('"window"]', '"windw"]'), r"\[elements\] path names 'windw', which is not described.*window"),
     "not in the path": (
         ('"polariser", "window"]', '"polariser"]'),
-        r"\[elements\.window\] is described but does not",
+        r"\[elements\.window\] is described but missing from the path",
     ),
     "path of an arm": (('"plate", "an', '"plat", "an'), r"\[arms\.main\.elements\] path names 'plat'.*plate"),
     "twice in the path": (('"window"]', '"window", "window"]'), r"path names something twice"),

@@ -100,14 +100,16 @@ def calibration_of(given: Product, effects: Effects = None) -> Calibration:
     from walop_jax.calibration.product import read_calibration
 
     source: Any = fit_of(given)
-    if isinstance(source, Fitted) and not hasattr(source, "folder"):  # a `Run` is read again
-        calibration = source if isinstance(source, Calibration) else Calibration.from_fit(source)  # pyright: ignore[reportArgumentType]
-        return (
-            calibration
-            if calibration.path is not None
-            else dataclasses.replace(calibration, path=Path(IN_MEMORY))
-        )
-    return read_calibration(folder_of(source), catalogue_of(effects))
+    if not _is_in_memory(source):
+        return read_calibration(folder_of(source), catalogue_of(effects))
+    calibration = source if isinstance(source, Calibration) else Calibration.from_fit(source)
+    in_memory = calibration.path is None
+    return dataclasses.replace(calibration, path=Path(IN_MEMORY)) if in_memory else calibration
+
+
+def _is_in_memory(source: Any) -> bool:
+    """True for a fit or a calibration; the product of a `Run` is read from its folder."""
+    return isinstance(source, Fitted) and not hasattr(source, "folder")
 
 
 def folder_of(run: Run | PathLike) -> Path:
