@@ -178,7 +178,10 @@ def draw(rng: np.random.Generator, calset: CalibrationSet) -> Hidden:
         star = 0.0
     size = 10.0 ** rng.uniform(-3.6, -2.1)
     made, colour = generators(rng), over_colour(rng)
-    if min(field(*np.meshgrid(EDGES, EDGES)).min(), colour(BAND).min(), values.min()) < 0.0:
+    if (
+        min(field(*(e.ravel() for e in np.meshgrid(EDGES, EDGES))).min(), colour(BAND).min(), values.min())
+        < 0.0
+    ):
         made[np.diag_indices(4)] = 0.0  # a depolariser with the other sign would polarise
     text = f"{where}, {field_name}, {law_name}, {size:.1e}"
     return Hidden(
