@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from small_run import small_fit
 
+from walop_jax.diagnosis.candidate_scores import candidate_scores
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.score import corrected_p
-from walop_jax.diagnosis.sentence_scores import sentence_scores
 from walop_jax.model.effects import EFFECTS
 
 
@@ -20,7 +20,7 @@ def test_a_fit_and_a_diagnosis_score_alike():
     diagnosed = examine(
         result, listed.names, np.random.default_rng(0), None, listed.sentences, listed.parts
     ).table
-    fitted = sentence_scores(Design.of(result))
+    fitted = candidate_scores(Design.of(result))
     assert {score.name for score in fitted.scores} <= {score.name for score in diagnosed.scores}
     assert len(fitted.scores) > 0.9 * len(diagnosed.scores)  # patterns have scores of their own
     assert fitted.trials == pytest.approx(diagnosed.trials, rel=0.5)

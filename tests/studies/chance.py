@@ -37,8 +37,13 @@ def relative_errors(calibration: walop.Calibration) -> np.ndarray:
     seen = np.abs(np.linalg.det(matrix[:, :, 1:])) >= 0.1
     inverse = np.linalg.inv(matrix[seen][:, :, 1:])
     of_stars = np.einsum("pij,pjkf,pk->pif", inverse, slopes[seen], star[seen])
-    value, vector = np.linalg.eigh(calibration.covariance)
-    along = of_stars @ (vector * np.sqrt(np.clip(value, 0.0, None)))
+    return relative(of_stars, calibration.covariance)
+
+
+def relative(slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Errors (place, quantity, direction) of unit normal numbers, over the stated ones, by slopes in parameters."""
+    value, vector = np.linalg.eigh(covariance)
+    along = slopes @ (vector * np.sqrt(np.clip(value, 0.0, None)))
     return along / np.linalg.norm(along, axis=2, keepdims=True)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from studies.chance import relative
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import matrix_slopes
@@ -60,12 +61,9 @@ def _chance(
     """Share of draws from the covariance of a calibration that are `wrong`; `slope` gives q, u of the stars."""
     instrument = calibration.model.instrument(calibration.values)
     _, slopes = matrix_slopes(instrument, setting, calibration.filters, one.x, one.y)
-    value, vector = np.linalg.eigh(calibration.covariance)
-    elements = np.asarray(slopes).reshape(len(one.x), 6, -1)[seen] @ (
-        vector * np.sqrt(np.clip(value, 0.0, None))
-    )
-    stars = np.einsum("pia,paf->pif", slope, elements)
-    elements, stars = (a / np.linalg.norm(a, axis=2, keepdims=True) for a in (elements, stars))
+    of_elements = np.asarray(slopes).reshape(len(one.x), 6, -1)[seen]
+    of_stars = np.einsum("pia,paf->pif", slope, of_elements)
+    elements, stars = (relative(a, calibration.covariance) for a in (of_elements, of_stars))
     draws = np.random.default_rng(6).standard_normal((DRAWS, elements.shape[2]))
     return float(np.mean([_wrong(stars @ draw, elements @ draw) for draw in draws]))
 

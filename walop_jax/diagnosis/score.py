@@ -324,17 +324,8 @@ class ScoreSpace:
         if not self._root.rank:
             return np.zeros(0)
         # Scores s = L n have covariance G for unit normals n. Seven digits are plenty for what is only counted.
-        root = self._root.whole
-        places = self.places()
-        maps = [root[places[name]].T @ w for name, w in self.whitened.items() if w.shape[1]]
-        normal = rng.standard_normal((draws, root.shape[1]), dtype=np.float32)
-        squares = (normal @ np.concatenate(maps, axis=1).astype(np.float32)) ** 2
-        smallest, first = np.zeros(draws), 0
-        for rank in (m.shape[1] for m in maps):
-            statistic = squares[:, first : first + rank].sum(axis=1)
-            np.minimum(smallest, _log_survival(statistic, rank), out=smallest)
-            first += rank
-        return smallest
+        root = self._root.whole.astype(np.float32)
+        return self.smallest_of(root @ rng.standard_normal((draws, root.shape[1]), dtype=np.float32).T)
 
     def smallest_of(self, drawn: Float[np.ndarray, "a d"]) -> Vector:
         """ln of the smallest p among all candidates in each draw of the scores C̃ᵀr, for noise of unit size."""

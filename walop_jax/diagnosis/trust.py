@@ -14,7 +14,7 @@ Components  the variance of what field points, exposures, states, standards, nig
             model, finer than any pattern (`variance_components`).
 Conditions  the efficient score of every number that the set states of itself: field, filters, colours, sky; of every
             prior, term of a camera and effect of the catalogue (`stated_conditions`).
-Descriptions  the efficient score of all that a diagnosis could say is missing (`sentence_scores`).
+Candidates  the efficient score of every effect and description of a diagnosis (`candidate_scores`).
 Repeats     the correlation of what is left of two exposures (`repeated_noise`).
 Errors      χ²/dof far below 1: N_ERR is overestimated. A few per cent are attributed to the stated errors,
             not to the model.
@@ -37,12 +37,12 @@ from jaxtyping import Bool
 from scipy import special
 
 from walop_jax.diagnosis import thresholds
+from walop_jax.diagnosis.candidate_scores import candidate_doubts
 from walop_jax.diagnosis.design import Design, pattern_scores
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.readings import refuse_dead_cameras, refuse_mixups
 from walop_jax.diagnosis.repeated_noise import repeated_noise
 from walop_jax.diagnosis.score import Projector, ScoreTable, local_p
-from walop_jax.diagnosis.sentence_scores import described_doubts
 from walop_jax.diagnosis.stated_conditions import Singles, stated_conditions
 from walop_jax.diagnosis.variance_components import (
     VarianceComponent,
@@ -105,7 +105,7 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
         doubts = (
             *stated_conditions(design, singles),
             *_patterns(table),
-            *described_doubts(design, seed),
+            *candidate_doubts(design, seed),
             *in_words(components),
             *_groups(design),
             *repeated_noise(design),

@@ -1,9 +1,8 @@
-"""The scores of all effects and descriptions against a fit: what a diagnosis would find, the fit is asked as well.
+"""Scores of all effects and descriptions against a fit, for its verdict.
 
-The list is that of a diagnosis (`grammar.hypotheses`). The score of a candidate needs of the design the products of its
-own columns with each other, the residuals and the projection alone; so the columns are made some at a time, and nothing
-is kept of them but their scores in draws of noise. These give the number of independent trials, as in a diagnosis, so
-that both correct p alike.
+The list is that of a diagnosis (`grammar.hypotheses`). Only products of the columns of a candidate with each other, the
+residuals and the projection are needed, so the columns are made in batches. Their scores in draws of noise give the
+number of independent trials, as in a diagnosis, so that both correct p alike.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ from walop_jax.diagnosis.hypotheses import Probe, all_candidates
 from walop_jax.diagnosis.score import ScoreSpace, ScoreTable, effective_trials
 from walop_jax.model.effects import Described
 
-TOGETHER = 1e8  # numbers of columns that are there at a time
+TOGETHER = 1e8  # numbers in the columns of a batch
 DRAWS = 200  # of noise: a fifth of them give the number of trials to 16 %
 _SHOWN = 3
 
 
-def sentence_scores(design: Design, seed: int = 0) -> ScoreTable:
-    """The scores of all that a model may lack, effects and descriptions, with their corrected p."""
+def candidate_scores(design: Design, seed: int = 0) -> ScoreTable:
+    """Scores of all effects and descriptions that a model may lack, with their corrected p."""
     fit = design.fit
     calset: CalibrationSet = fit.calset
     listed = grammar.hypotheses(fit.model.catalogue, fit.model.template, calset.exposures, len(calset.points))
@@ -35,27 +34,29 @@ def sentence_scores(design: Design, seed: int = 0) -> ScoreTable:
     probes = (*absent, *listed.sentences, *(probe for probe, _ in listed.parts))
     residual = design.projector(design.residual)
     noise = float(np.sqrt(residual @ residual / max(design.projector.free, 1))) or 1.0
-    names: list[str] = []
-    sizes: list[int] = []
-    blocks: list[tuple[np.ndarray, ...]] = []
     normal = np.random.default_rng(seed).standard_normal((len(residual), DRAWS), dtype=np.float32)
-    normal -= (design.projector.basis @ (design.projector.basis.T @ normal)).astype(np.float32)
+    normal = design.projector(normal).astype(np.float32)
+    scored: list[Probe] = []
+    blocks: list[tuple[np.ndarray, ...]] = []
     for batch in _batches(probes, len(design.residual)):
         for probe, columns in _columns(design, batch):
             c = columns.astype(float) / fit.noise_scale
             along = design.projector.basis[: len(c)].T @ c
             square = c.T @ c
-            names.append(probe.name)
-            sizes.append(c.shape[1])
             drawn = c.T.astype(np.float32) @ normal[: len(c)]
-            blocks.append(
-                (probe.widths, np.diag(square), c.T @ residual[: len(c)], drawn, square - along.T @ along)
-            )
-    if not names:
+            scored.append(probe)
+            blocks.append((np.diag(square), c.T @ residual[: len(c)], drawn, square - along.T @ along))
+    if not scored:
         return ScoreTable((), noise, 1.0, 1.0)
-    widths, before, scores, drawn = (np.concatenate(arrays) for arrays in list(zip(*blocks, strict=True))[:4])
-    gram = np.asarray(linalg.block_diag(*(block for *_, block in blocks)))
-    space = ScoreSpace(tuple(names), tuple(sizes), widths, before, gram, design.projector.free)
+    before, scores, drawn = (np.concatenate(arrays) for arrays in list(zip(*blocks, strict=True))[:3])
+    space = ScoreSpace(
+        names=tuple(probe.name for probe in scored),
+        sizes=tuple(len(probe.widths) for probe in scored),
+        widths=np.concatenate([probe.widths for probe in scored]),
+        before=before,
+        gram=np.asarray(linalg.block_diag(*(block for *_, block in blocks))),
+        free=design.projector.free,
+    )
     trials = effective_trials(space.smallest_of(drawn))
     return space.table_after(ScoreTable((), noise, 1.0, trials), scores)
 
@@ -80,9 +81,9 @@ def _columns(design: Design, batch: list[Probe]) -> Iterator[tuple[Probe, np.nda
     yield from ((probe, candidates[probe.name].columns) for probe in batch if probe.name in candidates)
 
 
-def described_doubts(design: Design, seed: int = 0) -> Iterator[str]:
-    """A sentence if effects or descriptions of what may be missing explain more than noise does."""
-    table = sentence_scores(design, seed)
+def candidate_doubts(design: Design, seed: int = 0) -> Iterator[str]:
+    """A sentence if a missing effect or description explains more than noise does."""
+    table = candidate_scores(design, seed)
     if table.p_global >= thresholds.ALARM:
         return
     names = table.significant(thresholds.ALARM, _SHOWN)
