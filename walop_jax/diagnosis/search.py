@@ -102,7 +102,9 @@ def refused(evidence: Evidence, trial: Trial) -> str:
         return "its fit did not converge"
     if not trial.predicts:
         return "by its linear step it does not predict settings and field points that it has not seen"
-    worth, needed = trial.evidence / evidence.floor**2, evidence.evidence_needed
+    # Linear evidence counts in the scatter behind all candidates already, that of fits in the errors as stated.
+    unit = 1.0 if trial.fit is None else evidence.floor**2
+    worth, needed = trial.evidence / unit, evidence.evidence_needed
     if worth <= needed:
         return f"ln B = {worth:.3g} is not above {needed:.3g}"
     explained, least = evidence.chi2 - trial.left, _least_explained(evidence, trial)
