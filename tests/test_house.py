@@ -197,7 +197,7 @@ MOST_LINES = {
     "nights": 2810,
     "plans": 2370,
     "paper": 870,
-    "reports": 3040,
+    "reports": 3090,
     "commands": 4795,
 }
 """Lines of each room: raising one is a decision of its own."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -29,8 +29,6 @@ from walop_jax.model.effects.change import AMPLITUDES, Change, patched
 from walop_jax.model.effects.optics import SOURCE
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import param, unknown_name
-
-Amplitudes = Sequence[float] | Float[np.ndarray, " a"]
 
 
 def _amplitude(name: str) -> Any:
@@ -64,14 +62,14 @@ class Described(Effect):
     separated_by: ClassVar[str] = "exposures in which its dependence differs from that of the others"
 
     @classmethod
-    def neutral(cls, context: Context) -> Described:
+    def neutral(cls, context: Context) -> Self:
         """Nothing described."""
         return cls.of(context)
 
     @classmethod
-    def of(cls, context: Context, **values: Any) -> Described:
+    def of(cls, context: Context, **values: Any) -> Self:
         """Descriptions with some values, zero elsewhere. Raises ValueError for an invalid description."""
-        neutral = _without_size(tuple(values.pop("sentences", ())))
+        neutral: Any = _without_size(tuple(values.pop("sentences", ())))
         if unknown := sorted(set(values) - set(AMPLITUDES)):
             raise unknown_name(f"parameter of {cls.name}", unknown[0], (*AMPLITUDES, "sentences"))
         like = {name: getattr(neutral, name) for name in values}
@@ -79,12 +77,12 @@ class Described(Effect):
         return dataclasses.replace(neutral, **sizes) if sizes else neutral
 
     @classmethod
-    def combine(cls, group: Sequence[Any], amplitudes: Amplitudes) -> Described:
+    def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
         """One effect of members with a change each."""
         return cls.saying([text for member in group for text in member.sentences], amplitudes)
 
     @classmethod
-    def saying(cls, sentences: Sequence[str], amplitudes: Amplitudes) -> Described:
+    def saying(cls, sentences: Sequence[str], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
         """Descriptions with their amplitudes, in the same order."""
         held: dict[str, list[float]] = {}
         for text, amplitude in zip(sentences, amplitudes, strict=True):
