@@ -107,7 +107,7 @@ class Shape(NamedTuple):
 
 
 class Classes(NamedTuple):
-    """What a diagnosis leaves open: classes of its additions that have other members, and shapes of descriptions."""
+    """Ambiguities of a diagnosis: classes of its additions that have other members, and shapes of descriptions."""
 
     additions: tuple[ClassOf, ...] = ()
     shape: Shape | None = None
@@ -259,13 +259,6 @@ def _positive(matrix: Matrix) -> Matrix:
 
 def only_a_class(classes: Classes) -> Iterator[str]:
     """A sentence on each class whose members differ by so much that nothing of it may be trusted, and on shapes."""
-    shape = classes.shape
-    if shape is not None and _dominates(shape.spread, shape.stated):
-        yield (
-            "the cause was described, not named: over the field, over the exposures and in its kind of polarisation it "
-            f"may differ from the description (p by {two_digits(100 * shape.spread)} %, median, where the errors of "
-            f"the fit are {two_digits(100 * shape.stated)} %)"
-        )
     for group in classes.additions:
         if not (_dominates(group.spread, group.stated) or group.off > FAR):
             continue
@@ -275,6 +268,13 @@ def only_a_class(classes: Classes) -> Iterator[str]:
             f"with different effects on stars (p by {two_digits(100 * group.spread)} %, median, where the "
             f"errors of the fit are {two_digits(100 * group.stated)} %; elements of the matrix by up to "
             f"{two_digits(group.off)} errors): {_deciding(group)}"
+        )
+    shape = classes.shape
+    if shape is not None and _dominates(shape.spread, shape.stated):
+        yield (
+            "the cause was described, not named: over the field, over the exposures and in its kind of polarisation it "
+            f"may differ from the description (p by {two_digits(100 * shape.spread)} %, median, where the errors of "
+            f"the fit are {two_digits(100 * shape.stated)} %)"
         )
 
 
