@@ -18,13 +18,16 @@ NAMES = ("clp_zero", "rotator_zero", "lens_birefringence")
 SHARED = 0.97  # cosine between the first two names
 
 
-def evidence(amplitudes, seed=1):
-    """Two names that are much alike, a third one and a pattern beside a base of two parameters."""
+def evidence(amplitudes, seed=1, noise=1.0):
+    """Two names that are much alike, a third one and a pattern beside a base of two parameters.
+
+    `noise` is that of the data, where errors were scaled to 1.
+    """
     rng = np.random.default_rng(seed)
     base, columns = rng.standard_normal((ROWS, 2)), rng.standard_normal((ROWS, 4))
     columns /= np.linalg.norm(columns, axis=0)
     columns[:, 1] = SHARED * columns[:, 0] + np.sqrt(1.0 - SHARED**2) * columns[:, 1]
-    residual = rng.standard_normal(ROWS) - columns[:, : len(amplitudes)] @ amplitudes
+    residual = noise * rng.standard_normal(ROWS) - columns[:, : len(amplitudes)] @ amplitudes
     projector = Projector(base)
     residual = projector(residual)
     names, each = [*NAMES, PATTERN], np.split(columns, 4, axis=1)
@@ -92,3 +95,20 @@ def test_what_a_pattern_explains_better_is_not_given_a_name():
 def test_the_search_ends_after_the_steps_that_it_has(monkeypatch):
     monkeypatch.setattr(thresholds, "MOST_STEPS", 1)
     assert len(names(evidence([25.0, 0.0, 20.0]), Linear())) == 1
+
+
+def test_patterns_are_compared_with_fits_in_the_unit_of_fits():
+    """Errors were scaled by 5: a fit has ln B = ½ s²/(1 + w⁻²) − ½ ln(1 + w²), a linear step 25 times as much.
+
+    What explains all but the noise is refused for a pattern that explains less of it, were the units different.
+    """
+    here = evidence([12.0, 0.0, 0.0, 5.0], noise=0.2)
+    best = here.table[PATTERN]
+    along = float(here.scores[-1] / np.sqrt(here.space.gram[-1, -1]))
+    width = 10.0 * float(np.sqrt(here.space.gram[-1, -1]))
+    exact = 0.5 * along**2 / (1.0 + width**-2.0) - 0.5 * np.log(1.0 + width**2)
+    assert here.best_pattern(fitted=True) == pytest.approx(exact, abs=2.0)
+    assert here.best_pattern() == pytest.approx(best.log_bayes)
+    assert here.best_pattern() > 20.0 * exact
+    assert here.stands((), exact + 1.0, fitted=True)
+    assert not here.stands((), exact + 1.0)

@@ -102,7 +102,8 @@ def refused(evidence: Evidence, trial: Trial) -> str:
         return "its fit did not converge"
     if not trial.predicts:
         return "by its linear step it does not predict settings and field points that it has not seen"
-    worth, needed = trial.evidence / evidence.floor**2, evidence.evidence_needed
+    fitted, needed = trial.fit is not None, evidence.evidence_needed
+    worth = trial.evidence / evidence.floor**2 if fitted else trial.evidence
     if worth <= needed:
         return f"ln B = {worth:.3g} is not above {needed:.3g}"
     explained, least = evidence.chi2 - trial.left, _least_explained(evidence, trial)
@@ -111,8 +112,9 @@ def refused(evidence: Evidence, trial: Trial) -> str:
         return f"it explains {explained:.4g} of {missing:.4g} that are missing in χ², less than {least:.4g}"
     # What is left is noise, and was not before: a pattern can only say the same with more numbers.
     suffices = trial.noise and not explains(evidence.chi2, evidence.dof)
-    if not suffices and not _stands(evidence, trial, worth):
-        return f"a pattern without a name is more probable (ln B = {evidence.best_pattern:.3g}, its own {worth:.3g})"
+    if not suffices and not _stands(evidence, trial):
+        best = evidence.best_pattern(fitted=fitted)
+        return f"a pattern without a name is more probable (ln B = {best:.3g}, its own {trial.evidence:.3g})"
     before, after = (trial.compared.get(f"heldout_{when}", np.nan) for when in ("before", "after"))
     if after >= before:
         return (
@@ -132,12 +134,12 @@ def _least_explained(evidence: Evidence, trial: Trial) -> float:
     return max(least, thresholds.LEAST_SHARE_OF_NAME * surely)
 
 
-def _stands(evidence: Evidence, trial: Trial, worth: float) -> bool:
+def _stands(evidence: Evidence, trial: Trial) -> bool:
     """True if no pattern without a name is clearly more probable."""
     probes = [probe for probe in evidence.probes if probe.effect is trial.effect]
     if not probes and trial.effect is not Described:  # what has no linear step
         return True
-    return evidence.stands(probes, worth)
+    return evidence.stands(probes, trial.evidence, fitted=trial.fit is not None)
 
 
 def hopeless(evidence: Evidence, trial: Trial) -> str:
@@ -169,7 +171,7 @@ def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
         remaining,
         explains(remaining, evidence.dof - item.score.rank),
         item=item,
-        linear=item.log_bayes + 0.5 * statistic * (noise**2 - 1.0),
+        linear=item.log_bayes + evidence.by_fit(item.score),
     )
 
 
