@@ -11,7 +11,7 @@ from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import Projector, ScoreSpace
 from walop_jax.diagnosis.search import State, search
-from walop_jax.model.effects import Context, effect_by_name
+from walop_jax.model.effects import Context, Described, effect_by_name
 
 ROWS, PATTERN = 400, "a pattern without a name"
 NAMES = ("clp_zero", "rotator_zero", "lens_birefringence")
@@ -112,3 +112,21 @@ def test_patterns_are_compared_with_fits_in_the_unit_of_fits():
     assert here.best_pattern() > 20.0 * exact
     assert here.stands((), exact + 1.0, fitted=True)
     assert not here.stands((), exact + 1.0)
+
+
+class Refusing(Counting):
+    """A judge by whose fits the first name does not predict held-out data."""
+
+    def fitted(self, evidence, trial):
+        fitted = super().fitted(evidence, trial)
+        return dataclasses.replace(fitted, noise=False, predicts=trial.effect.name != NAMES[0])
+
+
+def test_a_description_comes_before_a_less_probable_name_once_the_best_name_is_refused():
+    """ln B ≈ 450, 0.97² 450 = 423, 312: the second one is a description, and is tried though it was not the best."""
+    here = evidence([30.0, 0.0, 25.0])
+    description = Probe(NAMES[1], Described, (Described.saying(["turn of polariser"], [0.0]),))
+    here = dataclasses.replace(here, probes=[here.probes[0], here.probes[2]], sentences=[description])
+    judge = Refusing()
+    assert names(here, judge)[0] == Described.name
+    assert judge.fits[:3] == [NAMES[0], NAMES[2], Described.name]

@@ -197,7 +197,7 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
     """The addition with the highest evidence that is not refused (None: all are), and the state with the reasons."""
     evidence, log, fits, choices = state.evidence, _Log(state.evidence), state.fits, state.choices
     waiting = log.passed(linear_trials(evidence), hopeless)
-    tried, accepted, ended = list(waiting), None, ""
+    tried, accepted, confirmed, ended = list(waiting), None, [], ""
     others_asked = sentences_asked = False
     while accepted is None:
         new: list[Trial] = []
@@ -223,11 +223,18 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
             fits += len(alternatives)
             alternatives = log.passed(alternatives)
             new, tried = [*new, *alternatives], [*tried, *alternatives]
-        for trial in judge.decided(sorted(new, key=names_first)):
+        for trial in judge.decided(sorted([*new, *confirmed], key=names_first)):
             if accepted := next(iter(log.passed([judge.confronted(evidence, trial)])), None):
                 break
+        # Sentences were behind a name that was refused: they come before another one that is less probable.
+        if accepted is not None and not confirmed:
+            confirmed = [accepted]
+            waiting = log.passed(_sentences_behind(evidence, tried, accepted), hopeless)
+            tried += waiting
+            accepted = None if waiting else accepted
         if not waiting or (ended := judge.over(fits)):
             break
+    accepted = accepted or next(iter(confirmed), None)
     if accepted is not None:
         ended, accepted = "", _with_rivals(evidence, accepted, tried)
     added = "" if accepted is None else accepted.name
@@ -243,10 +250,13 @@ def _is_sure(trial: Trial, waiting: Sequence[Trial]) -> bool:
     return trial.noise or not waiting or trial.linear - waiting[0].linear >= reach
 
 
-def _sentences_behind(evidence: Evidence, tried: Sequence[Trial]) -> list[Trial]:
-    """The leading sentences, without those that were tried."""
+def _sentences_behind(evidence: Evidence, tried: Sequence[Trial], name: Trial | None = None) -> list[Trial]:
+    """The leading sentences, without those that were tried; clearly more probable than a name, if it is given."""
+    least = -np.inf if name is None or name.item is None else name.item.log_bayes + thresholds.EVEN_ODDS
     untried = [
-        item for item in evidence.significant_sentences if not any(item is trial.item for trial in tried)
+        item
+        for item in evidence.significant_sentences
+        if item.log_bayes > least and not any(item is trial.item for trial in tried)
     ]
     return [linear_trial(evidence, item) for item in untried[: thresholds.MOST_SENTENCES]]
 
