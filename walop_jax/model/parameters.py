@@ -131,8 +131,10 @@ def number(*, unit: str, about: str, default: float | None = 0.0, several: bool 
 
 def as_number(value: Any) -> Any:
     """A value as a float64 array; None stays. Explicit, as weak types would be compiled anew beside arrays."""
+    if value is None or (isinstance(value, jax.Array) and value.dtype == float and not value.weak_type):
+        return value
     with float64():
-        return None if value is None else jnp.asarray(value, float)
+        return jnp.asarray(value, float)
 
 
 def unknown_name(what: str, name: str, known: Iterable[str]) -> ValueError:
@@ -149,6 +151,9 @@ def check_names(what: str, names: Iterable[str], known: Collection[str]) -> None
 
 class Component(eqx.Module):
     """A piece of the instrument; a fit may vary its declared parameters."""
+
+    # Methods of Equinox modules are trees, whose making took a tenth of a second fit; these are plain methods.
+    __getattribute__ = object.__getattribute__
 
     def __reduce__(self) -> tuple[Any, ...]:
         return blank, (type(self),), self.__getstate__()
