@@ -188,7 +188,8 @@ def _arrays(
         elif isinstance(value, tuple):
             for i, child in enumerate(value):
                 if isinstance(child, Component) and hasattr(child, "name"):
-                    yield from _arrays(child, f"{part}.{_name(child)}".strip("."), (*holder, str(i)))
+                    name: Any = child.name
+                    yield from _arrays(child, f"{part}.{name}".strip("."), (*holder, str(i)))
         elif isinstance(value, Component):
             yield from _arrays(value, f"{part}.{field.name}".strip("."), holder)
 
@@ -202,10 +203,6 @@ def _named(
         raise ValueError(f"{type(component).__name__}.{name}: {len(labels)} labels, {np.size(value)} values")
     names = (declared.name or f"{part}.{label}".strip(".") for label in labels)
     return tuple(dataclasses.replace(declared, name=name, part=part) for name in names)
-
-
-def _name(component: Any) -> str:
-    return component.name
 
 
 def leaves(component: Component) -> tuple[Parameter, ...]:
