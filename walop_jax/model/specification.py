@@ -287,9 +287,8 @@ def with_effects(
                 f"effect {effect.name!r} is the number that {text!r} adds to: leave one of them out"
             )
     instrument = dataclasses.replace(model.template, effects=in_order(active))
-    jax.eval_shape(
-        lambda i: i.patched(), instrument
-    )  # an effect that does not fit the instrument is an error here
+    # An effect that does not fit the instrument is an error here.
+    jax.eval_shape(lambda i: i.patched(), instrument)
     by_name = {p.name: p for p in model.parameters}
     parameters = []
     for p in make_model(model.name, instrument).parameters:
