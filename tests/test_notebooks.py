@@ -30,15 +30,8 @@ DEEP = {
         "reports.figures": "the figure named `modulation` needs a fit and has one point"
     },
     "paper_versus_joint.ipynb": {
-        "paper": "the method of Paper II",
-        "reports": "its figures",
-        "science.star_errors": "a truth in memory",
+        "reports": "figures of the method of Paper II",
     },
-    "tables.py": {
-        "model.effects.described": "an effect out of the sentences of a diagnosis",
-        "model.specification": "the context of such an effect",
-    },
-    "walop_north_design.ipynb": {"likelihood.layout": "a sample of points spread over the field"},
     "year_of_an_instrument.ipynb": {
         "reports.survey_figures": "figures of a survey, which has a page but no `plot`"
     },
