@@ -15,14 +15,14 @@ Limits      To first order, about the fit. What is smoother than a point spacing
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.dependences import FEWEST_POINTS, Dependences
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.columns import Columns
@@ -31,6 +31,7 @@ from walop_jax.model.effects.change import SINGLE, SLOW, Change, InExposures
 from walop_jax.model.effects.deviations import CUBIC
 from walop_jax.model.effects.factors import FIELD
 from walop_jax.model.effects.optics import GENERATORS, generators_of
+from walop_jax.model.light import mean_wavelengths
 
 Vector = Float[np.ndarray, " _"]
 _OPTICS = {name.partition(" ")[0] for name in GENERATORS} | {"turn"}
@@ -52,14 +53,14 @@ def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Change], Vecto
         return [], np.zeros(0), np.zeros(0)
     described = instrument.effect(Described.name)
     assert isinstance(described, Described)
-    squares: dict[_Place, float] = {}
+    data, squares = _AtData.of(columns), dict[_Place, float]()
     laws: dict[_Place, dict[tuple[str, ...], None]] = {}
     for change, amplitude in described.terms():
         optical = change.kind.partition(" ")[0] in _OPTICS
         place = _Place(GENERATORS if optical else (change.kind,), change.where, change.place, change.origin)
         parts = generators_of(change.kind) if optical else ((change.kind, 1.0, ()),)
         for _, coefficient, factors in parts:
-            size = float(amplitude) * coefficient * _rms(change.times(*factors), fit.calset, columns)
+            size = float(amplitude) * coefficient * data.rms(change.times(*factors))
             squares[place] = squares.get(place, 0.0) + size**2
         law = tuple(item.text for item in change.grows_with if item.depends_on != FIELD)
         laws.setdefault(place, {(): None}).setdefault(law)
@@ -69,8 +70,8 @@ def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Change], Vecto
         shapes = list(_shapes(place, tuple(laws[place]), fit, columns))
         count = len(shapes) / len(place.kinds)
         for change in shapes:
-            rms = _rms(change, fit.calset, columns)
-            if change.text not in listed and rms > 0:
+            rms = data.rms(change)
+            if change.text not in listed and square * rms > 0.0:
                 changes.append(change)
                 widths.append(np.sqrt(square / max(count, 1.0)) / rms)
                 sizes.append(rms)
@@ -100,10 +101,24 @@ def _shapes(
                 yield change
 
 
-def _rms(change: Change, calset: CalibrationSet, columns: Columns) -> float:
-    """Root mean square of the factors of a change over the data."""
-    at = InExposures(columns.exposures, calset.points.x[:, None], calset.points.y[:, None])
-    sizes = np.nan_to_num(np.asarray(change.factor(at), float))
-    return float(
-        np.sqrt(np.mean(np.broadcast_to(sizes, columns.likelihood.used.shape)[columns.likelihood.used] ** 2))
-    )
+@dataclasses.dataclass(frozen=True)
+class _AtData(InExposures):
+    """The (point, exposure) of a set; `wavelength` (µm) is the mean of the band of each exposure."""
+
+    wavelength: Any = 0.0
+    used: Any = None
+
+    @classmethod
+    def of(cls, columns: Columns) -> Self:
+        """Those of a likelihood."""
+        points, plan = columns.likelihood.calset.points, columns.plan
+        of_bands = np.asarray(mean_wavelengths(columns.patched, plan))
+        wavelength = of_bands[np.asarray(plan.band_of)[:, 0]]
+        return cls(
+            columns.exposures, points.x[:, None], points.y[:, None], wavelength, columns.likelihood.used
+        )
+
+    def rms(self, change: Change) -> float:
+        """Root mean square of the factors of a change."""
+        sizes = np.nan_to_num(np.asarray(change.factor(self), float))
+        return float(np.sqrt(np.mean(np.broadcast_to(sizes, self.used.shape)[self.used] ** 2)))
