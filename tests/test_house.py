@@ -193,7 +193,7 @@ MOST_LINES = {
     "calibration": 2850,
     "posterior": 2400,
     "science": 6400,
-    "diagnosis": 8170,
+    "diagnosis": 8180,
     "nights": 2810,
     "plans": 2370,
     "paper": 870,
