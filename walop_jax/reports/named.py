@@ -241,11 +241,6 @@ FIGURES: Mapping[str, NamedFigure] = {
 """In the order of the list that is printed."""
 
 
-def _of_comparison(name: str, about: str) -> NamedFigure:
-    figure = getattr(paper_figures, f"{name}_figure")
-    return NamedFigure(about, lambda source: figure(source.held[COMPARISON]), COMPARISON)
-
-
 def _tracks(source: FigureSource) -> AnyFigure:
     survey = source.held[SURVEY]
     figure = survey_figures.tracks_figure(survey.tracks, survey.document())
@@ -258,10 +253,15 @@ OF_RESULTS: Mapping[str, NamedFigure] = {
     "modulation": NamedFigure(
         FIGURES["modulation"].about, _modulation, DATA, lambda s: bool(s.calset.exposures.clp_in.any())
     ),
-    "histogram": _of_comparison("histogram", "errors of both methods"),
-    "map": _of_comparison("map", "their errors of p over the field"),
-    "offset": _of_comparison("offset", "corrections of the published method"),
-    "spectral": _of_comparison("spectral", "the matrix against wavelength"),
+    **{
+        name: NamedFigure(about, lambda s, draw=figure: draw(s.held[COMPARISON]), COMPARISON)
+        for name, about, figure in (
+            ("histogram", "errors of both methods", paper_figures.histogram_figure),
+            ("map", "their errors of p over the field", paper_figures.map_figure),
+            ("offset", "corrections of the published method", paper_figures.offset_figure),
+            ("spectral", "the matrix against wavelength", paper_figures.spectral_figure),
+        )
+    },
     "plate": NamedFigure(
         "photon errors with the calibration plate",
         lambda s: paper_figures.plate_figure(s.rebuilt),

@@ -79,14 +79,9 @@ class FigureSource:
             return cls(given, **options)
         if isinstance(given, PosteriorSample):
             return cls(held={POSTERIOR: given.groups()}, sample=given, **options)
-        for kind, name in (
-            (Calibration, PRODUCT),
-            (Comparison, COMPARISON),
-            (Survey, SURVEY),
-            (CalibrationSet, DATA),
-        ):
-            if isinstance(given, kind):
-                return cls(held={name: given}, **options)
+        if isinstance(given, Calibration | Comparison | Survey | CalibrationSet):
+            names = {Calibration: PRODUCT, Comparison: COMPARISON, Survey: SURVEY, CalibrationSet: DATA}
+            return cls(held={names[type(given)]: given}, **options)
         result = given.after if isinstance(given, Diagnosis) else given
         product = Calibration.from_fit(result)
         data = result.likelihood
