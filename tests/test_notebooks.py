@@ -26,15 +26,6 @@ DEEP = {
         "paper.polynomial": "the method of Paper II, which is there for comparison",
         "science.star_errors": "the same: errors of its test stars",
     },
-    "first_calibration.ipynb": {
-        "reports.figures": "the figure named `modulation` needs a fit and has one point"
-    },
-    "paper_versus_joint.ipynb": {
-        "reports": "figures of the method of Paper II",
-    },
-    "year_of_an_instrument.ipynb": {
-        "reports.survey_figures": "figures of a survey, which has a page but no `plot`"
-    },
 }
 """What notebooks import from rooms of the package, and why; this may only become less."""
 TIMEOUT = 900  # seconds per cell, on a machine that does other things as well
