@@ -97,21 +97,22 @@ def test_the_search_ends_after_the_steps_that_it_has(monkeypatch):
     assert len(names(evidence([25.0, 0.0, 20.0]), Linear())) == 1
 
 
-def test_patterns_are_compared_with_fits_in_the_unit_of_fits():
-    """Errors were scaled by 5: a fit has ln B = ½ s²/(1 + w⁻²) − ½ ln(1 + w²), a linear step 25 times as much.
+@pytest.mark.parametrize(("noise", "size"), [(0.2, 5.0), (1.0, 9.0), (2.0, 30.0)])
+def test_patterns_are_compared_with_fits_in_the_unit_of_fits(noise, size):
+    """A fit with errors of 1 has ln B = ½ s²/(1 + w⁻²) − ½ ln(1 + w²); a linear step counts in the noise itself.
 
-    What explains all but the noise is refused for a pattern that explains less of it, were the units different.
+    Were the units different, a fit that explains all would be refused for a pattern that explains less (noise 0.2), or
+    preferred to one that explains more (noise 2).
     """
-    here = evidence([12.0, 0.0, 0.0, 5.0], noise=0.2)
-    best = here.table[PATTERN]
+    here = evidence([12.0, 0.0, 0.0, size], noise=noise)
     along = float(here.scores[-1] / np.sqrt(here.space.gram[-1, -1]))
     width = 10.0 * float(np.sqrt(here.space.gram[-1, -1]))
     exact = 0.5 * along**2 / (1.0 + width**-2.0) - 0.5 * np.log(1.0 + width**2)
-    assert here.best_pattern(fitted=True) == pytest.approx(exact, abs=2.0)
-    assert here.best_pattern() == pytest.approx(best.log_bayes)
-    assert here.best_pattern() > 20.0 * exact
-    assert here.stands((), exact + 1.0, fitted=True)
-    assert not here.stands((), exact + 1.0)
+    assert here.best_pattern(fitted=True) == pytest.approx(exact, abs=3.0)
+    assert here.best_pattern() == pytest.approx(here.table[PATTERN].log_bayes)
+    assert here.best_pattern() == pytest.approx(exact / noise**2, rel=0.2)
+    assert here.stands((), exact + 3.0, fitted=True)
+    assert not here.stands((), exact - 7.0, fitted=True)
 
 
 class Refusing(Counting):

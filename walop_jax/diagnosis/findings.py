@@ -182,6 +182,7 @@ class Step:
     log_bayes: float
     chi2_before: float
     chi2_after: float
+    dof_after: int
     heldout_scheme: str
     heldout_before: float
     heldout_after: float

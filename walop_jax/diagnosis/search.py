@@ -102,6 +102,7 @@ def refused(evidence: Evidence, trial: Trial) -> str:
         return "its fit did not converge"
     if not trial.predicts:
         return "by its linear step it does not predict settings and field points that it has not seen"
+    # Linear evidence counts in the scatter behind all candidates already, that of fits in their errors.
     fitted, needed = trial.fit is not None, evidence.evidence_needed
     worth = trial.evidence / evidence.floor**2 if fitted else trial.evidence
     if worth <= needed:

@@ -14,9 +14,9 @@ from walop_jax.calibration.calibration import Calibration, Product
 from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.records import CalibrationSet
+from walop_jax.diagnosis.detection_limits import DetectionLimits
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, figure_data, read_figure_data
 from walop_jax.diagnosis.findings import Diagnosis
-from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.names import (

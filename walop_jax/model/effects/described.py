@@ -11,9 +11,10 @@ Revealed by data without an equally good named explanation
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -61,33 +62,36 @@ class Described(Effect):
     separated_by: ClassVar[str] = "exposures in which its dependence differs from that of the others"
 
     @classmethod
-    def neutral(cls, context: Context) -> Self:
+    def neutral(cls, context: Context) -> Described:
         """Nothing described."""
         return cls.of(context)
 
     @classmethod
-    def of(cls, context: Context, **values: Any) -> Self:
+    def of(cls, context: Context, **values: Any) -> Described:
         """Descriptions with some values, zero elsewhere. Raises ValueError for an invalid description."""
         sentences = tuple(values.pop("sentences", ()))
+        if not values:
+            return _without_size(sentences)
         held = [Change.parsed(text).parameter for text in sentences]
         for name in values:
             if name not in AMPLITUDES:
                 raise unknown_name(f"parameter of {cls.name}", name, (*AMPLITUDES, "sentences"))
         arrays = {
-            name: jnp.broadcast_to(jnp.asarray(values[name], float), (held.count(name),))
-            if name in values
-            else _zeros(held.count(name))
-            for name in AMPLITUDES
+            name: jnp.broadcast_to(jnp.asarray(values[name], float), (held.count(name),)) for name in values
         }
-        return cls(**arrays, sentences=sentences)
+        return dataclasses.replace(_without_size(sentences), **arrays)
 
     @classmethod
-    def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
+    def combine(
+        cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]
+    ) -> Described:
         """One effect of members with a change each."""
         return cls.saying([text for member in group for text in member.sentences], amplitudes)
 
     @classmethod
-    def saying(cls, sentences: Sequence[str], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
+    def saying(
+        cls, sentences: Sequence[str], amplitudes: Sequence[float] | Float[np.ndarray, " a"]
+    ) -> Described:
         """Descriptions with their amplitudes, in the same order."""
         held: dict[str, list[float]] = {}
         for text, amplitude in zip(sentences, amplitudes, strict=True):
@@ -121,6 +125,13 @@ class Described(Effect):
     def patch(self, instrument: Instrument) -> Instrument:
         """All changes, those at one place together."""
         return patched(instrument, self.terms())
+
+
+@functools.lru_cache(maxsize=8192)
+def _without_size(sentences: tuple[str, ...]) -> Described:
+    """Descriptions with all amplitudes zero, made once: every list of candidates has them."""
+    held = [Change.parsed(text).parameter for text in sentences]
+    return Described(**{name: _zeros(held.count(name)) for name in AMPLITUDES}, sentences=sentences)
 
 
 class OtherDescription(Effect):
