@@ -124,7 +124,7 @@ class PriorRows:
     """Rows (θ − mean) / width of the parameters at `index`; those that are not `known` are weak pulls.
 
     A free parameter has one row: its prior if it has one, else the weak pull to its start value, if it has that. A
-    frozen one has none, for it does not vary; nor has a tied one, whose value is that of another: what is known of that
+    frozen one has none, for it does not vary; nor has a tied one, whose value is that of another: the prior of that
     one is said there, and once.
     """
 
@@ -194,7 +194,7 @@ class Likelihood:
     ) -> Likelihood:
         """Bring a set and a model together; `probes` are effects beyond the model whose columns will be asked for.
 
-        `memory` (bytes) is what the data of the points may take, None for the usual 2 GB. `batch` and
+        `memory` (bytes) is the limit for the data of the points, None for the usual 2 GB. `batch` and
         `interpolate` are decided by the size of the set where they are None. `sets` is how many such sets come.
         """
         runner = runner or Runner()
