@@ -194,7 +194,7 @@ class Likelihood:
     ) -> Likelihood:
         """Bring a set and a model together; `probes` are effects beyond the model whose columns will be asked for.
 
-        `memory` (bytes) is the limit for the data of the points, None for the usual 2 GB. `batch` and
+        `memory` (bytes) is what the data of the points may take, None for the usual 2 GB. `batch` and
         `interpolate` are decided by the size of the set where they are None. `sets` is how many such sets come.
         """
         runner = runner or Runner()

@@ -39,7 +39,7 @@ def listed(items: Sequence[str]) -> str:
 
 
 def hidden_in_words(summary: Mapping[str, Any]) -> str:
-    """The mistakes that these data would not have shown, the worst first; empty where none is computed or counts."""
+    """The mistakes that these data would not have shown, the worst first; empty where nobody asked or none counts."""
     entries = (summary.get("hidden") or [])[:4]
     sizes = [
         f"{entry['name']} ({rounded(entry['size'], '.2g')} {entry['unit']})".replace(" )", ")")
