@@ -5,7 +5,7 @@ Stars are seen through m + δm and calibrated with m + ∂m/∂θ δθ, so that 
 
     M⁻¹ (δm − ∂m/∂θ δθ) (1, q, u),   and by 2 p δR where a mistake δR turns the sky against the instrument
 
-Every command that says what could hide asks `could_hide`.
+Every command that reports undetected mistakes calls `could_hide`.
 
 Symbols     m instrument matrix, M its part that acts on q, u; δm its change by an effect at its size; p = 5 %
 Limits      One mistake at a time; to first order in δθ.
@@ -70,7 +70,7 @@ class CouldHide(NamedTuple):
 
 
 def unmeasured(mistakes: Iterable[CouldHide]) -> dict[str, CouldHide]:
-    """Mistakes that the data do not measure, by their names: what one measurement would show together."""
+    """Mistakes that the data do not measure, by their names: those together that one measurement would show."""
     together: dict[str, list[CouldHide]] = {}
     for mistake in mistakes:
         if not mistake.measured:

@@ -1,15 +1,15 @@
-"""The search for what is missing: while something is, additions are tried, refused with a reason, or adopted.
+"""The search for missing effects: while one is missing, additions are tried, refused with a reason, or adopted.
 
 All is functions of a `State`, which never changes. `refused` has all rules by which an addition is not made, `search`
 is the loop. What differs between the search that fits (`refits.Refits`) and the one of the blind study, which takes
 linear steps (`tests/diagnosis/linear_judge.py`), is a `Judge`.
 
-1. Candidates are ordered by their linear evidence. What could not be added by its linear step is not tried.
+1. Candidates are ordered by their linear evidence. Candidates that their linear step would refuse are not tried.
 2. The best is fitted. If it leaves nothing but noise, no rival can be better. If its evidence differs from that of its
    linear step by more than `thresholds.LINEAR_GOOD`, rivals that lie within twice the difference are fitted as well.
 3. Where the model is far off and no name explains half of that, or none is left, what cannot be differentiated
    competes with the names: structural effects and other descriptions of the instrument (`descriptions`).
-4. The best that data which took no part in its fit confirm is adopted, and what is left is scored again.
+4. The best that data which took no part in its fit confirm is adopted, and the residuals are scored again.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ Judge = Any
 
 over        amount of work after which nothing further is tried, in words; empty: there is more to spend
 fitted      a linear trial as the judge finds it
-others      trials of what has no linear step, and other descriptions of the instrument that were compared
+others      trials of effects without a linear step, and other descriptions of the instrument that were compared
 decided     trials in order of evidence, with those that are even decided
 confronted  a trial with what data that took no part in its fit say of it
 adopted     the state once a trial has joined the model
@@ -97,7 +97,7 @@ def search(state: State, judge: Judge) -> State:
 
 
 def refused(evidence: Evidence, trial: Trial) -> str:
-    """Reason not to add what was tried; empty: there is none."""
+    """Reason not to add the effect of a trial; empty: there is none."""
     if trial.fit is not None and not trial.fit.converged:
         return "its fit did not converge"
     if not trial.predicts:
@@ -111,7 +111,7 @@ def refused(evidence: Evidence, trial: Trial) -> str:
     if explained < least:
         missing = evidence.chi2 - evidence.dof
         return f"it explains {explained:.4g} of {missing:.4g} that are missing in χ², less than {least:.4g}"
-    # What is left is noise, and was not before: a pattern can only say the same with more numbers.
+    # The residuals are noise now: a pattern can only describe the same with more numbers.
     suffices = trial.noise and not explains(evidence.chi2, evidence.dof)
     if not suffices and not _stands(evidence, trial):
         best = evidence.best_pattern(fitted=fitted)
@@ -125,10 +125,10 @@ def refused(evidence: Evidence, trial: Trial) -> str:
 
 
 def _least_explained(evidence: Evidence, trial: Trial) -> float:
-    """Part of what is missing in χ² that an addition must explain."""
+    """Part of the excess of χ² that an addition must explain."""
     missing = evidence.chi2 - evidence.dof
     least = thresholds.LEAST_SHARE * missing
-    # Of a poor fit the final model is asked (`thresholds.PART`): what is missing there may be many things.
+    # Of a poor fit the final model is asked (`thresholds.PART`): its misfit may have many causes.
     if evidence.poor or trial.effect is Described:
         return least
     surely = missing - 2.0 * np.sqrt(2.0 * evidence.dof)
@@ -138,13 +138,13 @@ def _least_explained(evidence: Evidence, trial: Trial) -> float:
 def _stands(evidence: Evidence, trial: Trial) -> bool:
     """True if no pattern without a name is clearly more probable."""
     probes = [probe for probe in evidence.probes if probe.effect is trial.effect]
-    if not probes and trial.effect is not Described:  # what has no linear step
+    if not probes and trial.effect is not Described:  # without a linear step
         return True
     return evidence.stands(probes, trial.evidence, fitted=trial.fit is not None)
 
 
 def hopeless(evidence: Evidence, trial: Trial) -> str:
-    """Reason not to try what a linear step would refuse even if it were better by as much as such steps may miss."""
+    """Reason not to try an effect that is refused even if it is better by the error of linear steps."""
     if trial.evidence <= thresholds.LINEAR_BELOW:
         return refused(evidence, trial)
     factor = 1.0 + thresholds.LINEAR_SHARE
@@ -163,7 +163,7 @@ def linear_trials(evidence: Evidence) -> list[Trial]:
 
 
 def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
-    """Trial of one candidate by its linear step; `linear` is what a fit should find, with its errors."""
+    """Trial of one candidate by its linear step; `linear` is the expected result of a fit, with its errors."""
     noise, statistic = evidence.table.noise_scale, item.score.statistic
     remaining = evidence.chi2 - statistic * (noise * evidence.scale) ** 2
     return Trial(
@@ -263,7 +263,7 @@ def _sentences_behind(evidence: Evidence, tried: Sequence[Trial], name: Trial | 
 
 
 def _with_rivals(evidence: Evidence, trial: Trial, tried: Sequence[Trial]) -> Trial:
-    """A trial with what is not improbable beside it, and other shapes of its effect that are as probable."""
+    """A trial with the alternatives that are not improbable, and other shapes of its effect that are as probable."""
     rivals, shapes = [], list(trial.alternatives)
     for rival in tried:
         if rival.name == trial.name:
@@ -301,7 +301,7 @@ def _came_first(added: str) -> str:
 
 
 def _too_far(evidence: Evidence, item: Ranked) -> str:
-    """Reason for which a significant candidate was not tried: what comes before it."""
+    """Reason for which a significant candidate was not tried: the candidates before it."""
     names, sentences = evidence.significant, evidence.significant_sentences
     best = max([*names[:1], *sentences[:1]], key=lambda ranked: ranked.log_bayes)
     gap = best.log_bayes - item.log_bayes

@@ -38,7 +38,7 @@ def base_model(
     """The base model (docs: model) for the instrument and standards of a calibration set.
 
     `instrument` is the one as designed, needed where its name is not one that comes with the package; `plates` and
-    `throughput_degree` replace what it says. Raises `DataError` for an instrument that nobody knows, and ValueError
+    `throughput_degree` replace what it says. Raises `DataError` for an unknown instrument, and ValueError
     for one of another name than the set's, or without a moving element that the set has in the beam.
 
     >>> walop.base_model(calset)["pupil.magnification"].prior

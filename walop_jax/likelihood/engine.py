@@ -10,7 +10,7 @@ Three layers, each with its own small Jacobian:
 
 Flux           of every (exposure, point) is eliminated (`flux.py`). Where an effect of the detectors D acts, the model
                is D(F a), F follows by Newton steps and ∂D/∂F takes the place of a.
-Exposures      are not compressed beforehand, although light is linear in them: with the flux eliminated what could
+Exposures      are not compressed beforehand, although light is linear in them: with the flux eliminated all that could
                be kept of a point holds only near one set of values, as F and â depend on them. Whole frames, whose
                counts are smooth over the field, are summed over cells near one set of values instead (`frames.py`).
 """

@@ -124,7 +124,7 @@ class PriorRows:
     """Rows (θ − mean) / width of the parameters at `index`; those that are not `known` are weak pulls.
 
     A free parameter has one row: its prior if it has one, else the weak pull to its start value, if it has that. A
-    frozen one has none, for it does not vary; nor has a tied one, whose value is that of another: what is known of that
+    frozen one has none, for it does not vary; nor has a tied one, whose value is that of another: the prior of that
     one is said there, and once.
     """
 

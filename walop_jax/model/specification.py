@@ -59,7 +59,7 @@ class Model(Displayed):
         )
         hidden = len(self.positions(THROUGHPUT))
         note = (f"{hidden} throughput terms not shown; to_table() has them",) if hidden else ()
-        head = ("parameter", ">start", "unit", "prior", "", "what it is")
+        head = ("parameter", ">start", "unit", "prior", "", "meaning")
         return Display(f"Model of {self.name}: {counts}; effects: {effects}", (), head, rows, note)
 
     def to_table(self) -> Any:
@@ -72,7 +72,7 @@ class Model(Displayed):
             "PRIOR_MEAN": (priors[:, 0], "", "mean of the prior"),
             "PRIOR_SIGMA": (priors[:, 1], "", "standard deviation of the prior"),
             "STATE": (np.array([p.state or "free" for p in self.parameters]), "", "free, fixed or tied"),
-            "ABOUT": (np.array([p.about for p in self.parameters]), "", "what it is"),
+            "ABOUT": (np.array([p.about for p in self.parameters]), "", "meaning"),
         }
         return astropy_table(columns)
 

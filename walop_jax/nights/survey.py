@@ -328,7 +328,7 @@ class Survey(Drawn):
             "MJD": (by_night([n.mjd for n in data.nights]), "d", "mean of the exposures, UTC"),
             "VALUE": (values.ravel(), "", "under the law"),
             "ERROR": (errors.ravel(), "", "standard error of VALUE"),
-            "DEVIATION": ((deviation * scale).ravel(), "", "what the night alone would add"),
+            "DEVIATION": ((deviation * scale).ravel(), "", "departure of the night alone"),
             "DEVIATION_ERR": ((alone * scale).ravel(), "", "its standard error"),
             "LAW": (by_parameter(laws), "", "law of the parameter"),
             "UNIT": (by_parameter([p.unit for p in data.parameters]), "", "of the values"),

@@ -211,7 +211,7 @@ FIGURES: Mapping[str, NamedFigure] = {
         FIGURE_DATA,
     ),
     "signature": NamedFigure(
-        "residuals of every exposure, and what the effect explains of them",
+        "residuals of every exposure, and the part explained by the effect",
         lambda s: diagnosis_figures.signature_figure(
             s.figure_data.comparisons[s.examined], s.figure_data.exposures, s.figure_data.cameras, s.canvas
         ),
@@ -228,7 +228,7 @@ FIGURES: Mapping[str, NamedFigure] = {
         FIGURE_DATA,
     ),
     "residual-map": NamedFigure(
-        "what the smooth model leaves, of whole frames", _residual_map, possible=lambda s: not _small(s)
+        "residuals of the smooth model, of whole frames", _residual_map, possible=lambda s: not _small(s)
     ),
     "residuals": NamedFigure(
         "residuals of every field point before and after the fit, and all of them",
