@@ -46,7 +46,7 @@ def __getattr__(name: str) -> Any:
     if isinstance(found, types.FunctionType) and not hasattr(found, "command") and name != "forward":
         from walop_jax.model.compiled import (
             in_float64,
-        )  # `forward`: the session itself compiles what it gives
+        )  # `forward`: the session itself compiles its functions
 
         found = in_float64(found, name)
     globals()[name] = found

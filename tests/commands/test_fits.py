@@ -46,7 +46,7 @@ def test_a_diagnosis(call, spoilt_file: Path, tmp_path: Path, monkeypatch):
 
     monkeypatch.setattr("walop_jax.diagnosis.workflow.diagnose", lambda *args, **more: found)
     monkeypatch.setattr("walop_jax.diagnosis.figure_data.write_figure_data", fail)
-    with pytest.raises(DataError, match="what was there is untouched"):
+    with pytest.raises(DataError, match="the old content is untouched"):
         walop.diagnose(spoilt_file, output=tmp_path / "other")
     assert not (tmp_path / "other").exists()
 

@@ -21,7 +21,7 @@ def test_a_page_for_every_effect(call, effect):
     if known is not None:
         assert f"{known['found'][0]:.2g}" in text
         assert all(f"`{rival}`" in text for rival, _ in known["rivals"])
-        assert "## What it does to the maps" in text
+        assert "## Its effect on the maps" in text
 
 
 @pytest.mark.parametrize("kind", ELEMENTS, ids=lambda kind: kind.kind)

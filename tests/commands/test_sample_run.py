@@ -66,7 +66,7 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_been(
 
     with monkeypatch.context() as patch:
         patch.setattr("walop_jax.calibration.write_calibration", fail)
-        with pytest.raises(DataError, match="what was there is untouched"):
+        with pytest.raises(DataError, match="the old content is untouched"):
             sample(caller, **more, resume=True)
     assert {name: (caller / name).read_bytes() for name in before} == before
     found = sample(caller, **more, resume=True)

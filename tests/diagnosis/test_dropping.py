@@ -51,7 +51,7 @@ def lead_from_the_first_fit_to_the_last(found):
 def strong():
     """An encoder error of 3°, thirty times the usual: a zero point is named first."""
     found, told = diagnosed([WOBBLE.of(PLAN.context(), amplitude=3.0)], (ZERO, WOBBLE))
-    assert "added clp_zero; scoring what is left" in told
+    assert "added clp_zero; scoring the residuals" in told
     assert "clp_zero is no longer needed" in told
     return found
 

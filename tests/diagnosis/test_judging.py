@@ -291,33 +291,11 @@ def test_a_name_must_explain_a_quarter_of_what_is_surely_missing(effect, chi2, e
         floor=1.0,
         evidence_needed=0.0,
         probes=(),
-        stands=lambda *_: True,
+        stands=lambda *_, **__: True,
     )
     reason = search.refused(state, exact.Trial(effect, 50.0, chi2 - explained, noise=False))
     assert (reason == "") is told
     assert told or f"explains {explained:.4g} of {chi2 - 10_000:.4g} that are missing" in reason
-
-
-@pytest.mark.parametrize(("fitted", "refused"), [(False, False), (True, True)])
-def test_evidence_counts_once_in_the_scatter_that_no_candidate_explains(fitted, refused):
-    """Residuals of 2 σ: ln B 40 of a linear step is in that scatter, ln B 40 of a fit in errors as stated is 10 in it.
-
-    A pattern without a name has ln B 20 in it.
-    """
-    state = Mock(
-        Evidence,
-        chi2=48_000.0,
-        dof=10_000,
-        poor=True,
-        floor=2.0,
-        evidence_needed=0.0,
-        best_pattern=20.0,
-        probes=(),
-        stands=lambda probes, worth: worth > 20.0,
-    )
-    result = Mock(FitResult, converged=True) if fitted else None
-    trial = exact.Trial(Described, 40.0, 40_000.0, noise=False, fit=result)
-    assert ("a pattern without a name" in search.refused(state, trial)) is refused
 
 
 def test_decided_keeps_every_trial_once(monkeypatch):

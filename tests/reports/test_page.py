@@ -99,7 +99,7 @@ def test_every_section_is_there(diagnosed, refitted):
     assert len(page.images) == 2
     page = Page(diagnosed)
     assert [heading for heading in page.headings if heading in both] == both
-    assert {"What was found", "Residuals before and after", "Candidates"} <= set(page.headings)
+    assert {"Findings", "Residuals before and after", "Candidates"} <= set(page.headings)
     assert len(page.images) == 6  # maps, curves, ladder, shares, matrix, errors
     assert "cos(3θ − 57°), θ the polariser angle" in page.text
 
@@ -153,7 +153,7 @@ def test_a_summary_with_the_necessary_keys_alone_is_enough(tmp_path):
     (run / "summary.json").write_text(json.dumps({key: handmade_run.SUMMARY[key] for key in keys}))
     assert "trusted" in page_of(run).text
     (run / "summary.json").write_text(json.dumps({key: handmade_run.SUMMARY[key] for key in keys[:-1]}))
-    with pytest.raises(DataError, match=r"summary.json: does not hold what was displayed of it \('shown'\)"):
+    with pytest.raises(DataError, match=r"summary.json: does not hold its display \('shown'\)"):
         render(read_run(run))
 
 

@@ -232,7 +232,7 @@ class Calibration(Contents, Fitted):
     def from_fit(cls, result: FitResult, residuals: ResidualMap | None = None) -> Calibration:
         """The calibration by a fit, with the verdict on it: of a diagnosis the mean over the models still possible.
 
-        `residuals` is what the model leaves over the field (`residual_map`), worth its pass for large sets.
+        `residuals` are those over the field (`residual_map`), worth its pass for large sets.
         Raises RuntimeError for a fit without a verdict.
         """
         calset = result.calset

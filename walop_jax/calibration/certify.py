@@ -1,7 +1,7 @@
 """Is a calibration product fit for use? Checks that fail closed: one that does not hold makes the product invalid.
 
 A product is read with its checksums, version and content hash before it comes here (`read_calibration`, without its
-model); what is left to find out is whether it says what its own parameters say, and whether that is physics.
+model); it remains to check whether it agrees with its own parameters, and whether that is physics.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ LARGEST_FIELD = 0.3  # deg: beyond, a description does not cover the optics
 class CheckedInstrument(Displayed):
     """An instrument with the model of its parameters; `train` and `arms` name elements in the order light meets them.
 
-    `optical` are the parameters that enter the band integral, `conditions` what the optics ask of an exposure,
+    `optical` are the parameters that enter the band integral, `conditions` those that the optics need of an exposure,
     `retardance` is that of every plate by its place (waves, folded to 0 … ½), for 0.62 µm along the normal.
     """
 

@@ -387,7 +387,7 @@ def effect_slopes(
 ) -> Float[np.ndarray, "p a 3 e"]:
     """Derivatives of the matrix with respect to the amplitudes of neutral effects, effect by effect in their order.
 
-    What of an effect does not go with the matrix (single exposures, ghosts, detectors) has none.
+    Parts of an effect outside the matrix (single exposures, ghosts, detectors) have none.
     """
     if not effects:
         return np.zeros((len(x), len(instrument.cameras.pairs), 3, 0))

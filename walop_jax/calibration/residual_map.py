@@ -6,9 +6,9 @@ Quantities  In a cell of the field, at one optical setting, δm (three elements 
             light,
                 δN_k = ± ½ F T (δm · S) in the two cameras of an arm,   δN_k = ρ F v_k · S in those of a later one.
 Estimate    weighted least squares over the exposures and points of the cell, the flux of each exposure eliminated:
-            (Σ A P Aᵀ) δ = Σ A r, with r the normalised residuals, A = δN/σ and P what is left beside the flux.
+            (Σ A P Aᵀ) δ = Σ A r, with r the normalised residuals, A = δN/σ and P the projection off the flux.
             Its covariance is the inverse of the sum. A cell has few numbers of the millions of the smooth model's
-            data, so what the fit takes out of a cell is left out of account.
+            data, so the part of a cell that the fit absorbs is left out of account.
 Limit       no structure smaller than the smooth model's: δ scatters about 0 with its standard errors.
 """
 

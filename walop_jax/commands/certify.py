@@ -90,7 +90,7 @@ def certify(
     *,
     output: Annotated[PathLike | None, FOLDER] = None,
 ) -> Outcome[Certificate]:
-    """Check a calibration from its checksums to its physics and its accuracy: go or no-go, with what is missing.
+    """Check a calibration from its checksums to its physics and its accuracy: go or no-go, with its shortfalls.
 
     Version, content hash, convergence, covariance, validity (dates, filters, temperatures), hashes of the
     calibration sets it was made from, maps against parameters, and that no camera has a negative transmission: exit

@@ -32,8 +32,8 @@ def epoch(
 
     Reports the changes with their sizes, and how far off stars would be if the old calibration were still used; lists
     the parameters by how far they have moved, and tests all of them together. The new fit is that of the old model:
-    plates, effects, priors and what is held. Where that does not explain the new data and did explain the old ones,
-    what is missing is looked for as walop-jax diagnose does, and the old calibration is compared with the model found.
+    plates, effects, priors and fixed parameters. Where that does not explain the new data and did explain the old ones,
+    missing effects are looked for as by walop-jax diagnose, and the old calibration is compared with the model found.
 
     Exit code 0 only where the old calibration still holds; 3 where something has moved, or where the new data are not
     explained.
@@ -58,7 +58,7 @@ def epoch(
         comparison = compared(held, result)
     lacking = None
     if comparison.fits is None:
-        job.tell("looking for what the new fit lacks", "lacking")
+        job.tell("looking for effects that the new fit lacks", "lacking")
         # Other readings of the data have been tried when its fit was examined.
         lacking = diagnose(
             calset,
@@ -74,7 +74,7 @@ def epoch(
     shown = comparison.display()
     if lacking is not None:
         named = ", ".join(step.effect for step in lacking.steps) or "nothing that has a name"
-        lacks = f"what the old model lacks: {named} ({lacking.verdict})"
+        lacks = f"missing from the old model: {named} ({lacking.verdict})"
         shown = dataclasses.replace(shown, notes=(*shown.notes, lacks))
     return Outcome(
         comparison,

@@ -1,7 +1,7 @@
 """Calibrations and tables as arguments of commands, and tables with the columns that a calibration adds.
 
 A calibration may be given in memory, by its file or by the folder of a run. What is given in place of one of them is a
-TypeError: what it is, and what to give.
+TypeError that names its type and the types wanted.
 """
 
 from __future__ import annotations

@@ -314,7 +314,7 @@ class Compression:
     """Origin of a calibration set made of whole frames: it stands for so many `pixels` of the files `frames`.
 
     The pixels were summed at `values` of the model's parameters, where their χ² and its degrees of freedom were these.
-    `gain` and `response` are by how much single pixels differ there (`fit.verdict.Structure`); None: nobody asked.
+    `gain` and `response` are by how much single pixels differ there (`fit.verdict.Structure`); None: not computed.
     `exposures` are those of the pixels, by their EXPOSURE, in a set that has others beside them; None: all are.
     """
 

@@ -3,7 +3,7 @@
 Equation    Q + iU = P exp(2i ANGLE); along it the error is P_ERR, across it 2 P √(ANGLE_ERR² + ANGLE_SCATTER²)
 Limits      Of stars that are polarised by less than three errors the angle is not known: both errors are P_ERR. Where
             no angle is stated Q = U = 0, with the error √((P² + P_ERR²)/2).
-            Stars that nobody has monitored are taken to vary by `USUAL_SCATTER`.
+            Stars that were never monitored are taken to vary by `USUAL_SCATTER`.
 """
 
 from __future__ import annotations

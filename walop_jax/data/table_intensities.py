@@ -350,7 +350,7 @@ def repeated_counts(
     places, block = sampled(intensities, len(points), _LOOKED_AT)
     at, exposure = np.nonzero(block.used & counted)
     same = equal_rows([block.x[at], block.y[at], *block.counts[at, exposure].T])
-    order = np.lexsort((at, exposure, same))  # copies behind what they repeat
+    order = np.lexsort((at, exposure, same))  # copies behind their originals
     again = np.zeros(len(at), bool)
     again[order[1:]] = same[order[1:]] == same[order[:-1]]
     for name, ids, row in (("exposures", exposures.exposure, exposure), ("points", points.point[places], at)):

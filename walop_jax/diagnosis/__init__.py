@@ -1,1 +1,1 @@
-"""Finding what the model lacks: the alarm, the name, the addition, and what it honestly cannot tell."""
+"""Missing effects: the alarm, the name, the addition, and the alternatives that data cannot separate."""

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import Exposures
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import ClassOf
+from walop_jax.diagnosis.class_product import Classes, ClassOf, Shape
 from walop_jax.diagnosis.design import Design, positions_of
 from walop_jax.diagnosis.reasons import why
 from walop_jax.fit.refit import FitResult
@@ -277,7 +277,7 @@ class Diagnosis(Drawn):
     choices: tuple[Choice, ...] = ()
     classes: tuple[Mapping[str, Any], ...] = ()
     ended: str = ""
-    members: tuple[ClassOf, ...] = ()
+    members: Classes = dataclasses.field(default_factory=Classes)
     rounds: tuple[Any, ...] = ()
     not_scored: Mapping[str, str] = dataclasses.field(default_factory=dict)
     descriptions: int = 0
@@ -442,6 +442,13 @@ def _members(addition: ClassOf) -> dict[str, Any]:
     }
 
 
+def _shape(shape: Shape | None) -> dict[str, Any] | None:
+    if shape is None:
+        return None
+    count = len(shape.deviations.sums)
+    return {"deviations": count, "spread_of_p": shape.spread, "stated_error_of_p": shape.stated}
+
+
 def sentences(content: Mapping[str, Any]) -> Iterator[str]:
     """Sentences beside the numbers of a diagnosis, from the content of diagnosis.json: the same in `print`, the command
     and the page."""
@@ -544,7 +551,8 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "limits": diagnosis.limits,
         "choices": [dataclasses.asdict(choice) for choice in diagnosis.choices],
         "classes": diagnosis.classes,
-        "members": [_members(addition) for addition in diagnosis.members],
+        "members": [_members(addition) for addition in diagnosis.members.additions],
+        "shape": _shape(diagnosis.members.shape),
         "cannot_be_tested": diagnosis.untestable,
         "chi2_per_dof_before": before.chi2 / max(before.dof, 1),
         "chi2_per_dof_after": after.chi2 / max(after.dof, 1),

@@ -119,7 +119,7 @@ def _leftover(first: State, state: State, judge: Refits) -> Remainder:
 def _parts(first: State, state: State) -> dict[str, str]:
     """Names that leave a poor fit nearly as poor, with what each of them explains in words.
 
-    Such a name explains no more than it can borrow from what is missing, and the matrix between the points is worse
+    Such a name explains no more than it can borrow from missing effects, and the matrix between the points is worse
     with it. Other descriptions of the instrument stay: they have no amplitude that could bend.
     """
     names = [step for step in state.steps if step.effect is not OtherDescription]

@@ -3,7 +3,7 @@
 Cameras in another order, angles that run the other way or
 start elsewhere, a field that is mirrored, turned or in other units, a polariser that was not in the beam, another
 instrument: each makes residuals far beyond what any effect makes, and each is undone by rewriting the set. An
-alternative is worth what a fit of the rewritten set at a few field points leaves,
+alternative is worth the χ² of a fit of the rewritten set at a few field points,
 
     χ²(θ₀ + δ),   δ = −(JᵀJ/s² + P)⁻¹ (Jᵀr/s² + P(θ₀ − θ_prior)),
 
@@ -43,7 +43,7 @@ _STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best
 _BEST = 3  # alternatives that are looked at again
 _ALL_ORDERS = 4  # cameras up to which all orders are tried, beyond pairs alone
 _EXCHANGED = 5  # worst exposures, of which two may have been exchanged
-_NO_LIGHT = 0.05  # of what is expected, below which a camera sees nothing, …
+_NO_LIGHT = 0.05  # of the expected light, below which a camera sees nothing, …
 _MISSING = 20.0  # … if as many standard errors are missing
 _FIELD = 1.5  # of the designed field: what a field in other units must fit into
 
@@ -67,14 +67,14 @@ class Alternative:
 
 
 def refuse_mixups(result: FitResult) -> None:
-    """Raise `DataError` with the remedy if a fit leaves what another reading of its data explains."""
+    """Raise `DataError` with the remedy if another reading of its data explains the residuals of a fit."""
     alternatives = mixups_of(result)
     if alternatives:
         raise refusal(result, alternatives)
 
 
 def mixups_of(result: FitResult) -> tuple[Alternative, ...]:
-    """The readings of the data that explain what a fit leaves, best first."""
+    """The readings of the data that explain the residuals of a fit, best first."""
     if result.dof <= 0:
         return ()
     return mixups(result.calset, result.model, result.chi2 / result.dof)
@@ -101,7 +101,7 @@ def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternati
     lit = block.used[..., None] & (block.counts > 0)
     if not lit.any():
         return ()
-    # What has gone wrong with all exposures misses all of the light by so much.
+    # A mistake in all exposures misses all of the light by so much.
     coarse = np.median(block.sigma[lit] / block.counts[lit]) * np.sqrt(left) >= thresholds.READING_COARSE
     few = dataclasses.replace(few, intensities=TableIntensities.dense(few.points, block))
     likelihood = Likelihood.of(few, model)
@@ -134,7 +134,7 @@ def _judged(
         rewritten = item.change(calset)
         if rewritten.instrument != calset.instrument:
             model = base_model(rewritten)
-        elif rewritten.sources is not calset.sources:  # what is known of them beforehand
+        elif rewritten.sources is not calset.sources:  # their priors
             model = model_like(rewritten, model)
         return dataclasses.replace(item, explained=_misfit(Likelihood.of(rewritten, model), misfit, steps)[0])
     except (ValueError, np.linalg.LinAlgError):

@@ -1,4 +1,4 @@
-"""The judge of the search that fits: trials, what was left out of their fits, and the model that goes on."""
+"""The judge of the search that fits: trials, the data left out of their fits, and the model that goes on."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from walop_jax.model.effects import Context, Described, EffectKind
 class Refits:
     """All that the fits of a search have in common; `adopt` is the only function that gives a state another fit.
 
-    `wanted` are the probes of `catalogue`, `sentences` and `parts` what else can be said (`grammar.beside_names`).
+    `wanted` are the probes of `catalogue`, `sentences` and `parts` other descriptions (`grammar.beside_names`).
     Nothing further is tried after `most` fits, nor after the time `until` (infinite: no matter how long it takes).
     """
 
@@ -101,7 +101,7 @@ class Refits:
         return said if further else Described.saying([change.text], [float(amplitude)])
 
     def _hopeful(self, evidence: Examination, item: Ranked) -> bool:
-        """True if a sentence predicts what it has not seen, by its linear step: nobody has a name for it to believe."""
+        """True if a sentence predicts held-out data by its linear step: it has no name that would support it."""
         single = any("exposure" in text for text in said_by(item.probe))
         column = [evidence.said[item.probe.name]]
         return predicts_unseen(evidence.design, column, thresholds.HOPEFUL, of_states=not single)
@@ -123,7 +123,7 @@ class Refits:
         return [*trials, *described], {**state.choices, **compared}
 
     def confronted(self, evidence: Examination, trial: Trial) -> Trial:
-        """A trial with the exposures and places that were left out of its fit, and what each KIND has against it."""
+        """A trial with the exposures and places left out of its fit, and the evidence of each KIND against it."""
         assert trial.fit is not None
         after = Design.of(trial.fit)
         compared = before_and_after(trial.effect.name, evidence.design, after)
@@ -175,7 +175,7 @@ class Refits:
             }
             groups = (*earlier.said, *groups)
         step = dataclasses.replace(trial, compared=compared, said=groups)
-        self.tell(f"added {name}; scoring what is left")
+        self.tell(f"added {name}; scoring the residuals")
         return self.adopt(state, result, [*steps, step])
 
 
@@ -197,7 +197,7 @@ def without(result: FitResult, name: str, remaining: Collection[str]) -> FitResu
 
 
 def contradicting(before: Design, after: Design) -> str:
-    """KINDs of exposures that all others predict worse with what a fit has more; empty: none."""
+    """KINDs of exposures that all others predict worse with the additions of a fit; empty: none."""
     gains = gains_by_kind(before, after)
     return ", ".join(f"KIND {kind}" for kind, gain in gains.items() if gain < -thresholds.CONTRADICTED)
 

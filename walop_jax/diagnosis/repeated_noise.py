@@ -1,11 +1,11 @@
 """Is the noise of two exposures the same? The general test for data that are there twice, whatever was done to them.
 
-Equation    ρ = Σ r₁·r₂ / √(Σ r₁² Σ r₂²) over the field points that two exposures share, r what a fit leaves of each.
+Equation    ρ = Σ r₁·r₂ / √(Σ r₁² Σ r₂²) over the field points that two exposures share, r the residuals of each.
             Independent noise gives Σ r₁·r₂ the variance Σ tr(P₁P₂), at most (K − f) for each point, P = 1 − ŵŵᵀ being
-            what is left of the noise of K cameras when f fluxes have been fitted
+            the rest of the noise of K cameras when f fluxes have been fitted
 Symbols     ŵ expected counts / errors, of unit length; p that of a normal deviate, for all pairs at once (Šidák)
 Source      correlation of independent residuals: Fisher 1915, Biometrika 10, 507; many questions: Šidák 1967
-Limits      What the model lacks hangs together as well, and is added to the noise: a pair is named only where ρ is more
+Limits      Missing effects correlate as well, and are added to the noise: a pair is named only where ρ is more
             than its squared residuals let a common pattern make. Below ρ = 0.25 nothing is named. Parameters take a
             little of the noise of all exposures together, which makes ρ smaller. Exposures that share a flux are not
             looked at. Unlike `data.repeats`, which looks for counts that agree, it needs a fit, but not many exposures,
@@ -31,7 +31,7 @@ _SHOWN = 3
 
 
 class _Pair(NamedTuple):
-    """Positions of two exposures and the correlation of what the fit leaves of them."""
+    """Positions of two exposures and the correlation of their residuals."""
 
     first: int
     second: int
@@ -74,7 +74,7 @@ def pairs_alike(design: Design, alarm: float = thresholds.ALARM) -> list[_Pair]:
         return []
     first_square, second_square = square[first, second], square[second, first]
     correlation = product[first, second] / np.sqrt(first_square * second_square)
-    # The fit takes something of every exposure: the noise is measured by what it leaves.
+    # The fit takes something of every exposure: the noise is measured by the residuals.
     deviate = correlation * np.sqrt(expected[first, second])
     limit = -special.ndtri(local_p(alarm, len(first)))
     excess = 0.5 * (first_square / free[first] + second_square / free[second]) / shared[first, second] - 1.0

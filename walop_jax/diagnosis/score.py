@@ -2,7 +2,7 @@
 
 Symbols      r whitened residuals at the best fit, prior rows appended; J = ∂r/∂θ of the free base parameters;
              C_g = ∂r/∂ε of the amplitudes of candidate g at zero.
-Projection   C̃ = (1 − QQᵀ) C with Q from the QR decomposition of J: what the base could have absorbed is removed.
+Projection   C̃ = (1 − QQᵀ) C with Q from the QR decomposition of J: removed is the part that the base absorbs.
 Gram matrix  Everything below follows from G = C̃ᵀC̃, s = C̃ᵀr and r·r. A candidate joins the base by a Schur complement.
 Statistic    T_g = s_gᵀ G_gg⁺ s_g; χ² with rank(G_gg) degrees of freedom under the base model.
              One-step amplitudes ε = −G_gg⁺ s_g, covariance G_gg⁺.
@@ -90,7 +90,7 @@ class Projector:
     """Removes from columns everything that the base parameters could absorb.
 
     `eliminated` counts the directions that are gone from residuals and columns already: one for every flux that
-    was solved for. `free` is what is left for noise, `basis` an orthonormal basis of what is removed.
+    was solved for. `free` is the number left for noise, `basis` an orthonormal basis of the part removed.
     """
 
     def __init__(self, jacobian: Matrix, eliminated: int = 0) -> None:
@@ -323,7 +323,7 @@ class ScoreSpace:
         """ln of the smallest p among all candidates, drawn under the base."""
         if not self._root.rank:
             return np.zeros(0)
-        # Scores s = L n have covariance G for unit normals n. Seven digits are plenty for what is only counted.
+        # Scores s = L n have covariance G for unit normals n. Seven digits are plenty for a count.
         root = self._root.whole.astype(np.float32)
         return self.smallest_of(root @ rng.standard_normal((draws, root.shape[1]), dtype=np.float32).T)
 
@@ -362,7 +362,7 @@ class _Root:
         self._chosen = order[: self.rank]
 
     def explained(self, scores: Vector) -> float:
-        """sᵀ G⁺ s of the scores s = Cᵀr: the square of what of r lies in the span of the columns C."""
+        """sᵀ G⁺ s of the scores s = Cᵀr: the square of the part of r in the span of the columns C."""
         if not self.rank:
             return 0.0
         solution = linalg.solve_triangular(self.whole[self._chosen], scores[self._chosen], lower=True)
@@ -377,7 +377,7 @@ def log_bayes(
         B = ⟨exp(½ sᵀ (G + Λ⁻¹/t²)⁻¹ s) / det(1 + t² Λ^½ G Λ^½)^½⟩ over t, Λ^½ the prior widths
 
     A width says how large one number may be. Of many independent ones it would say as well how large they are together,
-    which nobody knows: all scales are as probable beforehand (mixtures of priors: Liang et al. 2008, JASA 103, 410).
+    which is unknown: all scales are as probable beforehand (mixtures of priors: Liang et al. 2008, JASA 103, 410).
     """
     value, vector = np.linalg.eigh(gram * np.outer(widths, widths))
     t = (scales if len(widths) > 1 else np.ones(1))[:, None] ** 2

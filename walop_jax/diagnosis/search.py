@@ -1,15 +1,15 @@
-"""The search for what is missing: while something is, additions are tried, refused with a reason, or adopted.
+"""The search for missing effects: while one is missing, additions are tried, refused with a reason, or adopted.
 
 All is functions of a `State`, which never changes. `refused` has all rules by which an addition is not made, `search`
 is the loop. What differs between the search that fits (`refits.Refits`) and the one of the blind study, which takes
 linear steps (`tests/diagnosis/linear_judge.py`), is a `Judge`.
 
-1. Candidates are ordered by their linear evidence. What could not be added by its linear step is not tried.
+1. Candidates are ordered by their linear evidence. Candidates that their linear step would refuse are not tried.
 2. The best is fitted. If it leaves nothing but noise, no rival can be better. If its evidence differs from that of its
    linear step by more than `thresholds.LINEAR_GOOD`, rivals that lie within twice the difference are fitted as well.
 3. Where the model is far off and no name explains half of that, or none is left, what cannot be differentiated
    competes with the names: structural effects and other descriptions of the instrument (`descriptions`).
-4. The best that data which took no part in its fit confirm is adopted, and what is left is scored again.
+4. The best that data which took no part in its fit confirm is adopted, and the residuals are scored again.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ Judge = Any
 
 over        amount of work after which nothing further is tried, in words; empty: there is more to spend
 fitted      a linear trial as the judge finds it
-others      trials of what has no linear step, and other descriptions of the instrument that were compared
+others      trials of effects without a linear step, and other descriptions of the instrument that were compared
 decided     trials in order of evidence, with those that are even decided
 confronted  a trial with what data that took no part in its fit say of it
 adopted     the state once a trial has joined the model
@@ -97,24 +97,25 @@ def search(state: State, judge: Judge) -> State:
 
 
 def refused(evidence: Evidence, trial: Trial) -> str:
-    """Reason not to add what was tried; empty: there is none."""
+    """Reason not to add the effect of a trial; empty: there is none."""
     if trial.fit is not None and not trial.fit.converged:
         return "its fit did not converge"
     if not trial.predicts:
         return "by its linear step it does not predict settings and field points that it has not seen"
-    # Linear evidence counts in the scatter behind all candidates already, that of fits in the errors as stated.
-    unit = 1.0 if trial.fit is None else evidence.floor**2
-    worth, needed = trial.evidence / unit, evidence.evidence_needed
+    # Linear evidence counts in the scatter behind all candidates already, that of fits in their errors.
+    fitted, needed = trial.fit is not None, evidence.evidence_needed
+    worth = trial.evidence / evidence.floor**2 if fitted else trial.evidence
     if worth <= needed:
         return f"ln B = {worth:.3g} is not above {needed:.3g}"
     explained, least = evidence.chi2 - trial.left, _least_explained(evidence, trial)
     if explained < least:
         missing = evidence.chi2 - evidence.dof
         return f"it explains {explained:.4g} of {missing:.4g} that are missing in χ², less than {least:.4g}"
-    # What is left is noise, and was not before: a pattern can only say the same with more numbers.
+    # The residuals are noise now: a pattern can only describe the same with more numbers.
     suffices = trial.noise and not explains(evidence.chi2, evidence.dof)
-    if not suffices and not _stands(evidence, trial, worth):
-        return f"a pattern without a name is more probable (ln B = {evidence.best_pattern:.3g}, its own {worth:.3g})"
+    if not suffices and not _stands(evidence, trial):
+        best = evidence.best_pattern(fitted=fitted)
+        return f"a pattern without a name is more probable (ln B = {best:.3g}, its own {trial.evidence:.3g})"
     before, after = (trial.compared.get(f"heldout_{when}", np.nan) for when in ("before", "after"))
     if after >= before:
         return (
@@ -124,26 +125,26 @@ def refused(evidence: Evidence, trial: Trial) -> str:
 
 
 def _least_explained(evidence: Evidence, trial: Trial) -> float:
-    """Part of what is missing in χ² that an addition must explain."""
+    """Part of the excess of χ² that an addition must explain."""
     missing = evidence.chi2 - evidence.dof
     least = thresholds.LEAST_SHARE * missing
-    # Of a poor fit the final model is asked (`thresholds.PART`): what is missing there may be many things.
+    # Of a poor fit the final model is asked (`thresholds.PART`): its misfit may have many causes.
     if evidence.poor or trial.effect is Described:
         return least
     surely = missing - 2.0 * np.sqrt(2.0 * evidence.dof)
     return max(least, thresholds.LEAST_SHARE_OF_NAME * surely)
 
 
-def _stands(evidence: Evidence, trial: Trial, worth: float) -> bool:
+def _stands(evidence: Evidence, trial: Trial) -> bool:
     """True if no pattern without a name is clearly more probable."""
     probes = [probe for probe in evidence.probes if probe.effect is trial.effect]
-    if not probes and trial.effect is not Described:  # what has no linear step
+    if not probes and trial.effect is not Described:  # without a linear step
         return True
-    return evidence.stands(probes, worth)
+    return evidence.stands(probes, trial.evidence, fitted=trial.fit is not None)
 
 
 def hopeless(evidence: Evidence, trial: Trial) -> str:
-    """Reason not to try what a linear step would refuse even if it were better by as much as such steps may miss."""
+    """Reason not to try an effect that is refused even if it is better by the error of linear steps."""
     if trial.evidence <= thresholds.LINEAR_BELOW:
         return refused(evidence, trial)
     factor = 1.0 + thresholds.LINEAR_SHARE
@@ -162,7 +163,7 @@ def linear_trials(evidence: Evidence) -> list[Trial]:
 
 
 def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
-    """Trial of one candidate by its linear step; `linear` is what a fit should find, with its errors."""
+    """Trial of one candidate by its linear step; `linear` is the expected result of a fit, with its errors."""
     noise, statistic = evidence.table.noise_scale, item.score.statistic
     remaining = evidence.chi2 - statistic * (noise * evidence.scale) ** 2
     return Trial(
@@ -171,7 +172,7 @@ def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
         remaining,
         explains(remaining, evidence.dof - item.score.rank),
         item=item,
-        linear=item.log_bayes + 0.5 * statistic * (noise**2 - 1.0),
+        linear=item.log_bayes + evidence.by_fit(item.score),
     )
 
 
@@ -197,7 +198,7 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
     """The addition with the highest evidence that is not refused (None: all are), and the state with the reasons."""
     evidence, log, fits, choices = state.evidence, _Log(state.evidence), state.fits, state.choices
     waiting = log.passed(linear_trials(evidence), hopeless)
-    tried, accepted, ended = list(waiting), None, ""
+    tried, accepted, confirmed, ended = list(waiting), None, [], ""
     others_asked = sentences_asked = False
     while accepted is None:
         new: list[Trial] = []
@@ -223,11 +224,18 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
             fits += len(alternatives)
             alternatives = log.passed(alternatives)
             new, tried = [*new, *alternatives], [*tried, *alternatives]
-        for trial in judge.decided(sorted(new, key=names_first)):
+        for trial in judge.decided(sorted([*new, *confirmed], key=names_first)):
             if accepted := next(iter(log.passed([judge.confronted(evidence, trial)])), None):
                 break
+        # Sentences were behind a name that was refused: they come before another one that is less probable.
+        if accepted is not None and not confirmed:
+            confirmed = [accepted]
+            waiting = log.passed(_sentences_behind(evidence, tried, accepted), hopeless)
+            tried += waiting
+            accepted = None if waiting else accepted
         if not waiting or (ended := judge.over(fits)):
             break
+    accepted = accepted or next(iter(confirmed), None)
     if accepted is not None:
         ended, accepted = "", _with_rivals(evidence, accepted, tried)
     added = "" if accepted is None else accepted.name
@@ -243,16 +251,19 @@ def _is_sure(trial: Trial, waiting: Sequence[Trial]) -> bool:
     return trial.noise or not waiting or trial.linear - waiting[0].linear >= reach
 
 
-def _sentences_behind(evidence: Evidence, tried: Sequence[Trial]) -> list[Trial]:
-    """The leading sentences, without those that were tried."""
+def _sentences_behind(evidence: Evidence, tried: Sequence[Trial], name: Trial | None = None) -> list[Trial]:
+    """The leading sentences, without those that were tried; clearly more probable than a name, if it is given."""
+    least = -np.inf if name is None or name.item is None else name.item.log_bayes + thresholds.EVEN_ODDS
     untried = [
-        item for item in evidence.significant_sentences if not any(item is trial.item for trial in tried)
+        item
+        for item in evidence.significant_sentences
+        if item.log_bayes > least and not any(item is trial.item for trial in tried)
     ]
     return [linear_trial(evidence, item) for item in untried[: thresholds.MOST_SENTENCES]]
 
 
 def _with_rivals(evidence: Evidence, trial: Trial, tried: Sequence[Trial]) -> Trial:
-    """A trial with what is not improbable beside it, and other shapes of its effect that are as probable."""
+    """A trial with the alternatives that are not improbable, and other shapes of its effect that are as probable."""
     rivals, shapes = [], list(trial.alternatives)
     for rival in tried:
         if rival.name == trial.name:
@@ -290,7 +301,7 @@ def _came_first(added: str) -> str:
 
 
 def _too_far(evidence: Evidence, item: Ranked) -> str:
-    """Reason for which a significant candidate was not tried: what comes before it."""
+    """Reason for which a significant candidate was not tried: the candidates before it."""
     names, sentences = evidence.significant, evidence.significant_sentences
     best = max([*names[:1], *sentences[:1]], key=lambda ranked: ranked.log_bayes)
     gap = best.log_bayes - item.log_bayes

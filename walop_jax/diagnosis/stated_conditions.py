@@ -2,7 +2,7 @@
 
 A field that is displaced, turned or scaled, a filter curve that is displaced, a lamp of another temperature: each is a
 single number, and a fit takes most of it up in its own parameters, which are then wrong by many standard errors while
-χ² hardly changes. Patterns over field and exposures, of which there are hundreds, miss what is spread over all data.
+χ² hardly changes. Patterns over field and exposures, of which there are hundreds, miss a misfit spread over all data.
 So each number has its own efficient score (`score`), with the derivative
 
     C = [r(θ̂; set with c + h) − r(θ̂; set with c − h)] / 2h
@@ -16,7 +16,7 @@ these: the prior of each parameter, and those of each element together, are riva
 value)/width. So are terms of one camera with one amplitude: a non-linearity (its counts squared), a pedestal, scattered
 light (the median counts of an exposure), light of another camera. What cannot be told apart is told together.
 
-Limits      What the free parameters take up whole is told by no residual: with a single filter its displacement, the
+Limits      Mistakes that free parameters absorb whole show in no residual: with a single filter its displacement, the
             thicknesses of the plates look the same. One number at a time, by a linear step: the size is a hint.
 """
 
@@ -59,7 +59,7 @@ _PRECESSION = (
     46.124 / 3600.0,
     20.043 / 3600.0,
 )  # deg a year: m, n, Capitaine et al. 2003, A&A 412, 567, J2000
-STEP = 1e-4  # of the width: what is left out of the derivative is its square
+STEP = 1e-4  # of the width: the error of the derivative is its square
 
 
 class _Stated(NamedTuple):
@@ -84,7 +84,7 @@ class _Stated(NamedTuple):
 class _Scored(NamedTuple):
     """A number, the score of changing it, and the derivative of the residuals (rows of the design).
 
-    `square` is the square of what the model leaves of the derivative: information, in errors as stated.
+    `square` is the square of the residual of the derivative: information, in errors as stated.
     """
 
     stated: _Stated

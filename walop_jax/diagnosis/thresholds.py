@@ -35,20 +35,20 @@ SAME_COUNTS = 0.01
 POOR_FIT = 1.5
 """χ²/dof above which structural effects and other descriptions are tried. Not measured: no scene is so poor."""
 GOOD_SHARE = 0.5
-"""Share of what is missing that a name must explain for these not to be tried. Not measured."""
+"""Share of the misfit that a name must explain for these not to be tried. Not measured."""
 
 LINEAR_BELOW = 150.0
 """Evidence of the best above which rivals are tried down to `LINEAR_SHARE` of it less. Not measured."""
 LINEAR_SHARE = 0.6
 """By which a fit may be better than its linear step there. Not measured."""
 FLOOR = 1.25
-"""Standard deviations of what is left behind all candidates above which evidence counts in that unit. Not measured:
+"""Standard deviations of the residuals behind all candidates above which evidence counts in that unit. Not measured:
 errors of all scenes are as stated."""
 
-# --------------------------------------------------------------------------------------------- what may be added?
+# ------------------------------------------------------------------------------------------------------- additions
 
 LEAST_SHARE = 0.1
-"""Share of what is missing that an addition must explain. Ablation: no gain where the fit is not poor."""
+"""Share of the misfit that an addition must explain. Ablation: no gain where the fit is not poor."""
 LEAST_SHARE_OF_NAME = 0.25
 """Of what is surely missing (2 σ of χ²) a name, where the fit is not poor: else it stands in for what has none.
 Ablation."""
@@ -79,12 +79,12 @@ MOST_PATTERNS = 8
 MOST_CLASSES = 8
 """Rivals of one name, and names with rivals, that are listed. Not measured."""
 
-# ------------------------------------------------------------------------------------------------ what is reported?
+# --------------------------------------------------------------------------------------------------------- reports
 
 NEGLIGIBLE = 1e-4
 """Change of calibrated q and u that does not matter for an instrument good to 10⁻³."""
 MOST_NAMES = 2
-"""Names above which a single effect that nobody thought of is as likely. Blind."""
+"""Names above which a single effect outside the catalogue is as likely. Blind."""
 LARGEST_ROBUST_RATIO = 1.5
 """Of errors that allow for common disturbances of an exposure, to errors that do not. Not measured."""
 LIMIT = 0.95
@@ -107,7 +107,7 @@ READING_ALIKE = 1.5
 READING_SURE = 1.2
 """χ²/dof up to which another reading explains the data to the noise, before anything is looked for. Not measured."""
 
-# ------------------------------------------------------------------------------------- what is asked, and for how long
+# ------------------------------------------------------------------------------------------------ candidates and time
 
 MOST_FITS = 40
 """Exact fits of additions in one diagnosis, after which nothing further is tried. Not measured."""
@@ -115,9 +115,9 @@ MOST_FITS_FAR_OFF = 12
 """The same where the model is so far from the data that errors were scaled (`fit.search.FAR_OFF`). Not measured."""
 
 RINGS = (3, 4, 5, 6, 7, 8)
-"""Degrees of patterns of rings about the centre of the field; the throughput takes up what is smoother."""
+"""Degrees of patterns of rings about the centre of the field; the throughput absorbs smoother ones."""
 ASKED_BY_CAMERA = ("pedestal", "nonlinearity")
-"""Effects that are asked camera by camera, under the names of what they are there."""
+"""Effects that are asked camera by camera, under their names there."""
 
 
 def in_use() -> dict[str, float]:

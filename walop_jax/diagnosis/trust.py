@@ -1,6 +1,6 @@
 """Is a fit to be trusted? What its residuals say against it, whatever the total χ² says.
 
-χ² of everything hides what is small beside all the noise, or what is made up for elsewhere. Here the residuals
+χ² of everything hides errors small beside all the noise, or made up for elsewhere. Here the residuals
 are asked in smaller questions, each with a known answer under the model that was fitted:
 
 Patterns    the efficient score of every free-form pattern (`design`) with one global p for all of them: structure
@@ -15,7 +15,7 @@ Components  the variance of what field points, exposures, states, standards, nig
 Conditions  the efficient score of every number that the set states of itself: field, filters, colours, sky; of every
             prior, term of a camera and effect of the catalogue (`stated_conditions`).
 Candidates  the efficient score of every effect and description of a diagnosis (`candidate_scores`).
-Repeats     the correlation of what is left of two exposures (`repeated_noise`).
+Repeats     the correlation of the residuals of two exposures (`repeated_noise`).
 Errors      χ²/dof far below 1: N_ERR is overestimated. A few per cent are attributed to the stated errors,
             not to the model.
 
@@ -24,7 +24,7 @@ Symbols     w = expected counts / errors of what has a flux in common (an exposu
             parameters.
 Sources     Rao 1948; Satterthwaite 1946, Biometrics Bull. 2, 110 (χ² with two moments); Šidák 1967 (many questions).
 Limits      Noise alone raises a doubt in about one fit of 100. Of a large set a sample of the points is looked at, of
-            whole frames the points that stand for all pixels: what is smaller shows in χ² and in the residual map.
+            whole frames the points that stand for all pixels: finer structure shows in χ² and in the residual map.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ TRUST_ROWS = 20_000
 UNEVEN = 1.25
 """Factor between the squared residuals of a group and those of all below which it is a matter of the stated errors."""
 NOISELESS = 1e-6
-"""Squared residuals, beyond what the parameters can make, of data that hold no noise: rounding, and second order."""
+"""Squared residuals, beyond the reach of the parameters, of data that hold no noise: rounding, and second order."""
 _SHOWN = 3
 
 
@@ -246,7 +246,7 @@ def group_scores(design: Design) -> list[_GroupScore]:
         means = [float(expected[subset].sum()) for subset in (group, complement)]
         if min(means) <= 0:
             continue
-        # ‖P‖² among what has a flux in common; what the parameters couple beyond that is small beside it.
+        # ‖P‖² among what has a flux in common; further coupling by parameters is small beside it.
         flux_shares = [np.where(subset, w, 0.0) for subset in (group, complement)]
         sums = [shared.summed(subset) for subset in flux_shares]
         squared_norms = [

@@ -15,10 +15,10 @@ that with B = QᵀA and D what the fluxes leave of AᵀA, block by block,
 
     tr G = tr D − tr M,   tr G² = |D|² − 2 tr BDBᵀ + |M|²,   tr G³ = tr D³ − 3 tr BD²Bᵀ + 3 tr BDBᵀM − tr M³,  M = BBᵀ.
 
-Groupings   the gain of each camera, and what it makes of each Stokes parameter, at each field point (structure finer
+Groupings   the gain of each camera, and its response to each Stokes parameter, at each field point (structure finer
             than any polynomial: flat fields, dust, pixels); its gain and gradients over the field in each exposure;
-            what it makes of each Stokes parameter in each state of the moving elements; its gain and gradients for
-            each night and kind of exposure; its gain and what it makes of each Stokes parameter for each standard
+            its response to each Stokes parameter in each state of the moving elements; its gain and gradients for
+            each night and kind of exposure; its gain and response to each Stokes parameter for each standard
 Symbols     r whitened residuals; w expected counts / errors of what has a flux in common, of unit length; Q orthonormal
             basis of the derivatives with respect to the free parameters; τ a share of the counts
 Sources     score test of a variance component: Rao 1948; Lin 1997, Biometrika 84, 309. Three moments: Imhof 1961,
@@ -51,7 +51,7 @@ WITH_STRUCTURE = "N_ERR with structure of field points"
 
 
 class _Grouping(NamedTuple):
-    """A way of grouping the data, and what may differ from place to place.
+    """A way of grouping the data, and the quantities that may differ from place to place.
 
     `place` is the number of the place of every (point, exposure), −1 for none; the gain of a camera there is multiplied
     with each of the `features`. `words` say what agrees; `structure` names the field of `Structure` that its size is,
@@ -94,7 +94,7 @@ def found_components(components: list[VarianceComponent]) -> list[VarianceCompon
 
 
 def in_words(components: list[VarianceComponent]) -> Iterator[str]:
-    """One sentence on what was found; a grouping that is asked as well often answers to the same structure."""
+    """One sentence on the result; a grouping that is asked as well often answers to the same structure."""
     if not components:
         return
     first = components[0]
@@ -117,7 +117,7 @@ def structure_of(components: list[VarianceComponent]) -> Structure:
 def with_structure(
     result: FitResult, design: Design, components: list[VarianceComponent], points: int
 ) -> FitResult:
-    """The fit with what the structure of field points does to its parameters added to their covariance.
+    """The fit with the effect of the structure of field points on its parameters in their covariance.
 
     With J = QR the parameters take up R⁻¹QᵀA of the amplitudes, so that τ² R⁻¹BBᵀR⁻ᵀ is added. `design` may be of a
     sample of so many `points`: structure then counts by their share, as noise does.

@@ -112,7 +112,7 @@ def diagnose(
     evidence, added = state.evidence, [step.effect.name for step in state.steps]
     steps = tuple(_finished(step, evidence, context, added) for step in state.steps)
     verdict: Outcome = "unexplained" if remainder else "effect_found" if steps else "consistent"
-    tell("examining what is left")
+    tell("examining the residuals")
     alike = {name for step in steps for name in (*step.equivalent, *step.nameless)} - {Described.name}
     groups = [name for step in state.steps for name in step.said]
     diagnosis = Diagnosis(

@@ -1,6 +1,6 @@
 """Configuration of the site: `sphinx-build -W -b html walop_jax/docs SITE`, with the dependency group `site`.
 
-The pages are those that `walop-jax docs` shows. Three directives make of the package what would otherwise be copied:
+The pages are those that `walop-jax docs` shows. Three directives make text from the package, which is not copied:
 the reference of the commands, that of the public names, and a gallery of the notebooks.
 """
 

@@ -1,12 +1,12 @@
 """Single intensities that neither model nor noise explain: cosmic rays, stars in a patch of sky.
 
 Equation    |r| > c s v,  s = max(1, 1.4826 median |r / v|),  v² = independent data of a row / K
-Symbols     r normalised residual of a camera, K cameras, v what is left of its standard error with the flux eliminated
+Symbols     r normalised residual of a camera, K cameras, v its standard deviation with the flux eliminated
             (v² = 1 − 1/K for one flux, 1 where it is known), c the number of standard errors, s how much more the
             residuals of this fit scatter than stated, by their median absolute deviation: it does not see the outliers
 Source      clipping: Yahil & Vidal 1977, ApJ 214, 347
 Limits      noise alone, c = 5: one row of 440 000 of four cameras. More than `MOST` of the rows are no outliers but
-            what the model lacks
+            effects that the model lacks
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def clipped(calset: CalibrationSet, model: Model | None = None, beyond: float = 
     """Flag (BAD_PIXEL) rows more than `beyond` standard errors off, fit the others, and repeat until none is.
 
     The farthest go first, down to half of their distance: large outliers bend a fit, and good rows then lie off
-    as well. As long as it does, errors are taken as large as what is left. Stops where more than `MOST` of the rows
+    as well. As long as it does, errors are taken as large as the residuals. Stops where more than `MOST` of the rows
     are flagged, and where all of them lie off alike: that is for `FitResult.warnings` to say. Raises ValueError for
     `beyond` below `LEAST`, and what `fit` raises.
     """

@@ -84,7 +84,7 @@ def parameter_table(model: Model, values: Vector, sigma: Vector) -> Any:
         "PRIOR_MEAN": (priors[:, 0], "", "mean of the prior"),
         "PRIOR_SIGMA": (priors[:, 1], "", "standard deviation of the prior"),
         "STATE": (np.array(states), "", "free, fixed, tied to another, or known from its prior only"),
-        "ABOUT": (np.array([p.about for p in model.parameters]), "", "what it is"),
+        "ABOUT": (np.array([p.about for p in model.parameters]), "", "meaning"),
     }
     return astropy_table(columns)
 

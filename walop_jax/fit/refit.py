@@ -55,7 +55,7 @@ class FitResult(Fitted):
 
     `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `verdict` is None
     until the residuals were examined (`diagnosis.trust.examined`); to ask for `trusted` before is an error.
-    `errors_from` is what the covariance was made from, the stated errors of the data (`STATED`) or residuals; `hidden`
+    `errors_from` is the source of the covariance, the stated errors of the data (`STATED`) or residuals; `hidden`
     are mistakes that the residuals would not show, None until these were examined. `answer` works out how well stars
     are known with it (`science.field_accuracy.answered`), which is shown first. `averaged` makes of its calibration the
     mean over models that its data cannot tell apart (`diagnosis.class_product`); None where there is one model alone.
@@ -184,7 +184,7 @@ class FitResult(Fitted):
         """The verdict; raises RuntimeError for a fit without one."""
         if self.verdict is None:
             raise RuntimeError(
-                "nobody has examined the residuals of this fit: call walop_jax.diagnosis.trust.examined(fit), as "
+                "the residuals of this fit are not examined yet: call walop_jax.diagnosis.trust.examined(fit), as "
                 "walop_jax.refit and walop_jax.diagnose do"
             )
         return self.verdict
@@ -353,7 +353,7 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
         yield Doubt(
             Quality.UNEXPLAINED | excess,
             f"the model does not explain the data: χ²/dof = {ratio:.4g}, where 1 is expected; do not use this "
-            "calibration (walop-jax diagnose looks for what is missing)",
+            "calibration (walop-jax diagnose looks for missing effects)",
         )
     elif result.errors_too_large and not noiseless:
         yield Doubt(
@@ -400,8 +400,8 @@ def refit(
 ) -> FitResult:
     """Fit a calibration set with `model` (default: the base model).
 
-    `progress` is called with a line about what is being done; `memory` (bytes, default 2 GB) is what the data of the
-    points may take. Errors are those of `with_honest_errors`. Raises what `fit` raises.
+    `progress` is called with a line about each step; `memory` (bytes, default 2 GB) is the limit for the data of
+    the points. Errors are those of `with_honest_errors`. Raises what `fit` raises.
     """
     runner = Runner(progress=progress)
     likelihood = Likelihood.of(calset, model or base_model(calset), memory=memory, runner=runner)

@@ -229,7 +229,7 @@ def _far_off(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
         message = (
             f"given up after {passes} steps from {starts} starts: χ²/dof stays near {best.misfit:.3g}, and more steps "
             "buy nothing; check the columns of the set, INSTRUME and the description of the instrument, or look for "
-            "what is missing (walop-jax diagnose)"
+            "missing effects (walop-jax diagnose)"
         )
         minimum = dataclasses.replace(minimum, message=message)
     return dataclasses.replace(best, minimum=minimum, starts=starts)

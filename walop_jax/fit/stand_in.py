@@ -60,7 +60,7 @@ def with_pixel_structure(calset: CalibrationSet, structure: Structure) -> Calibr
 def with_pixels(result: FitResult) -> FitResult:
     """The fit of a set that stands for pixels with the χ² and the degrees of freedom of these; any other as it is.
 
-    From where they were summed χ² of the pixels changes as that of the field points does. What the set holds beside
+    From where they were summed χ² of the pixels changes as that of the field points does. The data of the set beside
     them counts by itself, and so do parameters that there were not.
     """
     compression, likelihood = result.calset.compression, result.likelihood

@@ -81,7 +81,7 @@ class Doubt:
 class Structure:
     """Differences between field points that are finer than the model, rms over points and cameras.
 
-    `gain` is that of the gain of a camera (a share of its counts), `response` that of what it makes of fully polarised
+    `gain` is that of the gain of a camera (a share of its counts), `response` that of its response to fully polarised
     light (a share of the counts as well); 0 where residuals show none. Standard errors of everything that is seen at
     one place of the field hold them: no average over exposures makes them smaller.
     """
@@ -101,7 +101,7 @@ NOT_MEASURED = (
 )
 """Remark on mistakes without information in the data, at their usual sizes."""
 EFFECT, DATA = "effect", "data"
-"""Kinds of mistakes that could hide: of the model of the instrument, of what the set states of its data."""
+"""Kinds of mistakes that could hide: of the model of the instrument, of numbers that the set states."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -103,7 +103,7 @@ class OutputFolder:
                     os.replace(temporary / name, self.target / name)
             flush_folder(self.target.parent if new else self.target)
         except OSError as error:
-            advice = "free some space; what was there is untouched" if untouched else "write it again"
+            advice = "free some space; the old content is untouched" if untouched else "write it again"
             raise fail(f"writing failed: {error.strerror or error}", file=self.path, advice=advice) from error
         finally:
             remove(temporary)

@@ -1,11 +1,11 @@
 """Responses of the residuals to small changes of an instrument: the columns of the score test, all from one program.
 
 A change is a sum of sentences (`model.effects.change`), with a coefficient each. Its column is the derivative of the
-used residuals with respect to its amplitude, at neutral: what it does to the light or to the analysis vectors
-(`model.slots`) meets the exposures, is multiplied by what it grows with, and the flux takes up its part.
+used residuals with respect to its amplitude, at neutral: its change of the light or of the analysis vectors
+(`model.slots`) meets the exposures, is multiplied by its factors, and the flux takes up its part.
 
 Equation    ∂r/∂a = −P w F f (∂a_k/∂a · s + a_k · ∂s/∂a)
-Symbols     w = 1/σ, F flux, f what the change grows with, P projection off the flux (`flux.project_flux`)
+Symbols     w = 1/σ, F flux, f factors of the change, P projection off the flux (`flux.project_flux`)
 Limits      first order. Where detectors are not linear their derivative stands ahead of w.
 """
 
@@ -430,9 +430,8 @@ class ResponseBlock:
     def _core(self, slot: Slot) -> Float[np.ndarray, "m k n"]:
         responses = self.found
         if slot[0] == "light":
-            vectors = np.take_along_axis(
-                responses.vectors.vectors, self.band[:, None, :, None, None], axis=2
-            )  # p m e k 4
+            # P m e k 4.
+            vectors = np.take_along_axis(responses.vectors.vectors, self.band[:, None, :, None, None], axis=2)
             change = responses.light.slopes[:, :, self.of.of_light[slot[:4]]]
             for star in slot[4:]:
                 change = change * (self.value == star)[:, None, :, None]

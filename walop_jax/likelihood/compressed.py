@@ -5,10 +5,10 @@ Method      Blocks of cells are given n × n field points, at the nodes of the G
             errors are made from the sums there: with Ω = Σ F²w² and F the mean flux
                 N = F (u + Ω⁻¹ g),   σ = F Ω^(−½),
             so that the usual likelihood of these points has the gradient and the matrix of the pixels.
-Gradient    That of the points differs by what is not smooth within a block. The g are changed by K J β, the least
+Gradient    That of the points differs by structure within a block. The g are changed by K J β, the least
             change in units of their errors that gives the parameters of the model the gradient of the pixels.
-Limits      The matrix is that of the points. What is not smooth over the frame is not there: the residual map of the
-            fit shows it. χ² is that of the points; that of the pixels is told beside it (`records.Compression`).
+Limits      The matrix is that of the points. Structure that is not smooth over the frame is in the residual
+            map of the fit alone. χ² is that of the points; that of the pixels is in `records.Compression`.
 Source      Golub & Welsch 1969, Mathematics of Computation 23, 221 (nodes of the rule).
 """
 

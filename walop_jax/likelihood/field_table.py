@@ -3,7 +3,7 @@
     f(x, y) ≈ Σ c_ij T_i(tx) T_j(ty),    tx, ty from −1 to 1 over a rectangle of the field
 
 The optics are analytic in the field, so a few hundred field points stand for every pixel: they are solved on n × n
-nodes, and a table is taken only if it gives what they are at other places as well. A series has all terms with
+nodes, and a table is taken only if it gives their values at other places as well. A series has all terms with
 i, j < n, which is the polynomial through the nodes, or half of them, i + j < n: as accurate with a few nodes more,
 and quicker to evaluate at many points.
 

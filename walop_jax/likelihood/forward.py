@@ -6,7 +6,7 @@ Symbols     θ parameters of the model, in its order and units; N ± σ used int
             of unit flux (`model.light`), through the detectors where their response is not linear; F flux of each
             (point, exposure), the one that fits best (`likelihood.flux`); μ, s mean and width of a prior
 Gauges      constants are left out of the densities. A free parameter without a prior may have a weak pull to its start
-            value, which keeps what the data do not determine from running away; it is part of ln p, as in a fit
+            value, which keeps undetermined parameters from running away; it is part of ln p, as in a fit
 Ties        a tied parameter has the value of its master, whatever stands in its place
 Derivatives in any mode and order; the optics by the rule of `likelihood.optics`. Points are worked on in batches, in a
             scan, and a gradient computes each batch anew: its memory is that of one batch

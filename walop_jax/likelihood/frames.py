@@ -2,7 +2,7 @@
 
 Frames see a source that shines everywhere, so the counts for light of unit flux, u, are smooth over the field: all
 optics, sources and cameras there are, in one series of Chebyshev polynomials for each exposure and camera. With w = 1/σ
-and the best flux F of every exposure of a pixel (`flux.py`), what a pixel says of a change δ of u is
+and the best flux F of every exposure of a pixel (`flux.py`), the information of a pixel on a change δ of u is
 
     χ²(δ) = Σ r² − 2 g · δ + δᵀ K δ,    r = w (N − F u),   g = F w r,   K = F² (w² − w²u uᵀw² / Σ w²u²)
 

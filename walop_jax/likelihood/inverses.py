@@ -1,6 +1,6 @@
 """Linear algebra of quantities whose units differ by orders of magnitude: scaled row by row and column by column.
 
-What is taken for rounding, and left out, then depends on no unit.
+The threshold of rounding then depends on no unit.
 """
 
 from __future__ import annotations

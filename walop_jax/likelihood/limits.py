@@ -1,6 +1,6 @@
 """Sizes of the work: how much is computed together, kept in memory or looked at, and why just so much.
 
-Nothing here changes what is computed, only in what pieces, or how large a part of a set stands for all of it.
+Nothing here changes results, only the pieces of a computation, or how large a part of a set stands for all of it.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ they are (the colouring of a sparse Jacobian; Curtis, Powell & Reid 1974, J. Ins
 parameter reaches which rows is found by following it through the operations, not declared.
 
 Units       parameters in their units; field coordinates deg.
-Limits      what is not a parameter (field position, wavelengths, other arrays of the instrument) is differentiated
+Limits      all but parameters (field position, wavelengths, other arrays of the instrument) is differentiated
             by JAX, without a rule.
 """
 

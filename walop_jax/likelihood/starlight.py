@@ -2,7 +2,7 @@
 
 Equation    δa = Σ f B G F + a G_t      of the optics behind the telescope, of the light ahead of the polariser
 Symbols     a analysis vectors (camera; 1, q, u) of one setting; B, G, F as in `model.slots`; G_t generator of what
-            acts on the light itself; f what the change grows with over the field
+            acts on the light itself; f factors of the change over the field
 Limits      First order. Changes of sources, of the polariser, of detectors and in single exposures do nothing to a
             star; what grows with time, temperature or an angle is 0 in the usual setting.
 """
@@ -25,7 +25,7 @@ from walop_jax.model.slots import Slot, generators_ahead
 def added_to_starlight(
     columns: Columns, changes: Sequence[Change], exposure: int
 ) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
-    """Analysis vectors at the field points in the setting of an exposure, and what one unit of each change adds."""
+    """Analysis vectors at the field points in the setting of an exposure, and the part added by each change."""
     changed_terms = [columns.terms_of(change) for change in changes]
     slots = {term.slot for terms in changed_terms for term in terms}
     light = sorted(slot for slot in slots if slot[0] == "light" and slot[2] == "ahead of")

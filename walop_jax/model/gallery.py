@@ -61,7 +61,7 @@ def _effect(effect: EffectKind) -> Iterator[str]:
     """The paragraphs of the page of an effect."""
     yield from (f"# {effect.name}", f"{_about(effect)}.", *_indented(effect.head()))
     yield from _table(
-        ("parameter", "unit", "usual size", "what it is"),
+        ("parameter", "unit", "usual size", "meaning"),
         [
             (n, d.unit, "" if d.width is None else f"{d.width:g}", d.about)
             for n, d in effect.numbers().items()
@@ -74,7 +74,7 @@ def _effect(effect: EffectKind) -> Iterator[str]:
     entry = gallery["effects"].get(effect.name)
     if entry is not None:
         yield from _maps(entry)
-    yield "## How small it may be, and what it looks like"
+    yield "## How small it may be, and its signature"
     if entry is None:
         yield f"The example ({gallery['plan']}) has no numbers of it: its exposures do not show it, or were not asked."
     else:
@@ -88,7 +88,7 @@ def _effect(effect: EffectKind) -> Iterator[str]:
 
 def _maps(entry: Mapping[str, Any]) -> Iterator[str]:
     """Changes of the maps of the instrument matrix, at its usual size."""
-    yield "## What it does to the maps"
+    yield "## Its effect on the maps"
     size = f"{entry['parameter']} = {entry['usual']:g}{_unit(entry)}"
     if any(value >= _NOTHING for value in entry["maps"].values()):
         yield f"At {size} the elements of the instrument matrix change by (rms over the field, per cent)"
@@ -120,7 +120,7 @@ def _element(kind: type[Element]) -> Iterator[str]:
     head = _head_text(kind)
     yield from (f"# {kind.kind}", f"{_about(kind)}.", *_indented(head.partition("\n")[2].strip("\n")))
     yield from _table(
-        ("number", "unit", "what it is"), [(n, d.unit, d.about) for n, d in numbers_of(kind).items()]
+        ("number", "unit", "meaning"), [(n, d.unit, d.about) for n, d in numbers_of(kind).items()]
     )
     changed = [effect.name for effect in EFFECTS if kind.kind and kind.kind in effect.head().lower()]
     if changed:

@@ -164,7 +164,7 @@ class EffectAmplitude(Parameter):
     """An amplitude of an effect (`part`) that a model lacks, of one `shape`: the group of its probes and the member.
 
     `in_model` is its name in a model that has the effect. In files the name holds all of it: EFFECT#GROUP.LEAF#MEMBER,
-    without what is 0.
+    without zeros.
     """
 
     shape: tuple[int, int] = (0, 0)
@@ -300,7 +300,7 @@ def night_equations(
         if not (np.isfinite(chi2) and np.isfinite(gradient).all() and np.isfinite(matrix).all()):
             raise DataError(
                 f"{source}, night of MJD {evening}: the model has no finite counts or derivatives where the nights "
-                "meet; some night is far from it: fit each by itself (walop-jax refit), leave out what is not trusted"
+                "meet; some night is far from it: fit each by itself (walop-jax refit), leave out those not trusted"
             )
         e = subset.exposures
         nights.append(

@@ -151,7 +151,7 @@ def events_of(table: Any) -> list[tuple[float, str]]:
     mjd = numeric_column(read, "MJD", Column("float", "d"))
     if "WHAT" not in read.names:
         raise fail(
-            "the column is missing", file=read.path, column="WHAT", advice="say what was done, in words"
+            "the column is missing", file=read.path, column="WHAT", advice="describe the event in words"
         )
     words = read.table.columns[read.names.index("WHAT")]
     return list(zip(mjd.tolist(), map(str, words), strict=True))

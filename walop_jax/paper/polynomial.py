@@ -277,7 +277,7 @@ def _smooth_fit(
     """Weighted fit of s R + c: s, c, χ²/dof and the mean of R.
 
     The gradient of R over 35′ is small beside its mean, so s and c are told apart only weakly; a pull of s to
-    what the means say, |<q, u>| / |<R>| ± 1, keeps it in bounds.
+    the value of the means, |<q, u>| / |<R>| ± 1, keeps it in bounds.
     """
     good = np.isfinite(qu).all(axis=1)
     qu, covariance, sky = qu[good], covariance[good], sky[good]

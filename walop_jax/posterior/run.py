@@ -103,7 +103,7 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
         inputs = () if self.product is None else self.product.inputs
         if not inputs:
             advice = "make it with walop-jax refit"
-            raise fail("does not say what it was fitted to", file=self.folder, advice=advice)
+            raise fail("does not name the data of its fit", file=self.folder, advice=advice)
         calset = read_calibration_set(*(self.data or [self._located(entry.path) for entry in inputs]))
         if sorted(entry.sha256 for entry in calset.inputs) != sorted(entry.sha256 for entry in inputs):
             raise fail("these are not the data of the fit any more", file=inputs[0].path, advice="refit them")

@@ -199,7 +199,7 @@ def sample(
     With `folder`, the chain of emcee is kept there; `resume` goes on from it as if there had been no interruption
     (other samplers start anew). Raises `DataError` for a folder that holds a run already while `resume` is False, or
     one of other data, model, priors, sampler, settings or versions; ValueError where there is nothing to sample;
-    RuntimeError for a fit that nobody has examined.
+    RuntimeError for a fit that was not examined.
 
     Around a fit whose errors come from its residuals (`errors_from`), chains are those of the stated errors, and draws
     and covariance are `sandwich_adjusted`.

@@ -96,7 +96,7 @@ def display_of(document: Mapping[str, Any], path: Path) -> Display:
     try:
         return Display.of(document["shown"])
     except (KeyError, TypeError, ValueError) as error:
-        what = "does not hold what was displayed of it ('shown')"
+        what = "does not hold its display ('shown')"
         raise fail(what, file=path, advice="run the command that made it again") from error
 
 
@@ -298,8 +298,8 @@ def _diagnosed(run: RunContents, head: Display, missing: list[str]) -> list[Sect
     rows = tuple((row["pattern"], probability(row["p_value"]).removeprefix("= ")) for row in patterns)
     shown = dataclasses.replace(head, facts=())
     return [
-        Section("found", "What was found", shown, pictures),
-        Section("unexplained", "What is unexplained", Display("", head=("pattern", ">p"), rows=rows)),
+        Section("found", "Findings", shown, pictures),
+        Section("unexplained", "Unexplained patterns", Display("", head=("pattern", ">p"), rows=rows)),
     ]
 
 
@@ -316,7 +316,7 @@ def _candidates(run: RunContents) -> Section:
         )
         for row in run.diagnosis["candidates"]
     )
-    table = Display("", head=("effect", "what it is", ">score", ">p"), rows=rows[:SHOWN_CANDIDATES])
+    table = Display("", head=("effect", "meaning", ">score", ">p"), rows=rows[:SHOWN_CANDIDATES])
     hidden_rows = rows[SHOWN_CANDIDATES:]
     limits = tuple(
         (
@@ -419,9 +419,9 @@ def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
     sets = " ".join(str(entry["path"]) for entry in run.summary["inputs"]) or "CALSET"
     steps = [("correct stars", f"walop-jax apply {name} STARS.fits -o OUT.fits")] if trusted else []
     if run.diagnosis is None:
-        steps.append(("look for what is missing", f"walop-jax diagnose {sets} -o {name}_diagnosis"))
+        steps.append(("look for missing effects", f"walop-jax diagnose {sets} -o {name}_diagnosis"))
     if run.limits is None and trusted:
-        steps.append(("see what could hide in these data", f"walop-jax limits {sets} -o {name}"))
+        steps.append(("list mistakes that these data would not show", f"walop-jax limits {sets} -o {name}"))
     return [*steps, ("plan better exposures", f"walop-jax plan {name} --minutes 10")]
 
 
@@ -479,7 +479,7 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
         (
             Section("figures", "Figures", pictures=pictures),
             Section("numbers", "In numbers", dataclasses.replace(head, facts=())),
-            Section("limits", "What the plan can show", limits),
+            Section("limits", "Limits of the plan", limits),
         ),
         good=good,
         untrusted=not document.get("trusted", document.get("new_trusted", True)),

@@ -61,7 +61,7 @@ class Stars:
     error, a star without one the colour of a population (`COOL`, `HOT`), and `changed`: changes since the calibration
     that the whole catalogue shows. `colour` is the error of (q, u) if TEFF were ignored; without TEFF, half the
     difference between stars of 3500 K and 10 000 K. `hidden` is the largest shift of q and u by a single mistake that
-    the data of the calibration would not have shown (NaN: nobody asked). `flag` holds bits of `Quality`; `rows` counts
+    the data of the calibration would not have shown (NaN: not computed). `flag` holds bits of `Quality`; `rows` counts
     the rows of a star. `check` is that of all stars together, `sky_bound` the largest shift by light of the sky left
     over that they do not exclude (None: the level of the sky is not stated).
     """
@@ -95,7 +95,7 @@ def apply(
 ) -> Stars:
     """Stokes parameters of all stars of a catalogue.
 
-    `progress` is told how many rows of how many are done. Raises `DataError` for a filter that nobody knows, for a
+    `progress` is told how many rows of how many are done. Raises `DataError` for an unknown filter, for a
     catalogue with more optical settings than can be tabulated, and, unless `force` is given, for settings that the
     calibration does not cover (`check_validity`).
     """
@@ -562,7 +562,7 @@ def _turned(
 def _hidden(
     vectors: AnalysisVectors, derivative: Float[np.ndarray, "s 2 n"], acting: Mapping[int, np.ndarray]
 ) -> Float[np.ndarray, "s 2"]:
-    """Largest shift of q and u by one of the mistakes that would not have been found; NaN where nobody asked.
+    """Largest shift of q and u by one of the mistakes that would not have been found; NaN where not computed.
 
     `acting` are the shifts by those that act on starlight, by number: the parameters make up for a part of them.
     """

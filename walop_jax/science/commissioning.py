@@ -39,7 +39,7 @@ def requirements(
         Requirement(
             "the model explains the data", verdict.trusted,
             "trusted" if verdict.trusted else "; ".join(verdict.warnings) or "not trusted",
-            "walop-jax diagnose says what is missing",
+            "walop-jax diagnose looks for missing effects",
         ),
     ]  # fmt: skip
     if accuracy is not None:

@@ -48,7 +48,7 @@ class FieldAccuracy:
 
     `extent` is left, right, bottom and top in degrees. `limited_by` is what most of the error comes from. A
     mistake that the data would not have shown, the worst of them `hidden_by`, can make q or u wrong by `hidden`, the
-    median over the field (NaN: nobody asked), at its just undetected size, `hidden_worst` where it is largest; `remedy`
+    median over the field (NaN: not computed), at its just undetected size, `hidden_worst` where it is largest; `remedy`
     is the measurement that would show it. `not_measured` are the mistakes on which the data hold no information.
     `without_u` is the share of the field where a single exposure carries almost no information on u, `with_u` says
     where it does (None: everywhere). `goal` is what p of a star is wanted to: the calibration may make half of it.
@@ -88,7 +88,7 @@ class FieldAccuracy:
         """Everything that the calibration lacks for the goal; empty: it is good enough."""
         if not self.trusted:
             return (
-                Shortfall("the calibration is not trusted", "walop-jax diagnose looks for what is missing"),
+                Shortfall("the calibration is not trusted", "walop-jax diagnose looks for missing effects"),
             )
         allowed, lacks = self.goal / 2, []
         for name, gap in unmeasured(self.not_measured).items():
@@ -128,7 +128,7 @@ class FieldAccuracy:
         """Restriction of the error of p where the data do not measure everything that matters; empty: none."""
         if all(mistake.ahead for mistake in self.not_measured):
             return " behind the telescope" if self.not_measured else ""
-        return " apart from what is not measured"
+        return " apart from quantities not measured"
 
     def document(self) -> dict[str, object]:
         """As plain data, `accuracy_of_p` of summary.json; shares, not per cent."""

@@ -28,7 +28,7 @@ from walop_jax.model.parameters import unknown_name
 
 LARGEST_SQUARE = 2.0  # of the field radius, in units of the scale of the field: the corners
 FIELD, WAVELENGTH, EXPOSURE, COUNTS, SHAPE = "field", "wavelength", "exposure", "counts", "shape"
-MORE_POINTS = "more field points along that direction; dither: what is of the optics stays where it is"
+MORE_POINTS = "more field points along that direction; dither: an error of the optics stays where it is"
 ONCE_MORE = "the same exposures once more"
 FIELD_UNIT, WAVE = "{field}", "{wavelength}"  # scales of an instrument in words
 AT = f"(amplitude at {FIELD_UNIT}°)"
