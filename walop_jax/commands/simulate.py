@@ -200,12 +200,19 @@ def _texts(effect: str | Sequence[str | Effect] | Mapping[str, Any] | None) -> S
     ]
 
 
+_LISTED = 12  # numbers of a parameter that are listed
+
+
 def _sized(effect: Effect) -> str:
     """An effect as `--effect` writes it, with its units: wollaston_axis=angle:0.3 deg."""
     import numpy as np
 
-    numbers = [
-        f"{name}:{'/'.join(rounded(float(v)) for v in np.ravel(getattr(effect, name)))} {declared.unit}".rstrip()
-        for name, declared in effect.declarations().items()
-    ]
+    numbers = []
+    for name, declared in effect.declarations().items():
+        values = np.ravel(getattr(effect, name))
+        text = "/".join(rounded(float(v)) for v in values)
+        if values.size > _LISTED:
+            text = f"{values.size} numbers of {rounded(float(np.sqrt(np.mean(values**2))))} rms"
+        if values.size:
+            numbers.append(f"{name}:{text} {declared.unit}".rstrip())
     return f"{effect.name}={', '.join(numbers)}" if numbers else effect.name
