@@ -9,8 +9,6 @@ from jaxtyping import Float
 
 import walop_jax as walop
 from walop_jax import CalibrationSet, FilterCurve
-from walop_jax.model.effects.described import Described
-from walop_jax.model.specification import effect_context
 
 
 def bench_set(
@@ -55,8 +53,8 @@ def left_over(result, values=None):
 
 def saying(model, calset, sentences):
     """The model with what sentences say of it, for a fit to find the amplitudes of, without their priors."""
-    said = Described.of(effect_context(model.template, calset.exposures), sentences=tuple(sentences))
-    made = walop.with_effects(model, [said], effect_context(model.template, calset.exposures))
+    said = walop.effect_by_name("described").saying(sentences, np.zeros(len(sentences)))
+    made = walop.with_effects(model, [said], calset)
     for name in made.names:
         if name not in model.names:
             made = made.change(name, prior=None, loose=1.0)

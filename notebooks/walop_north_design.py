@@ -61,6 +61,15 @@ def design_set(folder: str | Path = "walop_north_design") -> CalibrationSet:
     return walop.read(made)
 
 
+def spread_points(calset: CalibrationSet, count: int) -> CalibrationSet:
+    """The set with so many of its field points, or a few less, spread evenly by the golden section."""
+    rows = np.unique((np.mod(0.6180339887498949 * np.arange(count), 1.0) * len(calset.points)).astype(int))
+    arrays = calset.to_arrays()
+    return walop.from_arrays(
+        **arrays | {name: arrays[name][rows] for name in ("counts", "errors", "x", "y", "source")}
+    )
+
+
 def cube(calset: CalibrationSet) -> np.ndarray:
     """Transmissions (point, exposure, camera)."""
     return calset.intensities.block(0, len(calset.points)).counts

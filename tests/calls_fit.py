@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import walop_jax
 from walop_jax.io.display import Drawn
-from walop_jax.reports.named import FIGURES
+from walop_jax.reports.named import FIGURES, OF_RESULTS
 
 
 class _An(NamedTuple):
@@ -121,7 +121,7 @@ class _Reader(ast.NodeVisitor):
         of = getattr(function, "__self__", None)
         drawn = isinstance(of, _An) and issubclass(of.kind, Drawn) and function.__name__ == "plot"
         named = getattr(node.args[0], "value", None) if drawn and node.args else None
-        if isinstance(named, str) and named not in FIGURES:
+        if isinstance(named, str) and named not in {**FIGURES, **OF_RESULTS}:
             self.found.append(f"there is no figure {named}")
         starred = [one for one in node.args if isinstance(one, ast.Starred)]
         if not starred and all(word.arg for word in node.keywords):

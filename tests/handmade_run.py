@@ -14,12 +14,12 @@ from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.calibration.product import write_calibration
 from walop_jax.data.grid import Grid
 from walop_jax.data.records import InputFile, Points, Site, Sources
+from walop_jax.diagnosis.detection_limits import DetectionLimit, DetectionLimits
 from walop_jax.diagnosis.figure_data import (
     DiagnosisFigureData,
     ResidualComparison,
     write_figure_data,
 )
-from walop_jax.diagnosis.limits_found import DetectionLimit, DetectionLimits
 from walop_jax.fit.verdict import Verdict
 from walop_jax.io.display import Display
 from walop_jax.io.text import json_text

@@ -26,22 +26,6 @@ DEEP = {
         "paper.polynomial": "the method of Paper II, which is there for comparison",
         "science.star_errors": "the same: errors of its test stars",
     },
-    "first_calibration.ipynb": {
-        "reports.figures": "the figure named `modulation` needs a fit and has one point"
-    },
-    "paper_versus_joint.ipynb": {
-        "paper": "the method of Paper II",
-        "reports": "its figures",
-        "science.star_errors": "a truth in memory",
-    },
-    "tables.py": {
-        "model.effects.described": "an effect out of the sentences of a diagnosis",
-        "model.specification": "the context of such an effect",
-    },
-    "walop_north_design.ipynb": {"likelihood.layout": "a sample of points spread over the field"},
-    "year_of_an_instrument.ipynb": {
-        "reports.survey_figures": "figures of a survey, which has a page but no `plot`"
-    },
 }
 """What notebooks import from rooms of the package, and why; this may only become less."""
 TIMEOUT = 900  # seconds per cell, on a machine that does other things as well

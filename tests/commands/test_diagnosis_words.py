@@ -25,6 +25,7 @@ def found() -> Diagnosis:
         log_bayes=40.0,
         chi2_before=2000.0,
         chi2_after=1000.0,
+        dof_after=900,
         heldout_scheme="exposures",
         heldout_before=1.0,
         heldout_after=1.0,

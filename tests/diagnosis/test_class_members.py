@@ -14,7 +14,7 @@ from walop_jax.calibration.certify import certify
 from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.class_members import classes_of
-from walop_jax.diagnosis.class_product import _with_ties, averaged, only_a_class
+from walop_jax.diagnosis.class_product import Classes, _with_ties, averaged, only_a_class
 from walop_jax.diagnosis.examination import examine
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
@@ -32,7 +32,8 @@ def told():
 
 
 def test_what_one_kind_has_against_the_others_the_others_have_against_it(told):
-    result, _, (found,) = told
+    result, _, classes = told
+    (found,) = classes.additions
     names = [member.name for member in found.members]
     assert names[0] == TOLD
     (other,) = (m for m in found.members if m.name == "gain of O1 * kind clp; gain of O1 * kind standard")
@@ -88,7 +89,7 @@ def test_sentences_in_a_fixed_ratio_have_one_error(told):
 def test_a_class_of_one_changes_nothing(told):
     result, context, _ = told
     alone = Calibration.from_fit(result.judged())
-    assert averaged(alone, (), context) is alone
+    assert averaged(alone, Classes(), context) is alone
 
 
 def test_what_was_added_is_in_its_class_once():
@@ -103,7 +104,7 @@ def test_what_was_added_is_in_its_class_once():
         if probe.name in (own, other)
     ]
     state = examine(fit(Likelihood.of(calset, model)), (), np.random.default_rng(0), sentences=said)
-    (found,) = classes_of(state, context, {Described.name}, [own])
+    (found,) = classes_of(state, context, {Described.name}, [own]).additions
     assert [member.name for member in found.members] == [own, other]
 
 

@@ -291,7 +291,7 @@ def test_a_name_must_explain_a_quarter_of_what_is_surely_missing(effect, chi2, e
         floor=1.0,
         evidence_needed=0.0,
         probes=(),
-        stands=lambda *_: True,
+        stands=lambda *_, **__: True,
     )
     reason = search.refused(state, exact.Trial(effect, 50.0, chi2 - explained, noise=False))
     assert (reason == "") is told

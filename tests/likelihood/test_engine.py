@@ -114,9 +114,10 @@ def values(likelihood):
 @functools.cache
 def _derivatives():
     there = with_values(likelihood_of(make_block()[0]).model.template)
+    predicted = jax.vmap(engine.point_prediction, (None, None, 0))
 
     def plain(values, plan, data):
-        model = engine._prediction(there(values), plan, data) * data.weight
+        model = predicted(there(values), plan, data) * data.weight
         eliminate = jax.vmap(eliminate_flux, in_axes=(0, 0, None))
         residual = eliminate(data.counts * data.weight, model, plan.exposures.flux_known)[1]
         return (residual, model), (residual, model)

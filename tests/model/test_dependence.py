@@ -89,7 +89,7 @@ def measured(*effects: Effect) -> tuple[Instrument, object, engine.PointData]:
 def formula(template: Instrument, values, flux, layout, data):
     """Counts (point, exposure, camera) from parameters and fluxes, as they are defined."""
     device = with_values(template)(values)
-    electrons = flux[..., None] * engine._prediction(device, layout, data)
+    electrons = flux[..., None] * jax.vmap(engine.point_prediction, (None, None, 0))(device, layout, data)
     return jax.vmap(light.detected, (None, None, 0))(device, layout.exposures, electrons)
 
 

@@ -10,6 +10,7 @@ from small_run import small_fit
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.commands.plot import plot
 from walop_jax.data.settings import Settings
 from walop_jax.paper.comparison import compare
 from walop_jax.reports import paper_figures as figures
@@ -30,9 +31,26 @@ def comparison(calibration_and_set):
 
 @pytest.mark.parametrize(("name", "panels"), [("histogram", 6), ("map", 9), ("offset", 3), ("spectral", 2)])
 def test_figures_are_drawn(comparison, name, panels):
-    figure = getattr(figures, f"{name}_figure")(comparison)
+    figure = comparison.plot(name)
     assert len(figure.axes) == panels
     figure.savefig(io.BytesIO(), format="png")
+
+
+def test_figures_in_memory_are_listed_and_of_one_size(comparison):
+    assert [*plot(comparison)] == ["histogram", "map", "offset", "spectral"]
+    with pytest.raises(ValueError, match="a size of its own"):
+        comparison.plot("map", width="column")
+
+
+def test_modulation_of_a_set_at_several_points(calibration_and_set):
+    _, calset = calibration_and_set
+    points = calset.points
+    figure = plot(calset, "modulation", x=points.x[[3, 8]], y=points.y[[3, 8]])
+    labels = [line.get_label() for line in figure.axes[0].lines if line.get_label() != "ideal"]
+    assert labels == [
+        f"X {x:+.2f}°, Y {y:+.2f}°".replace("-", "−")
+        for x, y in zip(points.x[[3, 8]], points.y[[3, 8]], strict=True)
+    ]
 
 
 def test_histograms_count_every_point(comparison):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import handmade_run
 import numpy as np
@@ -11,11 +13,13 @@ from astropy.io import fits
 from builders import exposures
 
 from walop_jax.diagnosis.figure_data import (
+    _ladder,
     best_combination,
     compare_residuals,
     read_figure_data,
     write_figure_data,
 )
+from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.io.errors import DataError
 
 ANGLES = 22.5 * np.arange(16)
@@ -26,6 +30,7 @@ SEQUENCE = exposures(
 USED = np.ones((25, 20), bool)
 FIELD = np.linspace(-1.0, 1.0, 25)
 CAMERAS = np.array([1.0, -1.0, 0.5, 0.0])
+FREE = SimpleNamespace(free=True, tie=None, prior=None)
 
 
 def cube(along: np.ndarray) -> np.ndarray:
@@ -74,6 +79,20 @@ def test_points_without_the_exposures_are_not_shown():
     one = compare_residuals("", before, 0.0 * before, used, SEQUENCE)
     assert np.flatnonzero(np.isnan(one.before).any(axis=1)).tolist() == [3]
     assert np.isfinite(one.mean_before).all()
+
+
+def test_the_ladder_has_the_degrees_of_freedom_of_every_fit():
+    """Those of its fit, not as many as it has parameters without a prior: ghost takes 2, lens 8."""
+    steps = [
+        SimpleNamespace(effect="ghost", chi2_after=900.0, dof_after=898),
+        SimpleNamespace(effect="lens", chi2_after=800.0, dof_after=890),
+    ]
+    model = SimpleNamespace(effect_names=("ghost", "lens"), positions=lambda name: [0], parameters=[FREE])
+    before = SimpleNamespace(chi2=2000.0, dof=900, model=SimpleNamespace(effect_names=()))
+    after = SimpleNamespace(chi2=800.0, dof=890, model=model)
+    ladder = _ladder(Mock(Diagnosis, before=before, after=after, steps=steps))
+    assert list(ladder["MODEL"]) == ["starting model", "ghost", "lens"]
+    assert ladder["DOF"].tolist() == [900, 898, 890]
 
 
 def test_they_come_back_from_their_file(tmp_path):

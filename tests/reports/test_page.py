@@ -298,4 +298,7 @@ def test_figures_are_drawn_from_the_run_that_was_given(tmp_path, monkeypatch):
     monkeypatch.setattr(page_module, "draw", draw)
     folder = handmade_run.make_refit(tmp_path / "run")
     render(read_run(Run(folder, EFFECTS[:2], ("elsewhere.fits",))))
-    assert set(drawn) == {(name, EFFECTS[:2], ("elsewhere.fits",)) for name in ("accuracy", "residuals")}
+    assert set(drawn) == {
+        (name, EFFECTS[:2], ("elsewhere.fits",))
+        for name in ("accuracy", "residuals", "matrix", "matrix-errors")
+    }

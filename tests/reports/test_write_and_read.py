@@ -12,8 +12,8 @@ import pytest
 from same_record import assert_same
 
 from walop_jax.calibration.product import read_product, write_calibration
+from walop_jax.diagnosis.detection_limits import DetectionLimits
 from walop_jax.diagnosis.figure_data import read_figure_data, write_figure_data
-from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.io.text import json_text, read_json
 
 RECORDS: Mapping[str, tuple[Any, Callable[[Path, Any], None], Callable[[Path], Any]]] = {

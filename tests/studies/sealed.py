@@ -497,6 +497,11 @@ def table(found: list[Outcome]) -> str:
             )
         )
         rows.append((f"{name}: trusted and wrong, all", rate(sum(j.wrong for _, j in trusted), len(trusted))))
+        told = [(o, j) for o, j in trusted if o.right and name == "diagnosis"]
+        if told:
+            rows.append(
+                (f"{name}: trusted and wrong, something told", rate(sum(j.wrong for _, j in told), len(told)))
+            )
         expected = sum(j.chance for _, j in trusted)
         rows.append(
             (f"{name}: of these by chance, from their own covariances", f"{expected:.1f} of {len(trusted)}")

@@ -30,7 +30,7 @@ from walop_jax.data.settings import Settings
 from walop_jax.io.text import rounded, two_digits
 from walop_jax.likelihood.field_table import Vector
 from walop_jax.model import light, slots
-from walop_jax.model.effects import Effect, effect_by_name, in_order
+from walop_jax.model.effects import Change, Effect, effect_by_name, in_order
 from walop_jax.model.effects.numbers import OF_POLARISER
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.planning import plan_for_settings
@@ -155,13 +155,19 @@ def acting_effects(calibration: Calibration) -> Mapping[int, Effect]:
     return effects
 
 
+def _changes(effect: Effect, instrument: Instrument) -> list[Change]:
+    """The changes of an effect, of any of its amplitudes."""
+    bare = dataclasses.replace(instrument, effects=())
+    return [change for terms in effect.first_order(bare) for _, change in terms]
+
+
 def moves_with(effect: Effect, instrument: Instrument) -> frozenset[str]:
     """Column prefixes of the moving elements that an effect depends on: it vanishes where these are out."""
     bare = dataclasses.replace(instrument, effects=())
     elements = itertools.chain(*slots.trains(bare.patched()).values())
     moving = {element.name: element.moves for element in elements if element.moves is not None}
     prefixes: set[str] = set()
-    for _, change in itertools.chain.from_iterable(effect.first_order(bare)):
+    for change in _changes(effect, bare):
         moved = {moving[name] for name in change.place.split(".") if name in moving}
         if change.where in ("ahead of", "behind") or not moved:
             return frozenset()
@@ -171,13 +177,9 @@ def moves_with(effect: Effect, instrument: Instrument) -> frozenset[str]:
 
 def acts_in(effect: Effect, instrument: Instrument, settings: Settings) -> bool:
     """True if an effect does anything to the light of a star in a setting (one row): it is in the beam there."""
-    changes = [
-        term for pair in effect.first_order(dataclasses.replace(instrument, effects=())) for _, term in pair
-    ]
-    if changes and all(
-        term.kind in (*OF_POLARISER, "rotator") for term in changes
-    ):  # of sources, of the angle of the sky
-        return False
+    changes = _changes(effect, instrument)
+    if changes and all(change.kind in (*OF_POLARISER, "rotator") for change in changes):
+        return False  # of sources, of the angle of the sky
     needed = moves_with(effect, instrument)
     return not needed or any(np.isfinite(settings.position(prefix)).any() for prefix in needed)
 
@@ -198,10 +200,8 @@ def with_effect(instrument: Instrument, effect: Effect) -> Instrument:
 
 def turn_of(instrument: Instrument, effect: Effect) -> float:
     """Angle (rad) by which an effect turns the sky against the instrument, beyond ROTATOR."""
-    changes = [
-        term for pair in effect.first_order(dataclasses.replace(instrument, effects=())) for _, term in pair
-    ]
-    if changes and all(term.kind != "rotator" for term in changes):
+    changes = _changes(effect, instrument)
+    if changes and all(change.kind != "rotator" for change in changes):
         return 0.0
     zeros = (model.patched().rotator_zero for model in (with_effect(instrument, effect), instrument))
     after, before = (0.0 if zero is None else float(zero) for zero in zeros)

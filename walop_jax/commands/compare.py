@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, figure_file
 from walop_jax.commands.inputs import Folder, InstrumentLike, ModelLike, Sets, set_and_model, set_of
@@ -19,7 +18,6 @@ from walop_jax.commands.products import (
 
 if TYPE_CHECKING:
     from walop_jax.paper.comparison import Comparison
-    from walop_jax.science.star_errors import Truth
 
 DOCUMENT, TABLE = "comparison.json", "comparison.fits"
 FIGURES = ("histogram", "map", "offset", "spectral")
@@ -34,7 +32,7 @@ def compare(
     calibration: OptionalProduct = None,
     *,
     output: Folder = None,
-    truth: Annotated[Truth | PathLike | None, TRUTH] = None,
+    truth: Annotated[tuple[Any, Any, Any] | PathLike | None, TRUTH] = None,
     filter: Annotated[str, Option("Filter to compare in.", "NAME")] = "SDSS-r",
     model: ModelLike = None,
     instrument: InstrumentLike = None,
@@ -47,8 +45,9 @@ def compare(
     simulated set. RUN/comparison.json has the statistics, comparison.fits every point, four figures the rest: also
     the spectral appendix and the full-Moon scheme. (Two calibrations are compared by epoch.)
 
-    In Python: a `Comparison`; `calibration` is the joint fit (default: made here). Raises ValueError if that does not
-    converge, and for a `calibration` or `truth` in memory together with `output`.
+    In Python: a `Comparison`; `calibration` is the joint fit (default: made here), `truth` a file, or (x, y, matrices)
+    in memory, in degrees. Raises ValueError if the fit does not converge, and for a `calibration` or `truth` in memory
+    together with `output`.
 
     >>> walop.compare("night.fits").document()["between"]  # doctest: +SKIP
     """
@@ -62,7 +61,7 @@ def compare(
     from walop_jax.science.field_points import true_matrices
     from walop_jax.science.star_errors import Truth
 
-    if output is not None and (calibration is not None or isinstance(truth, Truth)):
+    if output is not None and (calibration is not None or isinstance(truth, tuple)):
         raise ValueError("with output the joint fit is made anew: leave calibration and truth in memory out")
     job.begin("reading")
     held = None if calibration is None else calibration_of(calibration, effects)
@@ -74,8 +73,10 @@ def compare(
         raise fail(
             f"Paper II has a method for two arms of two cameras, which {chosen.name} is not; refit and diagnose"
         )
-    if isinstance(truth, str | os.PathLike):
-        truth = Truth(*true_matrices(truth, chosen.template.patched()))
+    if truth is not None:
+        truth = Truth(
+            *(truth if isinstance(truth, tuple) else true_matrices(truth, chosen.template.patched()))
+        )
     if held is None:
         job.tell("fitting the joint model", "fitting")
         result = examined(refit(calset, chosen, progress=job.progress), job.seed)

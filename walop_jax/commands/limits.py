@@ -13,7 +13,7 @@ from walop_jax.commands.products import Diagnosed, Effects, catalogue_of, fit_of
 
 if TYPE_CHECKING:
     from walop_jax import CalibrationSet, FitResult, ObservingPlan
-    from walop_jax.diagnosis.limits_found import DetectionLimits
+    from walop_jax.diagnosis.detection_limits import DetectionLimits
 
 DATA = Argument(
     "Calibration sets (FITS), fitted as one, or an observing plan in place of them.",

@@ -13,9 +13,15 @@ from walop_jax.commands.products import Effects, catalogue_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Run
+    from walop_jax import Calibration, CalibrationSet, FitResult, Run
     from walop_jax.diagnosis.findings import Diagnosis
+    from walop_jax.nights.survey import Survey
+    from walop_jax.paper.comparison import Comparison
     from walop_jax.posterior.result import PosteriorSample
+
+    Drawable = (
+        FitResult | Calibration | Diagnosis | PosteriorSample | Run | Comparison | Survey | CalibrationSet
+    )
 
 FORMATS = (".pdf", ".png", ".svg", ".eps", ".jpg")
 RUN = Argument("Folder of results; none: list the figures.", "[RUN]", Path)
@@ -31,13 +37,13 @@ WIDTH = Option(
 @command(writes=())
 def plot(
     job: Job,
-    run: Annotated[FitResult | Calibration | Diagnosis | PosteriorSample | Run | PathLike | None, RUN] = None,
+    run: Annotated[Drawable | PathLike | None, RUN] = None,
     name: Annotated[str | None, NAME] = None,
     *,
     output: Annotated[PathLike | None, FILE] = None,
     parameters: Annotated[str | Sequence[str] | None, PARAMETERS] = None,
-    x: Annotated[float, Option("Field point of transmission and modulation, X (deg).")] = 0.0,
-    y: Annotated[float, Option("The same, Y (deg).")] = 0.0,
+    x: Annotated[Any, Option("Field point of transmission and modulation, X (deg).", kind=float)] = 0.0,
+    y: Annotated[Any, Option("The same, Y (deg).", kind=float)] = 0.0,
     step: Annotated[int, STEP] = 1,
     width: Annotated[float | str | None, WIDTH] = None,
     data: DataOf = None,
@@ -51,8 +57,9 @@ def plot(
     Without a name the figures are listed: accuracy of p over the field, maps of the matrix and of the retardance of the
     half-wave plates, camera transmissions, corner plots, and others. The format follows the name of the file.
 
-    In Python: the matplotlib figure, of a run or of a fit, calibration, diagnosis or posterior in memory, written if
-    `output` is given; without a name, a line about each figure, by name. `figsize` (inches) is its size; with `ax` it
+    In Python: the matplotlib figure, of a run or of a fit, calibration, diagnosis, posterior, comparison, survey or set
+    (`modulation`, at any number of points) in memory, written if `output` is given; without a name, a line about each
+    figure, by name. `figsize` (inches) is its size; with `ax` it
     is drawn there (one of several panels in a subfigure that takes the room of these axes). `width` is that in print
     (mm, "column" or "page"): panels are arranged for it. `reference` holds values by name that a corner plot marks.
     Raises `DataError`, with the nearest names, for a figure that does not exist and for data that the run lacks.

@@ -114,9 +114,8 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         place = Place(path, name)
         if name in hdus:
             columns = column_names(hdus[name], place)
-            if (
-                primary["CALVERS"] == 1 and name == "EXPOSURES"
-            ):  # CLP and CHWP alone move, whatever else is there
+            # CLP and CHWP alone move, whatever else is there.
+            if primary["CALVERS"] == 1 and name == "EXPOSURES":
                 turns = [f"{prefix}_TURN" for prefix in (POLARISER, CALIBRATION_PLATE)]
                 columns = [column for column in columns if column in {*schema.EXPOSURES, *turns}]
             rules = table_rules(name, columns, place)

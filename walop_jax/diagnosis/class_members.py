@@ -26,7 +26,8 @@ from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_average import distinct, moved, probabilities
-from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum
+from walop_jax.diagnosis.class_product import Classes, ClassOf, Likeness, Shape, Sum
+from walop_jax.diagnosis.description_shape import shape_changes
 from walop_jax.diagnosis.exact import signature
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.hidden_mistakes import of_matrix, usual_exposure
@@ -34,9 +35,10 @@ from walop_jax.diagnosis.score import Projector, log_bayes
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.starlight import added_to_starlight
-from walop_jax.model.effects import Context, Described
+from walop_jax.model.effects import Context, Described, FreeForm
 from walop_jax.model.effects.change import AMPLITUDES, KINDS, patched
 from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.effects.optics import GENERATORS
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
@@ -52,17 +54,20 @@ def classes_of(
     names: Collection[str],
     said: Sequence[str],
     alike: Collection[str] = (),
-) -> tuple[ClassOf, ...]:
-    """The classes of the effects of a model that have some names; without those of which the class is that alone.
+) -> Classes:
+    """The classes of the effects of a model that have some names, without those of which the class is that alone.
+
+    With them comes the uncertainty of the shape of its descriptions.
 
     `said` are the names of the added groups of sentences, `alike` the effects and groups reported as indistinguishable:
     with large residuals, where one linear step is inaccurate, they count as probable.
     """
     additions = list(_additions(state.result, context, names, said))
     if not additions or not state.result.model.template.cameras.pairs:
-        return ()
+        return Classes()
     laid = _Laid(state, alike)
-    return tuple(addition for addition in itertools.starmap(laid.class_of, additions) if addition.names)
+    found = tuple(addition for addition in itertools.starmap(laid.class_of, additions) if addition.names)
+    return Classes(found, laid.shape())
 
 
 def _additions(
@@ -157,6 +162,31 @@ class _Laid:
         ]
         return ClassOf(name, at, tuple(members), *self._spread(members))
 
+    def shape(self) -> Shape | None:
+        """Deviations from the shapes of all descriptions, by one linear step; None without a description."""
+        if FreeForm.name in self.fit.model.effect_names:  # it has every shape
+            return None
+        changes, widths, sizes = shape_changes(self.fit, self.columns)
+        if not changes:
+            return None
+        sums: tuple[Sum, ...] = tuple(((1.0, change),) for change in changes)
+        step = _Step(self, np.zeros(0, int), np.zeros(self.design.rows))
+        column = self.design.stacked([self.columns.of(sums)])
+        projected = step.projector(column)
+        square, along = projected.T @ projected, projected.T @ step.left
+        likeness = step.member("", 0.0, sums, column, square, along, widths)
+        vectors, added = self.added(sums)
+        pairs = self.template.cameras.pairs
+        slopes = np.stack([of_matrix(vectors, added[..., j], pairs) for j in range(len(sums))], axis=-1)
+        slopes = slopes.reshape(*self.matrix.shape, -1) + self.slopes @ likeness.slopes
+        between = slopes @ likeness.covariance @ np.swapaxes(slopes, 1, 2)
+        between += likeness.change[:, :, None] * likeness.change[:, None, :]
+        share = sizes * np.sqrt(np.diag(likeness.covariance))
+        growing = [j for j, c in enumerate(changes) if c.of_stars and not c.over_field_alone]
+        growing = sorted(growing, key=lambda j: -share[j])[:MOST_MEMBERS]
+        steady = [j for j, c in enumerate(changes) if c.over_field_alone and c.kind not in GENERATORS]
+        return Shape(likeness, (*growing, *steady), *self._errors_of_p(between))
+
     def _spread(self, members: Sequence[Likeness]) -> tuple[float, float, float]:
         """Error of p of stars between members, error of the fit, and largest deviation of a member (`ClassOf`)."""
         weights = np.array([member.probability for member in members])
@@ -166,6 +196,10 @@ class _Laid:
         total = np.sqrt(self.errors**2 + np.diagonal(between, axis1=1, axis2=2))
         far = np.median(np.abs(away) / np.where(total > 0, total, np.inf), axis=1).max(axis=1)
         off = float(far[weights > PLAUSIBLE].max(initial=0.0))
+        return *self._errors_of_p(between), off
+
+    def _errors_of_p(self, between: Float[np.ndarray, "p m m"]) -> tuple[float, float]:
+        """Errors of p of stars from a covariance of the matrix, and from that of the fit: medians over the field."""
         within = self.slopes @ covariance_of_free(self.fit) @ np.swapaxes(self.slopes, 1, 2)
         if self.matrix.shape[1] == 6:
             good = measures_u(self.matrix.reshape(-1, 2, 3))
@@ -176,7 +210,7 @@ class _Laid:
                 for square in (between, within)
             ]
         spread, stated = (float(np.median(errors)) if errors.size else 0.0 for errors in maps)
-        return spread, stated, off
+        return spread, stated
 
 
 class _Step:
@@ -236,7 +270,7 @@ class _Step:
         self.laid.added([total for _, _, sums, *_ in chosen for total in sums])  # all of them in one go
         for probe, evidence, sums, square, along_residual in chosen:
             column = design.stacked([state.columns[number[probe.name]]])
-            yield self._member(probe.name, evidence, sums, column, square, along_residual, probe.widths)
+            yield self.member(probe.name, evidence, sums, column, square, along_residual, probe.widths)
 
     def in_other_kinds(self, member: Likeness) -> Likeness | None:
         """A member that is about exposures of one KIND, in all others instead; None for any other."""
@@ -262,9 +296,9 @@ class _Step:
         alike = max(thresholds.EVEN_ODDS, LINEAR * abs(member.evidence))
         evidence = member.evidence if abs(evidence - member.evidence) < alike else evidence
         name = "; ".join(sentence.text for amplitude in sums for _, sentence in amplitude)
-        return self._member(name, evidence, sums, column, square, along, widths)
+        return self.member(name, evidence, sums, column, square, along, widths)
 
-    def _member(
+    def member(
         self,
         name: str,
         evidence: float,

@@ -24,8 +24,9 @@ from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_average import known_apart_from, mixture
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import some, two_digits
-from walop_jax.model.effects import Context, Described
+from walop_jax.model.effects import Context, Described, Deviations
 from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.effects.optics import GENERATORS
 from walop_jax.model.specification import Model, effect_context, model_without, with_effects
 
 Vector = Float[np.ndarray, " _"]
@@ -77,16 +78,61 @@ class ClassOf(NamedTuple):
         return tuple(member.name for member in self.members[1:])
 
 
-def with_average(result: FitResult, classes: Sequence[ClassOf]) -> FitResult:
+class Shape(NamedTuple):
+    """Deviations from the shapes of all descriptions of a model, and errors of p of stars: from them, from the fit.
+
+    In a product those at the positions `in_words` are sentences, the others are in `Deviations` or act on no star.
+    """
+
+    deviations: Likeness
+    in_words: tuple[int, ...]
+    spread: float
+    stated: float
+
+    @property
+    def sums(self) -> tuple[Sum, ...]:
+        """Those in words."""
+        return tuple(self.deviations.sums[j] for j in self.in_words)
+
+    @property
+    def optical(self) -> dict[int, Sentence]:
+        """Those of `Deviations`, by position."""
+        changes = {j: total[0][1] for j, total in enumerate(self.deviations.sums) if j not in self.in_words}
+        return {j: c for j, c in changes.items() if c.kind in GENERATORS and c.over_field_alone}
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """Places of `Deviations`."""
+        return tuple(dict.fromkeys(f"{change.where} {change.place}" for change in self.optical.values()))
+
+
+class Classes(NamedTuple):
+    """Ambiguities of a diagnosis: classes of its additions that have other members, and shapes of descriptions."""
+
+    additions: tuple[ClassOf, ...] = ()
+    shape: Shape | None = None
+
+    def __bool__(self) -> bool:
+        return bool(self.additions) or self.shape is not None
+
+    @property
+    def sums(self) -> Iterator[tuple[Sum, ...]]:
+        """Amplitudes of all members but the additions themselves, and of deviations that grow with anything."""
+        yield from (member.sums for addition in self.additions for member in addition.members[1:])
+        if self.shape is not None:
+            yield self.shape.sums
+
+
+def with_average(result: FitResult, classes: Classes) -> FitResult:
     """The fit whose calibration is the mean over the classes of its additions."""
     if not classes:
         return result
     context = effect_context(result.model.template, result.calset.exposures)
-    mean = functools.partial(averaged, classes=tuple(classes), context=context)
+    mean = functools.partial(averaged, classes=classes, context=context)
     return dataclasses.replace(result, averaged=mean)
 
 
-def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Context) -> Calibration:
+def averaged(calibration: Calibration, classes: Classes, context: Context) -> Calibration:
     """The calibration of a fit as the mean over the classes of its additions, with their spread in the covariance.
 
     Its model includes all members, as sentences; different additions are taken as independent.
@@ -95,7 +141,10 @@ def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Cont
         return calibration
     old, model = calibration.model, _holding(calibration, classes, context)
     new = [i for i, name in enumerate(model.names) if name not in old.names]
-    model = _with_ties(model, new, np.concatenate(list(_amplitudes_of(model, classes)), axis=1))
+    derivatives = list(_amplitudes_of(model, classes))
+    if classes.shape is not None:
+        derivatives.append(_deviations_of(model, classes.shape))
+    model = _with_ties(model, new, np.concatenate(derivatives, axis=1))
     place = np.array([model.index(name) for name in old.names])
     count, free = len(model.parameters), old.free
     start, fitted = np.zeros(count), np.zeros((count, count))
@@ -106,8 +155,8 @@ def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Cont
     into = into @ old.selection()
     of_free = calibration.covariance[np.ix_(free, free)]
     values, covariance = start.copy(), fitted.copy()
-    amplitude_columns = _amplitudes_of(model, classes)
-    for group in classes:
+    amplitude_columns = iter(derivatives)
+    for group in classes.additions:
         conditional = into @ known_apart_from(of_free, group.at) @ into.T
         means, errors = [start], [fitted]
         for member in group.members[1:]:
@@ -118,6 +167,11 @@ def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Cont
         average = mixture(np.array([member.probability for member in group.members]), np.stack(means), errors)
         values += average.mean - start
         covariance += average.covariance - fitted
+    if classes.shape is not None:  # the descriptions remain: their parameters are as free as before
+        deviations, amplitudes = classes.shape.deviations, derivatives[-1]
+        slopes = into @ deviations.slopes + amplitudes
+        values += into @ deviations.values + amplitudes @ deviations.amplitudes
+        covariance += slopes @ deviations.covariance @ slopes.T
     hidden = calibration.hidden
     if hidden is not None:
         changes = np.zeros((len(hidden), count))
@@ -128,19 +182,17 @@ def averaged(calibration: Calibration, classes: Sequence[ClassOf], context: Cont
     )
 
 
-def _holding(calibration: Calibration, classes: Sequence[ClassOf], context: Context) -> Model:
+def _holding(calibration: Calibration, classes: Classes, context: Context) -> Model:
     """The model with the sentences of all members."""
     texts = dict.fromkeys(
-        sentence.text
-        for addition in classes
-        for member in addition.members[1:]
-        for amplitude in member.sums
-        for _, sentence in amplitude
+        sentence.text for sums in classes.sums for amplitude in sums for _, sentence in amplitude
     )
     model = calibration.model
+    if classes.shape is not None and classes.shape.places:
+        model = with_effects(model, [Deviations.of(context, places=classes.shape.places)], context)
     description = Described.saying(list(texts), np.zeros(len(texts)))
     if Described.name in model.effect_names:
-        earlier = model.instrument(calibration.values).effect(Described.name)
+        earlier = calibration.model.instrument(calibration.values).effect(Described.name)
         assert isinstance(earlier, Described)
         parameters = {p.name: p for p in model.parameters}
         wider = with_effects(model_without(model, Described.name), [earlier.joined(description)], context)
@@ -150,14 +202,28 @@ def _holding(calibration: Calibration, classes: Sequence[ClassOf], context: Cont
     return with_effects(model, [description], context)
 
 
-def _amplitudes_of(model: Model, classes: Sequence[ClassOf]) -> Iterator[Float[np.ndarray, "n a"]]:
+def _amplitudes_of(model: Model, classes: Classes) -> Iterator[Float[np.ndarray, "n a"]]:
     """Derivative of all parameters by the amplitudes of every member but the first of each class, in order."""
-    for member in (member for addition in classes for member in addition.members[1:]):
-        derivatives = np.zeros((len(model.parameters), len(member.sums)))
-        for j, combination in enumerate(member.sums):
-            for size, sentence in combination:
-                derivatives[model.index(f"{Described.name}.{sentence.label}"), j] += size
-        yield derivatives
+    yield from (
+        _derivatives(model, member.sums) for addition in classes.additions for member in addition.members[1:]
+    )
+
+
+def _deviations_of(model: Model, shape: Shape) -> Float[np.ndarray, "n a"]:
+    """Derivative of all parameters by the amplitudes of deviations."""
+    derivatives = np.zeros((len(model.parameters), len(shape.deviations.sums)))
+    derivatives[:, list(shape.in_words)] = _derivatives(model, shape.sums)
+    for j, change in shape.optical.items():
+        derivatives[model.index(f"{Deviations.name}.{change.label}"), j] = 1.0
+    return derivatives
+
+
+def _derivatives(model: Model, sums: Sequence[Sum]) -> Float[np.ndarray, "n a"]:
+    derivatives = np.zeros((len(model.parameters), len(sums)))
+    for j, combination in enumerate(sums):
+        for size, sentence in combination:
+            derivatives[model.index(f"{Described.name}.{sentence.label}"), j] += size
+    return derivatives
 
 
 def _with_ties(model: Model, new: Sequence[int], amplitudes: Float[np.ndarray, "n a"]) -> Model:
@@ -191,11 +257,10 @@ def _positive(matrix: Matrix) -> Matrix:
     return np.where(np.outer(scale > 0, scale > 0), 0.5 * (clipped + clipped.T), 0.0)
 
 
-def only_a_class(classes: Sequence[ClassOf]) -> Iterator[str]:
-    """A sentence on each class whose members differ by so much that nothing of it may be trusted."""
-    for group in classes:
-        apart = group.spread > min(GOAL, max(group.stated, thresholds.NEGLIGIBLE))
-        if not (apart or group.off > FAR):
+def only_a_class(classes: Classes) -> Iterator[str]:
+    """A sentence on each class whose members differ by so much that nothing of it may be trusted, and on shapes."""
+    for group in classes.additions:
+        if not (_dominates(group.spread, group.stated) or group.off > FAR):
             continue
         names = some([f"{m.name} ({100 * m.probability:.0f} %)" for m in group.members[1:]], _SHOWN)
         yield (
@@ -204,6 +269,18 @@ def only_a_class(classes: Sequence[ClassOf]) -> Iterator[str]:
             f"errors of the fit are {two_digits(100 * group.stated)} %; elements of the matrix by up to "
             f"{two_digits(group.off)} errors): {_deciding(group)}"
         )
+    shape = classes.shape
+    if shape is not None and _dominates(shape.spread, shape.stated):
+        yield (
+            "the cause was described, not named: over the field, over the exposures and in its kind of polarisation it "
+            f"may differ from the description (p by {two_digits(100 * shape.spread)} %, median, where the errors of "
+            f"the fit are {two_digits(100 * shape.stated)} %)"
+        )
+
+
+def _dominates(spread: float, stated: float) -> bool:
+    """True if an ambiguity is larger than the goal, or than the errors of the fit."""
+    return spread > min(GOAL, max(stated, thresholds.NEGLIGIBLE))
 
 
 def _deciding(group: ClassOf) -> str:

@@ -29,7 +29,8 @@ Limits      One effect at a time, to first order in its amplitude, for the shape
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -37,21 +38,24 @@ from scipy import special
 
 from walop_jax.calibration.accuracy import change_of_qu
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.could_hide import could_hide, hidden_errors
+from walop_jax.calibration.could_hide import CouldHide, could_hide, hidden_errors
 from walop_jax.calibration.matrix import effect_slopes, first_setting, matrix_slopes
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.examination import Examination, examine, most_points
+from walop_jax.diagnosis.examination import Examination, Matrix, Vector, examine, most_points
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.hypotheses import Probe, fringes_of
-from walop_jax.diagnosis.limits_found import ConditionLimit, DetectionLimit, DetectionLimits, over_field
 from walop_jax.diagnosis.score import ScoreSpace, local_p, noncentrality, separations
 from walop_jax.diagnosis.stated_conditions import STEP, Singles, condition_scores
 from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.stand_in import on_field_points
+from walop_jax.fit.verdict import DATA, EFFECT
+from walop_jax.io.display import Display, Displayed
+from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.progress import Stage
+from walop_jax.io.text import two_digits, two_digits_range
 from walop_jax.model.effects import EffectKind
 from walop_jax.model.instrument import Instrument
 
@@ -60,6 +64,226 @@ MANY_SHAPES = 8
 
 SECOND_ORDER = 1.1
 _ABSORBED = 1e-9  # share of the square of a column that a rival leaves below which the two are the same
+
+NO_LEVEL = "q and u cannot both be measured with one exposure"
+HEAD = ("amplitude", ">detected", ">named", "unit", ">error of q, u (%)", "can be mistaken for")
+
+
+class DetectionLimit(NamedTuple):
+    """The amplitudes of one parameter of an effect that are detected and named, in its unit.
+
+    `detected` holds the smallest and the largest over the shapes that the effect may have, `named` the largest
+    (infinite where some rival does exactly the same). `taken_for` are the effects for which it may be taken when it is
+    just detected, nearest first. `error_of_qu` is the error that q and u of a star polarised by up to 5 % have from it
+    at the amplitude that is just detected: median and largest over the field; NaN where one exposure does not give
+    both.
+    """
+
+    effect: str
+    parameter: str
+    unit: str
+    detected: tuple[float, float]
+    named: float
+    taken_for: tuple[str, ...]
+    error_of_qu: tuple[float, float]
+
+    @property
+    def name(self) -> str:
+        """The amplitude as it is spelled in tables."""
+        return f"{self.effect}.{self.parameter}"
+
+    @property
+    def mistake(self) -> CouldHide:
+        """The effect at its detection limit."""
+        return CouldHide(self.name, EFFECT, self.detected[1], self.unit, "", True, False, self.error_of_qu)
+
+
+class ConditionLimit(NamedTuple):
+    """Detection limit for the error of a number that a set states.
+
+    `detected` in `unit`, infinite where no residual shows it; `error_of_qu` as that of `DetectionLimit`, at `size`:
+    the detection limit, or the largest plausible size where it is not detectable.
+    """
+
+    what: str
+    unit: str
+    detected: float
+    size: float
+    error_of_qu: tuple[float, float]
+
+    @property
+    def mistake(self) -> CouldHide:
+        """The error of the number at `size`."""
+        return CouldHide(self.what, DATA, self.size, self.unit, "", True, False, self.error_of_qu)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class DetectionLimits(Displayed):
+    """Sizes at which a set shows every effect, and the harm that smaller ones may do.
+
+    `separation` (row, column) is how far (σ) the effect of the column stays from that of the row when this is just
+    detected. `protection` is, by field point (`x`, `y`, degrees), the largest error of q and u that a single effect
+    can make without being detected, with a tenth on top for what is not of first order, `caused_by` the effect.
+    `untestable` effects leave no trace in these data. `conditions` are those stated in the set: its field, its
+    filters, the colours of its light. `could_hide` are the undetectable mistakes, as in every command.
+    """
+
+    limits: tuple[DetectionLimit, ...]
+    effects: tuple[str, ...]
+    separation: Matrix
+    x: Vector
+    y: Vector
+    protection: Vector
+    caused_by: tuple[str, ...]
+    untestable: tuple[str, ...]
+    conditions: tuple[ConditionLimit, ...] = ()
+    could_hide: tuple[CouldHide, ...] = ()
+
+    def to_table(self) -> Any:
+        """A row for each effect and parameter, the largest error of q and u first, as an astropy table."""
+
+        def column(name: str, kind: str, about: str = "") -> tuple[np.ndarray, str, str]:
+            values = [getattr(row, name) for row in self.limits]
+            shape = (-1, 2) if name in ("detected", "error_of_qu") else -1
+            return np.array(values, kind).reshape(shape), "", about
+
+        taken_for = np.array([", ".join(row.taken_for) for row in self.limits], "U128")
+        return astropy_table(
+            {
+                "EFFECT": column("effect", "U32"),
+                "PARAMETER": column("parameter", "U32"),
+                "UNIT": column("unit", "U16", "of DETECTED and NAMED"),
+                "DETECTED": column("detected", "f8", "over the shapes: least, most"),
+                "NAMED": column("named", "f8", "named alone with 99 % probability"),
+                "QU_ERROR": column("error_of_qu", "f8", "median, largest over field"),
+                "TAKEN_FOR": (taken_for, "", ""),
+            }
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        field = {"x": self.x, "y": self.y, "error_of_qu": self.protection}
+        return {
+            "probability": thresholds.PROBABILITY,
+            "alarm": thresholds.ALARM,
+            "limits": [entry._asdict() for entry in self.limits],
+            "effects": list(self.effects),
+            "separation": self.separation.tolist(),
+            "protection": {name: values.tolist() for name, values in field.items()}
+            | {"caused_by": list(self.caused_by)},
+            "untestable": list(self.untestable),
+            "conditions": [entry._asdict() for entry in self.conditions],
+            "could_hide": [mistake._asdict() for mistake in self.could_hide],
+        }
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> DetectionLimits:
+        """Inverse of `document`. Raises KeyError or TypeError for an invalid one."""
+        protection, effects = document["protection"], tuple(document["effects"])
+        return cls(
+            limits=_records(DetectionLimit, document["limits"], "named"),
+            effects=effects,
+            separation=np.array(document["separation"], float).reshape(len(effects), len(effects)),
+            x=np.array(protection["x"], float),
+            y=np.array(protection["y"], float),
+            protection=np.array(protection["error_of_qu"], float),
+            caused_by=tuple(protection["caused_by"]),
+            untestable=tuple(document["untestable"]),
+            conditions=_records(ConditionLimit, document.get("conditions", ()), "detected"),
+            could_hide=_records(CouldHide, document.get("could_hide", ()), ""),
+        )
+
+    @property
+    def mistakes(self) -> tuple[CouldHide, ...]:
+        """All mistakes in order of their undetected error of q and u, the largest first.
+
+        Errors are those of `could_hide`, for all others those of their own limits.
+        """
+        names = {m.name for m in self.could_hide}
+        effects = (limit for limit in self.limits if limit.effect not in thresholds.ASKED_BY_CAMERA)
+        others = (limit.mistake for limit in (*effects, *self.conditions))
+        further = [m for m in others if m.name not in names and np.isfinite(m.error[0])]
+        return tuple(sorted((*self.could_hide, *further), key=lambda m: (-m.error[0], -m.error[1])))
+
+    def display(self) -> Display:
+        """The worst that could hide in a sentence; a row for each effect and parameter, and each number of the set."""
+        limits = {
+            EFFECT: {limit.name: limit for limit in self.limits},
+            DATA: {limit.what: limit for limit in self.conditions},
+        }
+        rows: list[tuple[str, ...]] = []
+        for kind, title in ((EFFECT, "EFFECTS"), (DATA, "ERRORS IN THE DATA")):
+            mistakes = {m.name: m for m in self.mistakes if m.kind == kind}
+            names = dict.fromkeys((*mistakes, *limits[kind]))
+            if names:
+                rows.append((title, *("",) * (len(HEAD) - 1)))
+            rows += [_row(name, mistakes.get(name), limits[kind].get(name)) for name in names]
+        undetected = f"cannot be detected in these data: {', '.join(self.untestable)}"
+        return Display(
+            title="What these data can show, with 99 % probability",
+            facts=(("undetectable", self.protection_in_words() or NO_LEVEL),),
+            head=HEAD,
+            rows=tuple(rows),
+            notes=(undetected,) if self.untestable else (),
+        )
+
+    def protection_in_words(self) -> str:
+        """The largest error of q and u over the field that goes unnoticed; empty where none is known."""
+        if not self.mistakes:
+            return ""
+        worst = self.mistakes[0]
+        return (
+            "a systematic error too small to be detected could still bias q or u by "
+            f"{two_digits(100 * worst.error[0])} % (median over the field, stars with p ≤ 5 %; "
+            f"{two_digits(100 * worst.error[1])} % at worst): "
+            f"{worst.in_words}"
+        )
+
+    @property
+    def worst(self) -> int | None:
+        """The field point with the largest undetected error; None if one exposure nowhere gives q and u."""
+        return int(np.nanargmax(self.protection)) if np.isfinite(self.protection).any() else None
+
+
+def _row(
+    name: str, hidden: CouldHide | None, limit: DetectionLimit | ConditionLimit | None
+) -> tuple[str, ...]:
+    """A row of the table: a mistake as it could hide, or a limit of which no error is known."""
+    error = "" if hidden is None else two_digits_range(*(100.0 * value for value in hidden.error))
+    if isinstance(limit, DetectionLimit):
+        named = two_digits(limit.named) if np.isfinite(limit.named) else "never"
+        detected = two_digits_range(*limit.detected)
+        return name, detected, named, limit.unit, error, ", ".join(limit.taken_for)
+    size, unit = (np.nan, "") if hidden is None else (hidden.size, hidden.unit)
+    remark = "" if hidden is None or hidden.measured else f"error at {two_digits(size)}, the usual size"
+    if limit is not None:
+        unit = limit.unit
+        if not np.isfinite(limit.detected):
+            remark = f"error at {two_digits(limit.size)} {unit}".rstrip()
+    detected = "never" if remark or not np.isfinite(size) else two_digits(size)
+    return name, detected, "", unit, error, remark
+
+
+def _records(kind: Any, entries: Iterable[Mapping[str, Any]], endless: str) -> tuple[Any, ...]:
+    """Records from plain data, where numbers that are not finite are null: ∞ in the field `endless`, NaN in others."""
+
+    def value(name: str, entry: Any) -> Any:
+        if isinstance(entry, list):
+            return tuple(value(name, element) for element in entry)
+        return (np.inf if name == endless else np.nan) if entry is None else entry
+
+    return tuple(kind(**{name: value(name, entry[name]) for name in kind._fields}) for entry in entries)
+
+
+def over_field(errors: Float[np.ndarray, "c p"]) -> tuple[float, float]:
+    """Median and largest over the field, of the worst shape."""
+    finite = errors[np.isfinite(errors).any(axis=1)]
+    if not finite.size:
+        return float("nan"), float("nan")
+    return float(np.nanmedian(finite, axis=1).max()), float(np.nanmax(finite))
+
+
+# ---------------------------------------------------------------------------------------------------------- effects
 
 
 def detection_limits(

@@ -185,10 +185,16 @@ class Evidence:
         """Evidence that a name needs: where the base is excluded it competes with patterns that have none."""
         return min(0.0, max((s.log_bayes for s in self._pattern_scores), default=0.0))
 
-    @property
-    def best_pattern(self) -> float:
-        """Evidence of the most probable pattern, less the logarithm of the number of patterns."""
-        alive = [score.log_bayes for score in self._pattern_scores]
+    def by_fit(self, score: Score) -> float:
+        """Difference of the evidence that a fit finds, with its errors, from that in units of the remaining noise."""
+        return 0.5 * score.statistic * (self.table.noise_scale**2 - 1.0)
+
+    def best_pattern(self, *, fitted: bool = False) -> float:
+        """Evidence of the most probable pattern, less the logarithm of the number of patterns.
+
+        In the unit of linear trials, or as a fit of it would find it (`by_fit`).
+        """
+        alive = [score.log_bayes + fitted * self.by_fit(score) for score in self._pattern_scores]
         return max(alive, default=-np.inf) - float(np.log(max(len(alive), 1)))
 
     def _p(self, score: Score) -> float:
@@ -215,12 +221,12 @@ class Evidence:
         """Patterns that together leave nothing significant, with corrected p: the most probable first, one by one."""
         return self._beside_patterns[0]
 
-    def stands(self, probes: Sequence[Probe], evidence: float) -> bool:
+    def stands(self, probes: Sequence[Probe], evidence: float, *, fitted: bool = False) -> bool:
         """True if an explanation with this evidence is preferred over every unnamed pattern.
 
         It is more probable than any of them, or is significant beside those that are needed.
         """
-        if evidence > self.best_pattern - thresholds.EVEN_ODDS:
+        if evidence > self.best_pattern(fitted=fitted) - thresholds.EVEN_ODDS:
             return True
         table = self._beside_patterns[1]
         return any(

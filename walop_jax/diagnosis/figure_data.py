@@ -370,11 +370,8 @@ def _in_words(cube: Cube, used: Used, exposures: Exposures) -> Iterator[_Combina
 def _ladder(diagnosis: Diagnosis) -> Table:
     """Starting model, every addition, and the final fit where it differs from that of the last addition."""
     final = diagnosis.after
-    dof, rungs = diagnosis.before.dof, [("starting model", diagnosis.before.chi2, diagnosis.before.dof)]
-    for step in diagnosis.steps:
-        added = [final.model.parameters[i] for i in final.model.positions(step.effect)]
-        dof -= sum(p.free and p.tie is None and p.prior is None for p in added)
-        rungs.append((step.effect, step.chi2_after, dof))
+    rungs = [("starting model", diagnosis.before.chi2, diagnosis.before.dof)]
+    rungs += [(step.effect, step.chi2_after, step.dof_after) for step in diagnosis.steps]
     if abs(final.chi2 - rungs[-1][1]) > 1e-6 * final.chi2:
         rungs.append((FreeForm.name if _unnamed_term(diagnosis) else "final fit", final.chi2, final.dof))
     model, chi2, freedom = zip(*rungs, strict=True)

@@ -13,13 +13,13 @@ from jaxtyping import Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import Exposures
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import ClassOf
+from walop_jax.diagnosis.class_product import Classes, ClassOf, Shape
 from walop_jax.diagnosis.design import Design, positions_of
 from walop_jax.diagnosis.reasons import why
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.text import probability, some, value_and_error
+from walop_jax.io.text import plain, probability, some, value_and_error
 from walop_jax.model import legendre
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import Change
@@ -182,6 +182,7 @@ class Step:
     log_bayes: float
     chi2_before: float
     chi2_after: float
+    dof_after: int
     heldout_scheme: str
     heldout_before: float
     heldout_after: float
@@ -276,7 +277,7 @@ class Diagnosis(Drawn):
     choices: tuple[Choice, ...] = ()
     classes: tuple[Mapping[str, Any], ...] = ()
     ended: str = ""
-    members: tuple[ClassOf, ...] = ()
+    members: Classes = dataclasses.field(default_factory=Classes)
     rounds: tuple[Any, ...] = ()
     not_scored: Mapping[str, str] = dataclasses.field(default_factory=dict)
     descriptions: int = 0
@@ -413,10 +414,6 @@ def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
 _ALIKE, _CLASSES = 6, 3  # printed indistinguishable names, and groups of them: the file has all
 
 
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 _AS_THEY_ARE = (
     "effect", "score", "p_value", "chi2_before", "chi2_after", "heldout_before", "heldout_after", "heldout_scheme",
     "alternatives", "equivalent", "nameless", "separated_by", "where", "confirmed", "log_bayes", "negligible",
@@ -429,8 +426,8 @@ def _step(step: Step) -> dict[str, Any]:
     return {name: getattr(step, name) for name in _AS_THEY_ARE} | {
         "parameters": {n: {"value": v, "sigma": s, "unit": unit} for n, (v, s, unit) in entries.items()},
         "sentences": [_sentence(*entry) for entry in step.told],
-        "change_of_qu": _number(step.change_of_qu),
-        "robust_error_ratio": _number(step.robust_ratio),
+        "change_of_qu": step.change_of_qu,
+        "robust_error_ratio": step.robust_ratio,
         "separation_sigma": {name: value for name, value in near if math.isfinite(value)},
     }
 
@@ -443,6 +440,13 @@ def _members(addition: ClassOf) -> dict[str, Any]:
         "stated_error_of_p": addition.stated,
         "farthest_element_sigma": addition.off,
     }
+
+
+def _shape(shape: Shape | None) -> dict[str, Any] | None:
+    if shape is None:
+        return None
+    count = len(shape.deviations.sums)
+    return {"deviations": count, "spread_of_p": shape.spread, "stated_error_of_p": shape.stated}
 
 
 def sentences(content: Mapping[str, Any]) -> Iterator[str]:
@@ -510,52 +514,53 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
 
 def document(diagnosis: Diagnosis) -> dict[str, Any]:
     """The content of diagnosis.json."""
-    unexplained = diagnosis.unexplained
-    return {
+    left, before, after = diagnosis.unexplained, diagnosis.before, diagnosis.after
+    unexplained = (
+        None
+        if left is None
+        else {
+            "p_value": left.p_value,
+            "description": left.description,
+            "patterns": [{"pattern": name, "p_value": p} for name, p in left.patterns],
+            "free_form": left.term,
+            "chi2_before": left.chi2_before,
+            "chi2_after": left.chi2_after,
+            "change_of_qu": left.change_of_qu,
+            "parts": left.parts,
+        }
+    )
+    rounds = [
+        {
+            "p_value": turn.p_value,
+            "added": turn.added,
+            "asked": [reason._asdict() for reason in turn.asked],
+        }
+        for turn in diagnosis.rounds
+    ]
+    content = {
         "verdict": diagnosis.verdict,
         "steps": [_step(step) for step in diagnosis.steps],
         "candidates": [
             {"effect": name, "score": score, "p_value": p} for name, score, p in diagnosis.candidates
         ],
-        "unexplained": None
-        if unexplained is None
-        else {
-            "p_value": unexplained.p_value,
-            "description": unexplained.description,
-            "patterns": [{"pattern": name, "p_value": p} for name, p in unexplained.patterns],
-            "free_form": list(unexplained.term),
-            "chi2_before": _number(unexplained.chi2_before),
-            "chi2_after": _number(unexplained.chi2_after),
-            "change_of_qu": _number(unexplained.change_of_qu),
-            "parts": list(unexplained.parts),
-        },
+        "unexplained": unexplained,
         "p_value": diagnosis.p_value,
         "remaining_p_value": diagnosis.remaining_p,
-        "noise_scale": _number(diagnosis.noise_scale),
-        "noise_p_value": _number(diagnosis.noise_p),
+        "noise_scale": diagnosis.noise_scale,
+        "noise_p_value": diagnosis.noise_p,
         "limits": diagnosis.limits,
-        "choices": [
-            {"change": choice.change, "left": choice.left, "better_by": _number(choice.better_by)}
-            for choice in diagnosis.choices
-        ],
+        "choices": [dataclasses.asdict(choice) for choice in diagnosis.choices],
         "classes": diagnosis.classes,
-        "members": [_members(addition) for addition in diagnosis.members],
+        "members": [_members(addition) for addition in diagnosis.members.additions],
+        "shape": _shape(diagnosis.members.shape),
         "cannot_be_tested": diagnosis.untestable,
-        "chi2_per_dof_before": diagnosis.before.chi2 / max(diagnosis.before.dof, 1),
-        "chi2_per_dof_after": diagnosis.after.chi2 / max(diagnosis.after.dof, 1),
-        "rounds": [
-            {
-                "p_value": turn.p_value,
-                "added": turn.added,
-                "asked": [
-                    {**reason._asdict(), "evidence": _number(reason.evidence)} for reason in turn.asked
-                ],
-            }
-            for turn in diagnosis.rounds
-        ],
-        "not_scored": dict(diagnosis.not_scored),
+        "chi2_per_dof_before": before.chi2 / max(before.dof, 1),
+        "chi2_per_dof_after": after.chi2 / max(after.dof, 1),
+        "rounds": rounds,
+        "not_scored": diagnosis.not_scored,
         "descriptions": diagnosis.descriptions,
         "caution": diagnosis.caution,
         "policy": thresholds.in_use(),
         "seconds": diagnosis.seconds,
     }
+    return plain(content)

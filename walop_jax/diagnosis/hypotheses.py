@@ -100,10 +100,14 @@ def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) ->
     """True if a set is sensitive to an effect: enough field points, and the conditions of its elements."""
     if effect.kind.over_field and len(calset.points) < FEWEST_POINTS:
         return False
+    exposures = calset.exposures
+    unstated = {
+        name
+        for name, column in CONDITIONS.items()
+        if not np.isfinite(getattr(exposures, column.lower())).any()
+    }
     bare = dataclasses.replace(instrument, effects=())
-    conditions = conditions_of_effect(bare, effect)
-    stated = {name: getattr(calset.exposures, column.lower()) for name, column in CONDITIONS.items()}
-    return all(np.isfinite(stated[name]).any() for name in conditions if name in stated)
+    return not unstated or unstated.isdisjoint(conditions_of_effect(bare, effect))
 
 
 def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Probe]) -> list[Probe]:

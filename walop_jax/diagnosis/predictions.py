@@ -29,6 +29,7 @@ def before_and_after(name: str, before: Design, after: Design) -> dict[str, Any]
     return {
         "chi2_before": before.fit.chi2,
         "chi2_after": after.fit.chi2,
+        "dof_after": after.fit.dof,
         "heldout_scheme": scheme,
         "heldout_before": held_out(before, scheme),
         "heldout_after": held_out(after, scheme),

@@ -102,7 +102,9 @@ def refused(evidence: Evidence, trial: Trial) -> str:
         return "its fit did not converge"
     if not trial.predicts:
         return "by its linear step it does not predict settings and field points that it has not seen"
-    worth, needed = trial.evidence / evidence.floor**2, evidence.evidence_needed
+    # Linear evidence counts in the scatter behind all candidates already, that of fits in their errors.
+    fitted, needed = trial.fit is not None, evidence.evidence_needed
+    worth = trial.evidence / evidence.floor**2 if fitted else trial.evidence
     if worth <= needed:
         return f"ln B = {worth:.3g} is not above {needed:.3g}"
     explained, least = evidence.chi2 - trial.left, _least_explained(evidence, trial)
@@ -111,8 +113,9 @@ def refused(evidence: Evidence, trial: Trial) -> str:
         return f"it explains {explained:.4g} of {missing:.4g} that are missing in χ², less than {least:.4g}"
     # The residuals are noise now: a pattern can only describe the same with more numbers.
     suffices = trial.noise and not explains(evidence.chi2, evidence.dof)
-    if not suffices and not _stands(evidence, trial, worth):
-        return f"a pattern without a name is more probable (ln B = {evidence.best_pattern:.3g}, its own {worth:.3g})"
+    if not suffices and not _stands(evidence, trial):
+        best = evidence.best_pattern(fitted=fitted)
+        return f"a pattern without a name is more probable (ln B = {best:.3g}, its own {trial.evidence:.3g})"
     before, after = (trial.compared.get(f"heldout_{when}", np.nan) for when in ("before", "after"))
     if after >= before:
         return (
@@ -132,12 +135,12 @@ def _least_explained(evidence: Evidence, trial: Trial) -> float:
     return max(least, thresholds.LEAST_SHARE_OF_NAME * surely)
 
 
-def _stands(evidence: Evidence, trial: Trial, worth: float) -> bool:
+def _stands(evidence: Evidence, trial: Trial) -> bool:
     """True if no pattern without a name is clearly more probable."""
     probes = [probe for probe in evidence.probes if probe.effect is trial.effect]
     if not probes and trial.effect is not Described:  # without a linear step
         return True
-    return evidence.stands(probes, worth)
+    return evidence.stands(probes, trial.evidence, fitted=trial.fit is not None)
 
 
 def hopeless(evidence: Evidence, trial: Trial) -> str:
@@ -169,7 +172,7 @@ def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
         remaining,
         explains(remaining, evidence.dof - item.score.rank),
         item=item,
-        linear=item.log_bayes + 0.5 * statistic * (noise**2 - 1.0),
+        linear=item.log_bayes + evidence.by_fit(item.score),
     )
 
 
@@ -195,7 +198,7 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
     """The addition with the highest evidence that is not refused (None: all are), and the state with the reasons."""
     evidence, log, fits, choices = state.evidence, _Log(state.evidence), state.fits, state.choices
     waiting = log.passed(linear_trials(evidence), hopeless)
-    tried, accepted, ended = list(waiting), None, ""
+    tried, accepted, confirmed, ended = list(waiting), None, [], ""
     others_asked = sentences_asked = False
     while accepted is None:
         new: list[Trial] = []
@@ -221,11 +224,18 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
             fits += len(alternatives)
             alternatives = log.passed(alternatives)
             new, tried = [*new, *alternatives], [*tried, *alternatives]
-        for trial in judge.decided(sorted(new, key=names_first)):
+        for trial in judge.decided(sorted([*new, *confirmed], key=names_first)):
             if accepted := next(iter(log.passed([judge.confronted(evidence, trial)])), None):
                 break
+        # Sentences were behind a name that was refused: they come before another one that is less probable.
+        if accepted is not None and not confirmed:
+            confirmed = [accepted]
+            waiting = log.passed(_sentences_behind(evidence, tried, accepted), hopeless)
+            tried += waiting
+            accepted = None if waiting else accepted
         if not waiting or (ended := judge.over(fits)):
             break
+    accepted = accepted or next(iter(confirmed), None)
     if accepted is not None:
         ended, accepted = "", _with_rivals(evidence, accepted, tried)
     added = "" if accepted is None else accepted.name
@@ -241,10 +251,13 @@ def _is_sure(trial: Trial, waiting: Sequence[Trial]) -> bool:
     return trial.noise or not waiting or trial.linear - waiting[0].linear >= reach
 
 
-def _sentences_behind(evidence: Evidence, tried: Sequence[Trial]) -> list[Trial]:
-    """The leading sentences, without those that were tried."""
+def _sentences_behind(evidence: Evidence, tried: Sequence[Trial], name: Trial | None = None) -> list[Trial]:
+    """The leading sentences, without those that were tried; clearly more probable than a name, if it is given."""
+    least = -np.inf if name is None or name.item is None else name.item.log_bayes + thresholds.EVEN_ODDS
     untried = [
-        item for item in evidence.significant_sentences if not any(item is trial.item for trial in tried)
+        item
+        for item in evidence.significant_sentences
+        if item.log_bayes > least and not any(item is trial.item for trial in tried)
     ]
     return [linear_trial(evidence, item) for item in untried[: thresholds.MOST_SENTENCES]]
 

@@ -76,7 +76,7 @@ def base_model(
     for i in model.positions(THROUGHPUT):
         p = model.parameters[i]
         model = model.change(p.name, scale=p.scale * level / LEVEL, loose=level)
-    for name in gauges(model, has_known_flux(calset)):
+    for name in gauges(model, bool(calset.exposures.flux_known.any())):
         model = model.change(name, free=False)
     if not calset.exposures.direct("moon").any():
         model = model.change("sky.depolarisation", free=False)
@@ -115,11 +115,6 @@ def instrument_of(calset: CalibrationSet) -> Instrument:
             "its description, --instrument FILE or instrument=Instrument.read(FILE)"
         )
     return nominal_instrument(calset.instrument)
-
-
-def has_known_flux(calset: CalibrationSet) -> bool:
-    """True if any exposure is of KIND `flux`, so that the overall scale of the throughput is measured."""
-    return bool(calset.exposures.flux_known.any())
 
 
 def model_for(

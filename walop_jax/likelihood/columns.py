@@ -430,9 +430,8 @@ class ResponseBlock:
     def _core(self, slot: Slot) -> Float[np.ndarray, "m k n"]:
         responses = self.found
         if slot[0] == "light":
-            vectors = np.take_along_axis(
-                responses.vectors.vectors, self.band[:, None, :, None, None], axis=2
-            )  # p m e k 4
+            # P m e k 4.
+            vectors = np.take_along_axis(responses.vectors.vectors, self.band[:, None, :, None, None], axis=2)
             change = responses.light.slopes[:, :, self.of.of_light[slot[:4]]]
             for star in slot[4:]:
                 change = change * (self.value == star)[:, None, :, None]

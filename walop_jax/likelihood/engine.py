@@ -321,13 +321,6 @@ def _residuals(
     return jax.vmap(point_residuals, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
 
-def _prediction(
-    instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None = None
-) -> Float[Array, "p e k"]:
-    """Counts for light of unit flux; `detected` takes electrons, flux × these, through the detectors."""
-    return jax.vmap(point_prediction, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
-
-
 def _linearised_residuals(
     instrument: Instrument, plan: Plan, data: PointData
 ) -> tuple[Float[Array, "p d"], Float[Array, "p d n"]]:
@@ -353,5 +346,8 @@ linearised_residuals = compiled(
 )
 star_responses = compiled(_star_responses, kept_as="star_responses")
 residuals = compiled(_residuals, optimised_above=limits.OPTIMISED_ABOVE, kept_as="residuals")
-prediction = compiled(_prediction, optimised_above=limits.OPTIMISED_ABOVE, kept_as="prediction")
+prediction = compiled(
+    jax.vmap(point_prediction, (None, None, 0)), optimised_above=limits.OPTIMISED_ABOVE, kept_as="prediction"
+)
+"""Counts for light of unit flux; `detected` takes electrons, flux × these, through the detectors."""
 detected = compiled(jax.vmap(light.detected, (None, None, 0)), kept_as="detected")

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -186,28 +186,15 @@ class Likelihood:
         model: Model,
         probes: tuple[Effect, ...] = (),
         *,
-        memory: float | None = None,
         runner: Runner | None = None,
-        batch: int | None = None,
-        interpolate: bool | None = None,
-        sets: int = 1,
+        **options: Any,
     ) -> Likelihood:
         """Bring a set and a model together; `probes` are effects beyond the model whose columns will be asked for.
 
-        `memory` (bytes) is what the data of the points may take, None for the usual 2 GB. `batch` and
-        `interpolate` are decided by the size of the set where they are None. `sets` is how many such sets come.
+        `options` are those of `Layout.of`: memory, batch, interpolate, sets.
         """
         runner = runner or Runner()
-        layout = Layout.of(
-            calset,
-            model,
-            probes,
-            memory=memory,
-            threads=runner.threads,
-            batch=batch,
-            interpolate=interpolate,
-            sets=sets,
-        )
+        layout = Layout.of(calset, model, probes, threads=runner.threads, **options)
         reader = PointReader(calset, layout.plan, model.template, layout.mirrored)
         return cls(layout, MeasuredPoints(reader, layout), runner, model)
 

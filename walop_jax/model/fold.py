@@ -195,9 +195,8 @@ def around(
         rows = [*itertools.accumulate(reversed(path), _ahead, initial=last)][::-1]
         places = [*zip(rows, itertools.accumulate(path, _behind, initial=start), strict=True)]
         arm_places.append((places[: count + 1], places[count:]))
-    same = zip(
-        *(shared for shared, _ in arm_places), strict=True
-    )  # of the common train, as each of the arms sees it
+    # Of the common train, as each of the arms sees it.
+    same = zip(*(shared for shared, _ in arm_places), strict=True)
     common_places = [(functools.reduce(jnp.add, [rows for rows, _ in views]), views[0][1]) for views in same]
     return [common_places, *(arm for _, arm in arm_places)]
 

@@ -131,8 +131,10 @@ def number(*, unit: str, about: str, default: float | None = 0.0, several: bool 
 
 def as_number(value: Any) -> Any:
     """A value as a float64 array; None stays. Explicit, as weak types would be compiled anew beside arrays."""
+    if value is None or (isinstance(value, jax.Array) and value.dtype == float and not value.weak_type):
+        return value
     with float64():
-        return None if value is None else jnp.asarray(value, float)
+        return jnp.asarray(value, float)
 
 
 def unknown_name(what: str, name: str, known: Iterable[str]) -> ValueError:
@@ -149,6 +151,9 @@ def check_names(what: str, names: Iterable[str], known: Collection[str]) -> None
 
 class Component(eqx.Module):
     """A piece of the instrument; a fit may vary its declared parameters."""
+
+    # Methods of Equinox modules are trees, whose making took a tenth of a second fit; these are plain methods.
+    __getattribute__ = object.__getattribute__
 
     def __reduce__(self) -> tuple[Any, ...]:
         return blank, (type(self),), self.__getstate__()
@@ -183,7 +188,8 @@ def _arrays(
         elif isinstance(value, tuple):
             for i, child in enumerate(value):
                 if isinstance(child, Component) and hasattr(child, "name"):
-                    yield from _arrays(child, f"{part}.{_name(child)}".strip("."), (*holder, str(i)))
+                    name: Any = child.name
+                    yield from _arrays(child, f"{part}.{name}".strip("."), (*holder, str(i)))
         elif isinstance(value, Component):
             yield from _arrays(value, f"{part}.{field.name}".strip("."), holder)
 
@@ -197,10 +203,6 @@ def _named(
         raise ValueError(f"{type(component).__name__}.{name}: {len(labels)} labels, {np.size(value)} values")
     names = (declared.name or f"{part}.{label}".strip(".") for label in labels)
     return tuple(dataclasses.replace(declared, name=name, part=part) for name in names)
-
-
-def _name(component: Any) -> str:
-    return component.name
 
 
 def leaves(component: Component) -> tuple[Parameter, ...]:

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from walop_jax.data.records import Exposures
+from walop_jax.data.records import CalibrationSet, Exposures
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import with_error, with_minus_sign
@@ -254,17 +254,19 @@ def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
     )
 
 
-def with_effects(model: Model, effects: Sequence[str | EffectKind | Effect], context: Context) -> Model:
-    """The model with effects added, in the order of the light path, otherwise unchanged.
+def with_effects(
+    model: Model, effects: Sequence[str | EffectKind | Effect], data: Context | CalibrationSet
+) -> Model:
+    """The model with effects added for some data, in the order of the light path, otherwise unchanged.
 
     A name or a class adds the effect at its neutral value, at the shape of its first probe; an instance starts at its
     values. Priors are centred on neutral, with the widths of the declarations. Raises ValueError for an unknown
     name, for a duplicate effect, and for two effects on one number.
 
-    >>> context = walop.ObservingPlan(grid=3).context()
-    >>> walop.with_effects(walop.base_model(calset), ["hwp1_axis"], context).effect_names
+    >>> walop.with_effects(walop.base_model(calset), ["hwp1_axis"], calset).effect_names
     ('hwp1_axis',)
     """
+    context = data if isinstance(data, Context) else effect_context(model.template, data.exposures)
     active = list(model.template.effects)
     starts = {}
     for effect in effects:
@@ -285,9 +287,8 @@ def with_effects(model: Model, effects: Sequence[str | EffectKind | Effect], con
                 f"effect {effect.name!r} is the number that {text!r} adds to: leave one of them out"
             )
     instrument = dataclasses.replace(model.template, effects=in_order(active))
-    jax.eval_shape(
-        lambda i: i.patched(), instrument
-    )  # an effect that does not fit the instrument is an error here
+    # An effect that does not fit the instrument is an error here.
+    jax.eval_shape(lambda i: i.patched(), instrument)
     by_name = {p.name: p for p in model.parameters}
     parameters = []
     for p in make_model(model.name, instrument).parameters:

@@ -25,7 +25,7 @@ from walop_jax.calibration.accuracy import measures_u, p_errors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.thresholds import GOAL
 from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
-from walop_jax.io.display import Display, Displayed
+from walop_jax.io.display import Display, Drawn
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import two_digits, value_and_error
@@ -46,7 +46,7 @@ SUSPECT = 5.0  # excess of χ² of a night over its expectation, in its own stan
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Survey(Displayed):
+class Survey(Drawn):
     """Nights under laws: `at(mjd)` is the calibration of a moment, `tracks` every parameter against time.
 
     `laws` are those of every parameter and candidate (None: absent), `breaks` the detected ones, now laws. `like` is
@@ -54,6 +54,8 @@ class Survey(Displayed):
     there is no calibration of a moment); `doubts` are those beside χ²; `events` the notes of
     users (MJD, words).
     """
+
+    first_figure = "tracks"
 
     data: Together
     laws: tuple[Law | None, ...]

@@ -27,7 +27,7 @@ from walop_jax.calibration.thresholds import GOAL, SMALLEST_DETERMINANT
 from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import DEFAULT_FILTER, Settings
-from walop_jax.io.display import Display, Displayed
+from walop_jax.io.display import Display, Drawn
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import two_digits
 from walop_jax.paper.polynomial import (
@@ -142,12 +142,14 @@ def offsets(
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Comparison(Displayed):
+class Comparison(Drawn):
     """Paper II's method and the joint model on one calibration set.
 
     `grid` has the errors at the points that the polynomials were made for, `between` those elsewhere; `truth` says
     whether the joint model was held against a truth there (its covariance otherwise).
     """
+
+    first_figure = "histogram"
 
     paper: PaperCalibration
     offsets: Offsets

@@ -17,8 +17,8 @@ from matplotlib.ticker import MaxNLocator
 
 from walop_jax.data.records import Points
 from walop_jax.diagnosis import thresholds
+from walop_jax.diagnosis.detection_limits import NO_LEVEL, DetectionLimits
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, PointMap, ResidualComparison, Table
-from walop_jax.diagnosis.limits_found import NO_LEVEL, DetectionLimits
 from walop_jax.fit.verdict import SUSPECT_SIGMA
 from walop_jax.reports.style import (
     ABOVE,

@@ -13,9 +13,9 @@ from walop_jax.io.errors import fail, nearest
 from walop_jax.io.names import FIGURE_DATA, LIMITS, POSTERIOR, PRODUCT
 from walop_jax.paper.polynomial import TERMS
 from walop_jax.paper.wavelength import plate_names
-from walop_jax.reports import diagnosis_figures, figures, paper_figures, posterior_figures
-from walop_jax.reports.run import FigureSource
-from walop_jax.reports.style import PLATES, AnyFigure
+from walop_jax.reports import diagnosis_figures, figures, paper_figures, posterior_figures, survey_figures
+from walop_jax.reports.run import COMPARISON, DATA, SURVEY, FigureSource
+from walop_jax.reports.style import PAGE, PLATES, AnyFigure
 from walop_jax.reports.wording import listed
 
 NARROW = 5.0  # inches of a corner plot: three coefficients at most
@@ -107,9 +107,10 @@ def _modulation(source: FigureSource) -> AnyFigure:
     measured = source.calset.intensities.block(0, len(points)).used[:, behind].any(axis=1)
     if not measured.any():
         raise fail("no field point was seen behind the polariser", file=source.folder, advice="plot matrix")
-    away = np.hypot(points.x - source.place[0], points.y - source.place[1])
-    nearest = int(np.argmin(np.where(measured, away, np.inf)))
-    return figures.modulation_figure(source.calset, [nearest], source.canvas, _cameras(source))
+    x, y = np.broadcast_arrays(*map(np.atleast_1d, source.place))
+    away = np.hypot(points.x - x[:, None], points.y - y[:, None])
+    nearest = np.argmin(np.where(measured, away, np.inf), axis=1).tolist()
+    return figures.modulation_figure(source.calset, nearest, source.canvas, _cameras(source))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -240,10 +241,45 @@ FIGURES: Mapping[str, NamedFigure] = {
 """In the order of the list that is printed."""
 
 
+def _tracks(source: FigureSource) -> AnyFigure:
+    survey = source.held[SURVEY]
+    figure = survey_figures.tracks_figure(survey.tracks, survey.document())
+    if figure is None:
+        raise fail("no law of this survey lets a parameter change", file=source.folder, advice="plot nights")
+    return figure
+
+
+OF_RESULTS: Mapping[str, NamedFigure] = {
+    "modulation": NamedFigure(
+        FIGURES["modulation"].about, _modulation, DATA, lambda s: bool(s.calset.exposures.clp_in.any())
+    ),
+    **{
+        name: NamedFigure(about, lambda s, draw=figure: draw(s.held[COMPARISON]), COMPARISON)
+        for name, about, figure in (
+            ("histogram", "errors of both methods", paper_figures.histogram_figure),
+            ("map", "their errors of p over the field", paper_figures.map_figure),
+            ("offset", "corrections of the published method", paper_figures.offset_figure),
+            ("spectral", "the matrix against wavelength", paper_figures.spectral_figure),
+        )
+    },
+    "plate": NamedFigure(
+        "photon errors with the calibration plate",
+        lambda s: paper_figures.plate_figure(s.rebuilt),
+        possible=lambda s: CALIBRATION_PLATE in s.rebuilt.model.template.patched().moving(),
+    ),
+    "tracks": NamedFigure("parameters against time", _tracks, SURVEY),
+    "nights": NamedFigure(
+        "χ² of every night", lambda s: survey_figures.nights_figure(s.held[SURVEY].document()), SURVEY
+    ),
+}
+"""Figures of results in memory; those that runs do not have are of one size."""
+
+
 def possible(source: FigureSource) -> dict[str, NamedFigure]:
     """The figures that a run, or a result in memory, can give; its plates go by their names."""
+    known = FIGURES if source.run is not None else {**FIGURES, **OF_RESULTS}
     figures = {
-        name: entry for name, entry in FIGURES.items() if entry.needs in source and entry.possible(source)
+        name: entry for name, entry in known.items() if entry.needs in source and entry.possible(source)
     }
     if "retardance" in figures:
         about = f"maps of the retardance of {listed(_plates(source))}"
@@ -253,6 +289,10 @@ def possible(source: FigureSource) -> dict[str, NamedFigure]:
 
 def draw(name: str, source: FigureSource) -> AnyFigure:
     """The figure of a name; `DataError` with the nearest names if there is none, or if the run lacks its data."""
+    if name not in FIGURES and name in OF_RESULTS and OF_RESULTS[name].needs in source:
+        if source.canvas != PAGE:
+            raise ValueError(f"the figure {name!r} has a size of its own: leave ax, figsize and width out")
+        return OF_RESULTS[name].draw(source)
     if name not in FIGURES:
         raise fail(
             f"there is no figure {name!r}", advice=f"{nearest(name, FIGURES)} (walop-jax plot RUN lists all)"

@@ -37,15 +37,15 @@ from walop_jax.io.names import (
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import probability, rounded, value_and_error, with_error, with_minus_sign
 from walop_jax.model.effects import EFFECTS
+from walop_jax.posterior.run import Run
 from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import draw
 from walop_jax.reports.posterior_figures import unit_in_words
-from walop_jax.reports.run import RunContents, read_limits
+from walop_jax.reports.run import FigureSource, RunContents, read_limits
 from walop_jax.reports.wording import (
     CAPTIONS,
     data_in_words,
     effect_in_words,
-    hidden_in_words,
     names_in_words,
     symbols_in_words,
 )
@@ -56,6 +56,8 @@ TEMPLATES = Path(__file__).parent / "templates"
 MOST_PULLS = 8
 SHOWN_CANDIDATES = 10
 MANY = 32  # rows of a table above which it is folded
+SMALL = ("ladder", "protection")
+"""Figures that take half of the width."""
 
 
 class Picture(NamedTuple):
@@ -127,11 +129,21 @@ def png(content: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(content).decode("ascii")
 
 
-def picture(
-    name: str, figure: Figure, words: Mapping[str, object] | None = None, small: bool = False
-) -> Picture:
+def picture(name: str, figure: Figure, **words: str) -> Picture:
     """A figure with its caption."""
-    return Picture(embedded(figure), CAPTIONS[name].format(**(words or {})), small)
+    return Picture(embedded(figure), CAPTIONS[name].format(**words), name in SMALL)
+
+
+def drawn(source: FigureSource, names: Sequence[str], missing: list[str], **words: str) -> list[Picture]:
+    """Figures by name, with captions; what cannot be drawn is added to `missing`."""
+    pictures = []
+    for name in names:
+        try:
+            pictures.append(picture(name, draw(name, source), **words))
+        except (ValueError, OSError) as error:
+            if not any(str(error) in sentence for sentence in missing):
+                missing.append(f"The figure {name} is not drawn: {error}.")
+    return pictures
 
 
 # ------------------------------------------------------------------------------------------- a fit, a diagnosis
@@ -154,7 +166,7 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
     if trusted and requirements_shown is not None and (goal is not None or not answered):
         accuracy = _accuracy(run)
         head = head if accuracy is None else _with_goal(head, accuracy)
-    missing, drawn = [*run.missing], _Drawn(run)
+    missing = [*run.missing]
     origin = "" if run.product is None or not run.product.origin else f"; data from {run.product.origin}"
     sampled = run.product is not None and run.product.verdict.covariance_from == "posterior"
     when = "" if run.product is None else run.product.date.replace("T", " at ")
@@ -162,19 +174,21 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
     sections = (
         Section("commissioning", "Go or no-go", requirements_shown),
         Section(
-            "accuracy", "Accuracy of p over the field", pictures=drawn.accuracy(missing) if trusted else ()
+            "accuracy",
+            "Accuracy of p over the field",
+            pictures=_accuracy_pictures(run, missing) if trusted else (),
         ),
         *(
             []
             if run.product is None
             else [Section("data", "The data", Display("", data_in_words(run.product)))]
         ),
-        *([] if diagnosis is None else _diagnosed(run, head)),
-        Section("residuals", "Residuals before and after", pictures=drawn.residuals(missing)),
+        *([] if diagnosis is None else _diagnosed(run, head, missing)),
+        Section("residuals", "Residuals before and after", pictures=_residual_pictures(run, missing)),
         *([] if diagnosis is None else [_candidates(run)]),
         Section("limits", "What these data can show", folded=_limits(run)),
         Section("warnings", "Warnings", Display("", notes=_warnings(run) or ("None.",))),
-        Section("matrix", "Instrument matrix", pictures=drawn.matrix()),
+        Section("matrix", "Instrument matrix", pictures=_matrix_pictures(run, missing)),
         Section("pulls", "Largest pulls from the priors", _pulls(run)),
         _posterior(run),
         _parameters(run, fit if diagnosis is not None else dataclasses.replace(fit, facts=())),
@@ -233,84 +247,53 @@ def _with_goal(head: Display, known: FieldAccuracy) -> Display:
     return dataclasses.replace(head, facts=(*answer, *remaining))
 
 
-class _Drawn:
-    """The figures of a fit or a diagnosis, section by section; what cannot be drawn is added to `missing`."""
-
-    def __init__(self, run: RunContents) -> None:
-        self.run, self.source, self.product = run, run.source, run.product
-
-    def named(
-        self, name: str, missing: list[str], words: Mapping[str, object] | None = None
-    ) -> list[Picture]:
-        """A figure by name, if there is all that it needs."""
-        try:
-            return [picture(name, draw(name, self.source), words)]
-        except (ValueError, OSError) as error:
-            if not any(str(error) in sentence for sentence in missing):
-                missing.append(f"The figure {name} is not drawn: {error}.")
-            return []
-
-    def accuracy(self, missing: list[str]) -> list[Picture]:
-        """The error of p over the field, and the effect of a mistake that goes unnoticed."""
-        pictures = (
-            []
-            if self.product is None
-            else self.named("accuracy", missing, {"filter": self.product.maps.filter})
-        )
-        if pictures and self.run.limits is not None and self.run.limits.worst is not None:
-            pictures.append(
-                picture("protection", diagnosis_figures.protection_figure(self.run.limits), small=True)
-            )
-        return pictures
-
-    def residuals(self, missing: list[str]) -> list[Picture]:
-        """Residuals with the starting and the final model."""
-        data = self.run.figure_data
-        if self.run.diagnosis is None:
-            return [] if self.product is None else self.named("residuals", missing)
-        if data is None:
-            return []
-        pictures, overall = [], data.comparisons[0]
-        if len(data.comparisons) == 1:
-            drawn = diagnosis_figures.residual_maps(data.points, {"residuals": overall.before}, data.cameras)
-            pictures.append(picture("whole", drawn, {"combination": in_greek(overall.combination)}))
-        else:
-            pictures.append(picture("ladder", diagnosis_figures.ladder_figure(data.ladder), small=True))
-        if len(data.comparisons) > 2:
-            pictures.append(picture("rms", diagnosis_figures.rms_figure(data)))
-        return [*pictures, picture("shares", diagnosis_figures.shares_figure(data.shares))]
-
-    def matrix(self) -> list[Picture]:
-        """Maps of the instrument matrix, of its errors, and of what whole frames leave."""
-        if self.product is None:
-            return []
-        maps, residuals = self.product.maps, self.product.residuals
-        errors = {"covariance": self.product.verdict.covariance_from}
-        pictures = [
-            picture("matrix", figures.matrix_maps_figure(maps), {"filter": maps.filter}),
-            picture("matrix-errors", figures.matrix_errors_figure(maps), errors),
-        ]
-        if residuals is not None:
-            words = {"filter": residuals.filter, "significance": f"{residuals.significance():.1f}"}
-            pictures += self.named("residual-map", [], words)
-        return pictures
+def _accuracy_pictures(run: RunContents, missing: list[str]) -> list[Picture]:
+    """The error of p over the field, and the effect of a mistake that goes unnoticed."""
+    if run.product is None:
+        return []
+    pictures = drawn(run.source, ["accuracy"], missing, filter=run.product.maps.filter)
+    if pictures and run.limits is not None and run.limits.worst is not None:
+        pictures += drawn(run.source, ["protection"], missing)
+    return pictures
 
 
-def _diagnosed(run: RunContents, head: Display) -> list[Section]:
+def _residual_pictures(run: RunContents, missing: list[str]) -> list[Picture]:
+    """Residuals with the starting and the final model."""
+    data = run.figure_data
+    if run.diagnosis is None:
+        return [] if run.product is None else drawn(run.source, ["residuals"], missing)
+    if data is None:
+        return []
+    overall, several = data.comparisons[0], len(data.comparisons) > 1
+    if several:
+        names = ["ladder", "rms", "shares"] if len(data.comparisons) > 2 else ["ladder", "shares"]
+        return drawn(run.source, names, missing)
+    maps = diagnosis_figures.residual_maps(data.points, {"residuals": overall.before}, data.cameras)
+    whole = picture("whole", maps, combination=in_greek(overall.combination))
+    return [whole, *drawn(run.source, ["shares"], missing)]
+
+
+def _matrix_pictures(run: RunContents, missing: list[str]) -> list[Picture]:
+    """Maps of the instrument matrix, of its errors, and of the residuals of whole frames."""
+    if run.product is None:
+        return []
+    maps, residuals = run.product.maps, run.product.residuals
+    words = {"filter": maps.filter, "covariance": run.product.verdict.covariance_from}
+    pictures = drawn(run.source, ["matrix", "matrix-errors"], missing, **words)
+    if residuals is not None:
+        words = {"filter": residuals.filter, "significance": f"{residuals.significance():.1f}"}
+        pictures += drawn(run.source, ["residual-map"], [], **words)
+    return pictures
+
+
+def _diagnosed(run: RunContents, head: Display, missing: list[str]) -> list[Section]:
     """Sections on findings, with the figures of every addition."""
     assert run.diagnosis is not None
     leftover, data, pictures = run.diagnosis["unexplained"], run.figure_data, []
     for number, comparison in enumerate(() if data is None else data.comparisons[1:], start=1):
         words = {"effect": comparison.effect, "combination": in_greek(comparison.combination)}
-        assert data is not None
-        pictures += [
-            picture("effect", diagnosis_figures.effect_figure(data, number), words),
-            picture(
-                "signature",
-                diagnosis_figures.signature_figure(comparison, data.exposures, data.cameras),
-                words,
-            ),
-        ]
+        step = dataclasses.replace(run.source, step=number)
+        pictures += drawn(step, ["effect", "signature"], missing, **words)
     patterns = [] if not leftover else leftover.get("patterns", [])
     rows = tuple((row["pattern"], probability(row["p_value"]).removeprefix("= ")) for row in patterns)
     shown = dataclasses.replace(head, facts=())
@@ -375,13 +358,12 @@ def _doubts(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _warnings(run: RunContents) -> tuple[str, ...]:
-    """All doubts about the fit, and mistakes that its data would not have shown."""
+    """All doubts about the fit."""
     summary, sentences = run.summary, ()
     if summary["misfit"]:
         sentences = summary["misfit"].get("sentences", ())
     flags = (f"Flag: {text}." for text in Quality(int(summary.get("quality", 0))).meanings)
-    hidden = hidden_in_words(summary)
-    return (*summary["warnings"], *sentences, *flags, *summary["remarks"], *([hidden] if hidden else []))
+    return (*summary["warnings"], *sentences, *flags, *summary["remarks"])
 
 
 def _pulls(run: RunContents) -> Display:
@@ -529,11 +511,9 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
             return []
         return [picture("planned", figures.planned_figure(document["field"]))]
     if kind == "limits":
-        results = read_limits(folder / LIMITS)
-        drawn = {"separation": diagnosis_figures.separation_figure(results)}
-        if results.worst is not None:
-            drawn = {"protection": diagnosis_figures.protection_figure(results)} | drawn
-        return [picture(name, figure, small=name == "protection") for name, figure in drawn.items()]
+        worst = read_limits(folder / LIMITS).worst
+        names = ["separation"] if worst is None else ["protection", "separation"]
+        return drawn(FigureSource(Run(folder)), names, missing)
     if kind == "epoch":
         return _change_of_the_matrix(folder, document, missing)
     if kind == "survey":

@@ -205,6 +205,7 @@ _COLOURS = {"paper": "tab:orange", "joint": "tab:blue"}
 _NAMES = {"paper": "Paper II, point by point", "joint": "joint model"}
 _RANGE = (1e-3, 10.0)  # per cent
 _PLATE_PIXELS = 49
+PLATE_SETTINGS = ((None,), (0.0, 45.0), (None, 22.5))  # deg: single exposures, the pair of Paper II, ours
 
 
 @styled
@@ -297,7 +298,9 @@ def spectral_figure(comparison: Comparison) -> Figure:
 
 
 @styled
-def plate_figure(calibration: Calibration, combinations: Sequence[Sequence[float | None]]) -> Figure:
+def plate_figure(
+    calibration: Calibration, combinations: Sequence[Sequence[float | None]] = PLATE_SETTINGS
+) -> Figure:
     """Maps of how much worse than an ideal instrument (q, u) are known with some settings of the calibration plate.
 
     Each combination is a list of angles in degrees (None: out), one exposure each, and has a map of the photon error

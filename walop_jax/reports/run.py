@@ -14,9 +14,9 @@ from walop_jax.calibration.calibration import Calibration, Product
 from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.records import CalibrationSet
+from walop_jax.diagnosis.detection_limits import DetectionLimits
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, figure_data, read_figure_data
 from walop_jax.diagnosis.findings import Diagnosis
-from walop_jax.diagnosis.limits_found import DetectionLimits
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.names import (
@@ -33,6 +33,8 @@ from walop_jax.io.names import (
 from walop_jax.io.run_folder import OF_A_FIT, RunFolder
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects.free_form import FreeForm
+from walop_jax.nights.survey import Survey
+from walop_jax.paper.comparison import Comparison
 from walop_jax.posterior.result import PosteriorSample
 from walop_jax.posterior.run import Run
 from walop_jax.reports.style import PAGE, Canvas
@@ -45,7 +47,8 @@ SAME_CHI2 = 1e-6  # relative difference of χ²/dof of one and the same fit, rea
 
 T = TypeVar("T")
 DATA = "data"
-Drawable = FitResult | Calibration | Diagnosis | PosteriorSample | Run
+COMPARISON, SURVEY = "comparison", "survey"
+Drawable = FitResult | Calibration | Diagnosis | PosteriorSample | Run | Comparison | Survey | CalibrationSet
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -53,17 +56,17 @@ class FigureSource:
     """The run, or the result in memory, that a figure is drawn from; missing data are a `DataError`.
 
     `held` are the contents of a result in memory under the names of the files of a run that would hold them, its data
-    as `DATA`; it has no `run`. `sample` is a posterior in memory, which has the walkers as well. `parameters` are
-    coefficients by name; `place` (deg) is a field point; `step` numbers the effects of a diagnosis; `reference` are
-    values to be marked, by name; `canvas` is where to draw, `goal` the error of p that is
-    wanted.
+    as `DATA`, others under names of their own; it has no `run`. `sample` is a posterior in memory, which has the
+    walkers as well. `parameters` are coefficients by name; `place` (deg) is a field point, or several for the
+    modulation; `step` numbers the effects of a diagnosis; `reference` are values to be marked, by name; `canvas` is
+    where to draw, `goal` the error of p that is wanted.
     """
 
     run: Run | None = None
     held: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     sample: PosteriorSample | None = None
     parameters: tuple[str, ...] = ()
-    place: tuple[float, float] = (0.0, 0.0)
+    place: tuple[Any, Any] = (0.0, 0.0)
     step: int = 1
     reference: Mapping[str, float] | None = None
     canvas: Canvas = PAGE
@@ -76,8 +79,9 @@ class FigureSource:
             return cls(given, **options)
         if isinstance(given, PosteriorSample):
             return cls(held={POSTERIOR: given.groups()}, sample=given, **options)
-        if isinstance(given, Calibration):
-            return cls(held={PRODUCT: given}, **options)
+        if isinstance(given, Calibration | Comparison | Survey | CalibrationSet):
+            names = {Calibration: PRODUCT, Comparison: COMPARISON, Survey: SURVEY, CalibrationSet: DATA}
+            return cls(held={names[type(given)]: given}, **options)
         result = given.after if isinstance(given, Diagnosis) else given
         product = Calibration.from_fit(result)
         data = result.likelihood
@@ -147,6 +151,8 @@ class FigureSource:
     @property
     def calset(self) -> CalibrationSet:
         """The data of the fit."""
+        if isinstance(calset := self.held.get(DATA), CalibrationSet):
+            return calset
         return self.likelihood.calset if self.run is None else self.run.calset
 
     @functools.cached_property

@@ -25,6 +25,7 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator, NullLocator, ScalarF
 
 from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.io.text import with_minus_sign
+from walop_jax.sky.nights import FIRST_DATE
 
 FONT = 9
 SMALL = 7
@@ -42,7 +43,6 @@ PLATES = {"half1.plate": "HWP1", "half2.plate": "HWP2"}
 BEFORE = "#b2182b"  # dark enough to be told from AFTER in grey as well; both are ends of DIVERGING
 AFTER = "#2166ac"
 QUIET = "0.8"
-EARLIEST = 30000.0  # of an MJD (1941): smaller numbers count exposures
 ABOVE: Any = "outside upper center"  # of a legend
 MOST_VECTOR = 2000  # points above which tiles are drawn as pixels
 SETTINGS: dict[Any, Any] = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.hashsalt": "walop-jax"}
@@ -319,7 +319,7 @@ def calendar(axis: Axes, mjd: Any) -> bool:
     )  # of a single date matplotlib would draw a tenth of all days since 1970
     margin = max(0.05 * (high - low), 0.5 * (1.0 - (high - low)))
     axis.set_xlim(low - margin, high + margin)
-    if not mjd.size or not np.nanmin(mjd) > EARLIEST:
+    if not mjd.size or not np.nanmin(mjd) > FIRST_DATE:
         return False
     locator = AutoDateLocator(minticks=3, maxticks=7)
     axis.xaxis.set_major_locator(locator)
@@ -331,7 +331,7 @@ def calendar(axis: Axes, mjd: Any) -> bool:
 def day_of(mjd: Any) -> Any:
     """Days of matplotlib (since 1970) of MJD; numbers of exposure groups stay as they are."""
     mjd = np.asarray(mjd, float)
-    return mjd - 40587.0 if mjd.size and np.nanmin(mjd) > EARLIEST else mjd
+    return mjd - 40587.0 if mjd.size and np.nanmin(mjd) > FIRST_DATE else mjd
 
 
 def plain_ticks(axis: Axis) -> None:

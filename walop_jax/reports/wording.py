@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import datetime
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration, Product
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
-from walop_jax.io.text import rounded, some, with_minus_sign
+from walop_jax.io.text import date_of, some, with_minus_sign
 from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.effects.free_form import FreeForm
 from walop_jax.reports.posterior_figures import LABELS
@@ -38,18 +36,6 @@ def listed(items: Sequence[str]) -> str:
     return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
 
 
-def hidden_in_words(summary: Mapping[str, Any]) -> str:
-    """The mistakes that these data would not have shown, the worst first; empty where nobody asked or none counts."""
-    entries = (summary.get("hidden") or [])[:4]
-    sizes = [
-        f"{entry['name']} ({rounded(entry['size'], '.2g')} {entry['unit']})".replace(" )", ")")
-        for entry in entries
-    ]
-    lead = "Mistakes larger than the errors that these data would not show, up to the size in brackets"
-    return f"{lead}: {listed(sizes)}." if sizes else ""
-
-
-_MJD_0 = datetime.datetime(1858, 11, 17)
 _MANY = 12
 _KINDS = {"clp": "through the polariser", "moon": "of the moonlit sky", "standard": "of standard stars"}
 
@@ -89,7 +75,7 @@ def data_in_words(product: Calibration | Product) -> tuple[tuple[str, str], ...]
 
 def _nights(mjd: Float[np.ndarray, " e"], longitude: float) -> str:
     evenings = np.unique(night_of(mjd[np.isfinite(mjd)], longitude))
-    days = [(_MJD_0 + datetime.timedelta(days=float(day))).date().isoformat() for day in evenings]
+    days = [date_of(day) for day in evenings]
     if not days:
         return "not recorded"
     return days[0] if len(days) == 1 else f"{len(days)}, {days[0]} to {days[-1]}"

@@ -13,10 +13,10 @@ from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import some, two_digits, with_minus_sign
 from walop_jax.science.catalogue_check import NOISE_MATTERS
 from walop_jax.science.instrument_changes import UNNAMED, InstrumentChange, PossibleChange
+from walop_jax.sky.nights import FIRST_DATE
 
 SCATTERED = 4.0
 """χ² per degree of freedom from which stars in which no change is found do not say that a calibration holds."""
-FIRST_DATE = 1e3  # times above are dates, not numbers of groups
 _COURSES = {
     "step": "from {} on",
     "drift": "at the end, drifting since {}",

@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 GAP = 8.0
+FIRST_DATE = 30000.0
+"""MJD (1941) up to which times are no dates but numbers of exposures or of groups."""
 
 
 def night_of(mjd: Float[np.ndarray, " e"], longitude: float) -> Float[np.ndarray, " e"]:

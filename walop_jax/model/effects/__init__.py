@@ -7,6 +7,7 @@ from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.effects.catalogue import EFFECTS, EffectKind
 from walop_jax.model.effects.change import Change
 from walop_jax.model.effects.described import Described, OtherDescription
+from walop_jax.model.effects.deviations import Deviations
 from walop_jax.model.effects.free_form import FreeForm
 from walop_jax.model.parameters import unknown_name
 
@@ -17,7 +18,7 @@ def effect_by_name(name: str, catalogue: Sequence[EffectKind] = EFFECTS) -> Effe
     >>> walop.effect_by_name("hwp1_axis").__doc__
     'Fast axis of HWP1 turned.'
     """
-    for effect in (*catalogue, Described, FreeForm, OtherDescription):
+    for effect in (*catalogue, Described, Deviations, FreeForm, OtherDescription):
         if effect.name == name:
             return effect
     error = unknown_name("effect", name, {effect.name: effect.__doc__ or "" for effect in catalogue})

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.data.kinds import POLARISER
 from walop_jax.model.conventions import OF_WALOP, Units
-from walop_jax.model.effects.factors import Factor, factor
+from walop_jax.model.effects.factors import FIELD, Factor, factor
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light_path import Scalar
 from walop_jax.model.parameters import check_names
@@ -180,6 +180,11 @@ class Change:
         return not elsewhere and not any(
             item.text == "hours" or item.form in ("hours", *OF_LIST) for item in self.grows_with
         )
+
+    @property
+    def over_field_alone(self) -> bool:
+        """True if it depends on the field, and on nothing else."""
+        return all(item.depends_on == FIELD for item in self.grows_with)
 
     def times(self, *factors: str) -> Change:
         """The change with further factors."""

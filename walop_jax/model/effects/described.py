@@ -11,9 +11,10 @@ Revealed by data without an equally good named explanation
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -28,6 +29,8 @@ from walop_jax.model.effects.change import AMPLITUDES, Change, patched
 from walop_jax.model.effects.optics import SOURCE
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import param, unknown_name
+
+Amplitudes = Sequence[float] | Float[np.ndarray, " a"]
 
 
 def _amplitude(name: str) -> Any:
@@ -61,33 +64,27 @@ class Described(Effect):
     separated_by: ClassVar[str] = "exposures in which its dependence differs from that of the others"
 
     @classmethod
-    def neutral(cls, context: Context) -> Self:
+    def neutral(cls, context: Context) -> Described:
         """Nothing described."""
         return cls.of(context)
 
     @classmethod
-    def of(cls, context: Context, **values: Any) -> Self:
+    def of(cls, context: Context, **values: Any) -> Described:
         """Descriptions with some values, zero elsewhere. Raises ValueError for an invalid description."""
-        sentences = tuple(values.pop("sentences", ()))
-        held = [Change.parsed(text).parameter for text in sentences]
-        for name in values:
-            if name not in AMPLITUDES:
-                raise unknown_name(f"parameter of {cls.name}", name, (*AMPLITUDES, "sentences"))
-        arrays = {
-            name: jnp.broadcast_to(jnp.asarray(values[name], float), (held.count(name),))
-            if name in values
-            else _zeros(held.count(name))
-            for name in AMPLITUDES
-        }
-        return cls(**arrays, sentences=sentences)
+        neutral = _without_size(tuple(values.pop("sentences", ())))
+        if unknown := sorted(set(values) - set(AMPLITUDES)):
+            raise unknown_name(f"parameter of {cls.name}", unknown[0], (*AMPLITUDES, "sentences"))
+        like = {name: getattr(neutral, name) for name in values}
+        sizes = {n: jnp.broadcast_to(jnp.asarray(values[n], float), like[n].shape) for n in values}
+        return dataclasses.replace(neutral, **sizes) if sizes else neutral
 
     @classmethod
-    def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
+    def combine(cls, group: Sequence[Any], amplitudes: Amplitudes) -> Described:
         """One effect of members with a change each."""
         return cls.saying([text for member in group for text in member.sentences], amplitudes)
 
     @classmethod
-    def saying(cls, sentences: Sequence[str], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
+    def saying(cls, sentences: Sequence[str], amplitudes: Amplitudes) -> Described:
         """Descriptions with their amplitudes, in the same order."""
         held: dict[str, list[float]] = {}
         for text, amplitude in zip(sentences, amplitudes, strict=True):
@@ -114,13 +111,18 @@ class Described(Effect):
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
         """One change for each amplitude."""
         changes = [Change.parsed(text) for text in self.sentences]
-        return tuple(
-            ((1.0, change),) for name in AMPLITUDES for change in changes if change.parameter == name
-        )
+        return tuple(((1.0, c),) for name in AMPLITUDES for c in changes if c.parameter == name)
 
     def patch(self, instrument: Instrument) -> Instrument:
         """All changes, those at one place together."""
         return patched(instrument, self.terms())
+
+
+@functools.lru_cache(maxsize=8192)
+def _without_size(sentences: tuple[str, ...]) -> Described:
+    """Descriptions with all amplitudes zero, made once: every list of candidates has them."""
+    held = [Change.parsed(text).parameter for text in sentences]
+    return Described(**{name: _zeros(held.count(name)) for name in AMPLITUDES}, sentences=sentences)
 
 
 class OtherDescription(Effect):

@@ -11,7 +11,7 @@ Limits      exact for one kind at a place; the order of several kinds matters at
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -87,6 +87,11 @@ def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
         for name, coefficient, factors in generators_of(change.kind):
             by = coefficient * product(factors, AtPoint(x, y), change.units)
             sums[name] = sums.get(name, 0.0) + by * size
+    return near_identity(sums)
+
+
+def near_identity(sums: Mapping[str, Any]) -> Mueller:
+    """Mueller matrix of the sizes of some `GENERATORS`."""
     matrix = mueller.product(
         make(*(jnp.asarray(sums.get(f"{what} {axis}", jnp.zeros(()))) for axis in "quv"))
         for what, make in (("diattenuation", mueller.diattenuator), ("retardance", mueller.general_retarder))
@@ -197,9 +202,9 @@ def _columns(terms: Sequence[Term]) -> dict[str, Any]:
     return {"changes": changes, "amplitudes": amplitudes}
 
 
-def _beside(instrument: Instrument, element: Element, change: Change) -> Instrument:
-    """The instrument with one more element at the place of a change."""
-    return instrument.inserted(element, **{"before" if change.where == "ahead of" else "after": change.place})
+def beside(instrument: Instrument, element: Element, where: str, place: str) -> Instrument:
+    """The instrument with one more element ahead of another one, or behind it."""
+    return instrument.inserted(element, **{"before" if where == "ahead of" else "after": place})
 
 
 _FIELD = ("even", "tilt", "r2", "astigmatic")
@@ -253,7 +258,8 @@ def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
         film = PolariserFilm(**_columns(terms))
         return instrument.changed(change.place, films=lambda films: (*films, film))
     moves = instrument.element(change.place).moves if change.where == "of" else None
-    return _beside(instrument, Terms(name="described", moves=moves, **_columns(terms)), change)
+    element = Terms(name="described", moves=moves, **_columns(terms))
+    return beside(instrument, element, change.where, change.place)
 
 
 def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
@@ -277,7 +283,8 @@ def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     components: dict[str, Any] = {"q": jnp.zeros(()), "u": jnp.zeros(())}
     for item, size in terms:
         components[item.kind[-1]] = components[item.kind[-1]] + size
-    return _beside(instrument, AddedPolarisation(name="described", **components), terms[0][0])
+    element = AddedPolarisation(name="described", **components)
+    return beside(instrument, element, terms[0][0].where, terms[0][0].place)
 
 
 def _grows_added(instrument: Instrument, change: Change) -> Grows:
