@@ -174,6 +174,21 @@ def ideal(angles: np.ndarray, electrons: float = 1e6, points: int = 25) -> Calib
     )
 
 
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_equal_counts_at_other_places_are_no_copies(axis):
+    """Expected counts of a uniform field, at points along one axis."""
+    calset = ideal(np.linspace(0.0, 168.0, 8), points=5)
+    table = calset.intensities
+    assert isinstance(table, TableIntensities)
+    counts = table.counts.reshape(8, 5, 4)[:, [0] * 5].reshape(-1, 4)
+    along = {"x": np.zeros(5), "y": np.zeros(5)} | {axis: np.linspace(-0.3, 0.3, 5)}
+    where = Points(np.arange(5), **along)
+    columns = {name: getattr(table, name) for name in COLUMNS} | {"counts": counts}
+    uniform = dataclasses.replace(calset, points=where, intensities=TableIntensities(8, where, **columns))
+    assert remarks_of(uniform) == []
+    assert len(remarks_of(again(uniform, MJD=second_later))) == 1
+
+
 def test_expected_counts_without_noise_are_read_with_a_remark(tmp_path):
     """A full turn: every angle returns after half of it, with the same counts in single precision."""
     calset = ideal(np.arange(0.0, 360.0, 11.25))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import effect_scenes as scenes
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood import field_table as nodes
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model import chebyshev
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.dependence import optical_indices
 from walop_jax.model.effects import effect_by_name
@@ -58,6 +60,20 @@ def exact(simulated):
 @pytest.fixture(scope="module")
 def quick(simulated):
     return Likelihood.of(simulated.calset, base_model(simulated.calset), interpolate=True)
+
+
+def test_expansion_from_a_table_is_that_of_the_points_at_its_nodes():
+    """There the series are exact, whatever the optics: χ², gradient and matrix are those of the plain rows."""
+    device, plan = scenes.instrument(), scenes.plan()
+    x, y = chebyshev.grid(FIELD, 2)
+    data = scenes.points(plan, x, y)
+    counts = scenes.FLUX * np.random.default_rng(7).uniform(0.1, 0.9, data.counts.shape)
+    data = data._replace(counts=jnp.asarray(counts), weight=jnp.asarray(1.0 / np.sqrt(counts)))
+    table = FieldTable.through(FIELD, 2, nodes.solved_optics(device, plan, x, y))
+    same(
+        engine.normal_equations(device, plan, data, jax.tree.map(jnp.asarray, table)),
+        engine.normal_equations(device, plan, data),
+    )
 
 
 @pytest.mark.long

@@ -124,6 +124,8 @@ def test_posterior_file_table_and_report(posterior: PosteriorSample, tmp_path: P
     write_posterior(tmp_path / "posterior.nc", posterior)
     draws = read_draws(tmp_path / "posterior.nc", posterior.names)
     np.testing.assert_array_equal(draws, posterior.draws.reshape(draws.shape))
+    for same in (posterior, posterior.groups(), posterior.to_arviz()):  # as `matrix` and `apply` take them
+        np.testing.assert_array_equal(read_draws(same, posterior.names), draws)
     with pytest.raises(DataError, match="another model"):
         read_draws(tmp_path / "posterior.nc", posterior.names[1:])
     assert len(read_draws(tmp_path / "posterior.nc", posterior.names, posterior.fit)) == len(draws)

@@ -65,7 +65,7 @@ def clip(
     if output is not None:
         write_calibration_set(output, flagged.calset, overwrite=job.overwrite)
     share = f"{100 * flagged.share:.2g} %"
-    warnings = [f"the fit without them: {sentence}" for sentence in result.warnings]
+    warnings = [f"the fit of the clipped set: {sentence}" for sentence in result.warnings]
     if flagged.too_many:
         text = f"{share} of the rows are outliers: too many to be isolated; the model lacks something"
         warnings.insert(0, f"{text}; walop-jax diagnose looks for it")

@@ -25,7 +25,7 @@ Equation    A pattern of camera k changes the counts of that camera alone: its c
                 C_aᵀC_b = Σ v_a v_b (δ_kl − m_k m_l),   QᵀC_a = Σ v_a (Q_k − m_k (m·Q))
             and behind the base G = CᵀC − (QᵀC)ᵀ(QᵀC).
 Symbols     a, b patterns of the cameras k, l; v = flux × unpolarised counts per flux / error × pattern; m = expected
-            counts / errors of what has a flux in common, of unit length, 0 where the flux is known; Q orthonormal basis
+            counts / errors of all with a flux in common, of unit length, 0 where the flux is known; Q orthonormal basis
             of the derivatives with respect to the free parameters
 Limits      The difference leaves 10⁻¹⁶ of the square of a column; what has less than `score.ABSORBED` left plays no
             part. Where exposures have a flux in common their rows hang together, and all columns are written out.

@@ -17,7 +17,7 @@ Document = Mapping[str, Any]
 def why(doc: Document, name: str) -> str:
     """Sentences on why a diagnosis has, or has not, named an effect, a description or a change of the instrument.
 
-    ValueError, with the nearest names, for what is none of them.
+    ValueError, with the nearest names, for any other.
     """
     sentences = [*_of_the_result(doc, name), *_of_the_first_look(doc, name), *_of_the_rounds(doc, name)]
     if not any(_asked(turn, name) for turn in doc.get("rounds", ())) and not sentences:

@@ -19,7 +19,7 @@ Repeats     the correlation of the residuals of two exposures (`repeated_noise`)
 Errors      χ²/dof far below 1: N_ERR is overestimated. A few per cent are attributed to the stated errors,
             not to the model.
 
-Symbols     w = expected counts / errors of what has a flux in common (an exposure at a point), of unit length, where
+Symbols     w = expected counts / errors of all with a flux in common (an exposure at a point), of unit length, where
             that was fitted (0 where it is known); Q orthonormal basis of the derivatives with respect to the free
             parameters.
 Sources     Rao 1948; Satterthwaite 1946, Biometrics Bull. 2, 110 (χ² with two moments); Šidák 1967 (many questions).

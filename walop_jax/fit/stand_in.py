@@ -61,7 +61,7 @@ def with_pixels(result: FitResult) -> FitResult:
     """The fit of a set that stands for pixels with the χ² and the degrees of freedom of these; any other as it is.
 
     From where they were summed χ² of the pixels changes as that of the field points does. The data of the set beside
-    them counts by itself, and so do parameters that there were not.
+    them count by themselves, and so do parameters that there were not.
     """
     compression, likelihood = result.calset.compression, result.likelihood
     if compression is None:

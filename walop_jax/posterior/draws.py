@@ -83,10 +83,10 @@ def read_groups(path: str | os.PathLike[str]) -> DataTree:
 
 
 def _groups_of(given: Any) -> Any:
-    """The groups of a `posterior.nc`, of what `walop.sample` returns, or as they are (`Run.posterior`)."""
+    """The groups of a `posterior.nc` or a `PosteriorSample`; those of `Run.posterior` and `to_arviz` as they are."""
     if isinstance(given, str | os.PathLike):
         return read_groups(given)
-    return given.groups() if callable(getattr(given, "groups", None)) else given
+    return given.groups() if hasattr(given, "draws") else given  # ArviZ 0.x has a `groups` that lists names
 
 
 def read_draws(path: Any, names: tuple[str, ...], fit: str | None = None) -> Float[np.ndarray, "d n"]:
