@@ -1,6 +1,7 @@
 """Deviations from the shape of a description: their polynomials, their widths, and their effect on the product."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import averaged, only_a_class
 from walop_jax.diagnosis.description_shape import shape_changes
 from walop_jax.diagnosis.examination import examine
-from walop_jax.fit.base_model import base_model
+from walop_jax.fit.base_model import base_model, model_like
 from walop_jax.fit.refit import fit
+from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import AtPoint, product
@@ -21,6 +23,7 @@ from walop_jax.model.effects.deviations import CUBIC
 from walop_jax.model.effects.optics import GENERATORS
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.posterior.run import Run
 from walop_jax.simulation.simulate import simulate
 
 TEXT, SIZE = "retardance v behind collimator * x", 4e-3
@@ -105,3 +108,23 @@ def test_a_deviation_larger_than_the_errors_is_not_trusted(described):
     assert not list(only_a_class(classes._replace(shape=shape._replace(spread=0.9 * shape.stated))))
     (sentence,) = only_a_class(classes._replace(shape=shape._replace(spread=3 * max(shape.stated, 1e-3))))
     assert "described, not named" in sentence
+
+
+def test_a_new_night_is_fitted_without_the_deviations(described):
+    """Hundreds of parameters that act on the optics of every wavelength would take gigabytes, and mean nothing."""
+    state, context, classes = described
+    product = averaged(Calibration.from_fit(state.result.judged()), classes, context)
+    assert "deviations" in product.model.effect_names
+    held = [p for p in product.model.parameters if p.part == "deviations"]
+    assert not any(p.free for p in held)
+    night = simulate(SMALL, seed=5).calset
+    model = model_like(night, product.model)
+    assert "deviations" not in model.effect_names
+    assert f"described.{TEXT.replace(' ', '_')}" in model.names
+
+
+def test_a_mean_over_shapes_is_not_made_anew_as_one_fit(tmp_path):
+    entry = {"deviations": 90, "spread_of_p": 1e-4, "stated_error_of_p": 1e-4}
+    (tmp_path / "diagnosis.json").write_text(json.dumps({"members": [], "shape": entry}))
+    with pytest.raises(DataError, match=r"refit --model .*model\.toml"):
+        Run(tmp_path).fit()

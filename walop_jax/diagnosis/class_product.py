@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -172,6 +172,8 @@ def averaged(calibration: Calibration, classes: Classes, context: Context) -> Ca
         slopes = into @ deviations.slopes + amplitudes
         values += into @ deviations.values + amplitudes @ deviations.amplitudes
         covariance += slopes @ deviations.covariance @ slopes.T
+    if classes.shape is not None:
+        model = _with_held(model, _parameters_of(classes) - set(old.names), values)
     hidden = calibration.hidden
     if hidden is not None:
         changes = np.zeros((len(hidden), count))
@@ -243,6 +245,30 @@ def _with_ties(model: Model, new: Sequence[int], amplitudes: Float[np.ndarray, "
             parameters[i] = dataclasses.replace(parameters[i], free=False)
         else:
             free.append(i)
+    return dataclasses.replace(model, parameters=tuple(parameters))
+
+
+def _parameters_of(classes: Classes) -> set[str]:
+    """Parameters of deviations from shapes alone."""
+    assert classes.shape is not None
+    members, deviations = (
+        {f"{Described.name}.{sentence.label}" for total in sums for _, sentence in total}
+        for sums in (
+            [total for addition in classes.additions for m in addition.members[1:] for total in m.sums],
+            classes.shape.sums,
+        )
+    )
+    return deviations - members
+
+
+def _with_held(model: Model, names: Collection[str], values: Vector) -> Model:
+    """The model with deviations held at their values: fits of other data would not constrain them."""
+    parameters = [
+        dataclasses.replace(p, free=False, tie=None, start=float(value))
+        if p.part == Deviations.name or p.name in names
+        else p
+        for p, value in zip(model.parameters, values, strict=True)
+    ]
     return dataclasses.replace(model, parameters=tuple(parameters))
 
 

@@ -15,10 +15,10 @@ from walop_jax.data.settings import Settings
 from walop_jax.fit.model_file import GAUGE, Catalogue, ModelTable, header_of, known_to, parse, with_effects_of
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
-from walop_jax.model.effects import EFFECTS
+from walop_jax.model.effects import EFFECTS, Deviations
 from walop_jax.model.instrument import Instrument, adapted, as_designed, nominal_instrument
 from walop_jax.model.sources import MoonSky, Standards
-from walop_jax.model.specification import THROUGHPUT, Model, effect_context, make_model
+from walop_jax.model.specification import THROUGHPUT, Model, effect_context, make_model, model_without
 from walop_jax.model.standards import half_range, standards_of
 
 LEVEL = 0.5  # of a throughput whose scale is a gauge
@@ -143,20 +143,21 @@ def model_for(
 def model_like(calset: CalibrationSet, old: Model) -> Model:
     """The model `old` for another calibration set: its plates, effects, priors, ties and fixed parameters.
 
-    Sky and standards are those of the new set. Raises ValueError for a set of another instrument.
+    Sky and standards are those of the new set. Deviations from descriptions, whose hundreds of parameters no fit of
+    one set constrains, are left out. Raises ValueError for a set of another instrument.
     """
+    if Deviations.name in old.effect_names:
+        old = model_without(old, Deviations.name)
     header = header_of(old)
     model = base_model(calset, old.template, plates=header.plates, throughput_degree=header.throughput_degree)
     own_kinds = dict.fromkeys((*(effect.kind for effect in old.template.effects), *old.catalogue))
     model = dataclasses.replace(model, catalogue=tuple(own_kinds))
     model = with_effects_of(model, header, effect_context(model.template, calset.exposures))
     unchanged = {p.name: p for p in old.parameters if p.name != GAUGE and p.part not in SKY_AND_STARS}
-    parameters = tuple(
-        dataclasses.replace(
-            p, free=unchanged[p.name].free, prior=unchanged[p.name].prior, tie=unchanged[p.name].tie
-        )
-        if p.name in unchanged
-        else p
-        for p in model.parameters
-    )
-    return dataclasses.replace(model, parameters=parameters, laws=old.laws)
+    parameters = []
+    for p in model.parameters:
+        if (like := unchanged.get(p.name)) is not None:
+            start = p.start if like.free else like.start
+            p = dataclasses.replace(p, start=start, free=like.free, prior=like.prior, tie=like.tie)
+        parameters.append(p)
+    return dataclasses.replace(model, parameters=tuple(parameters), laws=old.laws)

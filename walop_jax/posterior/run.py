@@ -128,7 +128,8 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
         does not come out as the calibration says (another model, or another version of the physics), or is a mean over
         a class. Errors are made as those of the calibration were, and the verdict is its verdict.
         """
-        if self.documents.get("diagnosis", {}).get("members"):
+        diagnosis = self.documents.get("diagnosis", {})
+        if diagnosis.get("members") or diagnosis.get("shape"):
             raise fail(
                 A_MEAN,
                 file=self.folder,
