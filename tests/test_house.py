@@ -193,7 +193,7 @@ MOST_LINES = {
     "calibration": 2845,
     "posterior": 2380,
     "science": 6400,
-    "diagnosis": 8180,
+    "diagnosis": 8190,
     "nights": 2810,
     "plans": 2370,
     "paper": 870,
