@@ -209,7 +209,7 @@ def test_exposures_without_a_time_are_refused(two):
 
 def test_values_without_finite_counts_are_refused(two):
     """Where nights far from their common model have led it, numbers end."""
-    with pytest.raises(DataError, match=r"no finite counts .* leave out what is not trusted"):
+    with pytest.raises(DataError, match=r"no finite counts .* leave out those not trusted"):
         night_equations(two[0], base_model(two[0]), {"half2.plate.quartz": np.inf}, {})
 
 
