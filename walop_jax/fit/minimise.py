@@ -193,6 +193,8 @@ def distance_to_minimum(expansion: Expansion) -> tuple[float, float]:
 
 def _step(here: Expansion, scale: Vector, damping: float) -> Vector:
     """−(JᵀJ + λ)⁻¹ Jᵀr; not a number where that matrix is singular."""
+    if not len(scale):  # before SciPy 1.14 nothing was solved for nothing
+        return np.zeros(0)
     try:
         factors = scipy.linalg.cho_factor(here.matrix + np.diag(damping / scale**2), check_finite=False)
     except np.linalg.LinAlgError:

@@ -81,8 +81,9 @@ def _as_votable(table: Table) -> Any:
         param = Param(votable, name=str(key), ID=str(key), datatype="unicodeChar", arraysize="*", value=text)
         resource.tables[0].params.append(param)
     if scale := str(cards.get("TIMESYS", "")):
+        config = {"version": votable.version, "version_1_4_or_later": True}  # before astropy 7.2 asked for
         resource.time_systems.append(
-            TimeSys(ID="TIME", timescale=scale, refposition="TOPOCENTER", timeorigin=0.0)
+            TimeSys(ID="TIME", timescale=scale, refposition="TOPOCENTER", timeorigin=0.0, config=config)
         )
     return votable
 
