@@ -49,7 +49,7 @@ def diagnosed() -> Diagnosis:
         after = after.doubted(Quality.CLASS_ONLY, sentence)
     residual = result.likelihood.residuals(result.values)[1]
     step = Step(
-        Described.name, {}, 0.0, 0.0, 0.0, 2.0, 1.0, "exposures", 2.0, 1.0,
+        Described.name, {}, 0.0, 0.0, 0.0, 2.0, 1.0, 1, "exposures", 2.0, 1.0,
         equivalent=("crosstalk",), residual_before=residual, residual_after=residual,
     )  # fmt: skip
     return Diagnosis(

@@ -128,3 +128,16 @@ def test_a_mean_over_shapes_is_not_made_anew_as_one_fit(tmp_path):
     (tmp_path / "diagnosis.json").write_text(json.dumps({"members": [], "shape": entry}))
     with pytest.raises(DataError, match=r"refit --model .*model\.toml"):
         Run(tmp_path).fit()
+
+
+def test_deviations_of_the_polariser_do_nothing_to_a_star():
+    """A star is seen without the polariser: of what its film may have, only the parameters of the fit know."""
+    text = "retardance q of polariser * r2"
+    calset = simulate(SMALL, seed=3, effects=[Described.saying([text], [4e-3])]).calset
+    context = effect_context(base_model(calset).template, calset.exposures)
+    model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
+    state = examine(fit(Likelihood.of(calset, model)), (), np.random.default_rng(0))
+    classes = classes_of(state, context, {Described.name}, [text])
+    assert classes.shape.in_optics == ()
+    product = averaged(Calibration.from_fit(state.result.judged()), classes._replace(additions=()), context)
+    assert "deviations" not in product.model.effect_names

@@ -184,8 +184,13 @@ class _Laid:
         share = sizes * np.sqrt(np.diag(likeness.covariance))
         growing = [j for j, c in enumerate(changes) if c.of_stars and not c.over_field_alone]
         growing = sorted(growing, key=lambda j: -share[j])[:MOST_MEMBERS]
-        steady = [j for j, c in enumerate(changes) if c.over_field_alone and c.kind not in GENERATORS]
-        return Shape(likeness, (*growing, *steady), *self._errors_of_p(between))
+        acting = np.flatnonzero(
+            np.abs(added).max(axis=(0, 1, 2)) > 0
+        ).tolist()  # on stars: not in the polariser
+        steady = [j for j in acting if changes[j].over_field_alone]
+        in_words = (*growing, *(j for j in steady if changes[j].kind not in GENERATORS))
+        in_optics = tuple(j for j in steady if changes[j].kind in GENERATORS)
+        return Shape(likeness, in_words, in_optics, *self._errors_of_p(between))
 
     def _spread(self, members: Sequence[Likeness]) -> tuple[float, float, float]:
         """Error of p of stars between members, error of the fit, and largest deviation of a member (`ClassOf`)."""

@@ -26,7 +26,6 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import some, two_digits
 from walop_jax.model.effects import Context, Described, Deviations
 from walop_jax.model.effects.change import Change as Sentence
-from walop_jax.model.effects.optics import GENERATORS
 from walop_jax.model.specification import Model, effect_context, model_without, with_effects
 
 Vector = Float[np.ndarray, " _"]
@@ -81,11 +80,13 @@ class ClassOf(NamedTuple):
 class Shape(NamedTuple):
     """Deviations from the shapes of all descriptions of a model, and errors of p of stars: from them, from the fit.
 
-    In a product those at the positions `in_words` are sentences, the others are in `Deviations` or act on no star.
+    In a product those at the positions `in_words` are sentences, those at `in_optics` are in `Deviations`; the others
+    act on no star.
     """
 
     deviations: Likeness
     in_words: tuple[int, ...]
+    in_optics: tuple[int, ...]
     spread: float
     stated: float
 
@@ -97,8 +98,7 @@ class Shape(NamedTuple):
     @property
     def optical(self) -> dict[int, Sentence]:
         """Those of `Deviations`, by position."""
-        changes = {j: total[0][1] for j, total in enumerate(self.deviations.sums) if j not in self.in_words}
-        return {j: c for j, c in changes.items() if c.kind in GENERATORS and c.over_field_alone}
+        return {j: self.deviations.sums[j][0][1] for j in self.in_optics}
 
     @property
     def places(self) -> tuple[str, ...]:
@@ -140,7 +140,8 @@ def averaged(calibration: Calibration, classes: Classes, context: Context) -> Ca
     if not classes:
         return calibration
     old, model = calibration.model, _holding(calibration, classes, context)
-    new = [i for i, name in enumerate(model.names) if name not in old.names]
+    held = _parameters_of(classes, model) - set(old.names)
+    new = [i for i, name in enumerate(model.names) if name not in old.names and name not in held]
     derivatives = list(_amplitudes_of(model, classes))
     if classes.shape is not None:
         derivatives.append(_deviations_of(model, classes.shape))
@@ -172,8 +173,7 @@ def averaged(calibration: Calibration, classes: Classes, context: Context) -> Ca
         slopes = into @ deviations.slopes + amplitudes
         values += into @ deviations.values + amplitudes @ deviations.amplitudes
         covariance += slopes @ deviations.covariance @ slopes.T
-    if classes.shape is not None:
-        model = _with_held(model, _parameters_of(classes) - set(old.names), values)
+        model = _with_held(model, held, values)
     hidden = calibration.hidden
     if hidden is not None:
         changes = np.zeros((len(hidden), count))
@@ -248,25 +248,22 @@ def _with_ties(model: Model, new: Sequence[int], amplitudes: Float[np.ndarray, "
     return dataclasses.replace(model, parameters=tuple(parameters))
 
 
-def _parameters_of(classes: Classes) -> set[str]:
+def _parameters_of(classes: Classes, model: Model) -> set[str]:
     """Parameters of deviations from shapes alone."""
-    assert classes.shape is not None
     members, deviations = (
         {f"{Described.name}.{sentence.label}" for total in sums for _, sentence in total}
         for sums in (
             [total for addition in classes.additions for m in addition.members[1:] for total in m.sums],
-            classes.shape.sums,
+            () if classes.shape is None else classes.shape.sums,
         )
     )
-    return deviations - members
+    return (deviations - members) | {p.name for p in model.parameters if p.part == Deviations.name}
 
 
 def _with_held(model: Model, names: Collection[str], values: Vector) -> Model:
     """The model with deviations held at their values: fits of other data would not constrain them."""
     parameters = [
-        dataclasses.replace(p, free=False, tie=None, start=float(value))
-        if p.part == Deviations.name or p.name in names
-        else p
+        dataclasses.replace(p, free=False, start=float(value)) if p.name in names else p
         for p, value in zip(model.parameters, values, strict=True)
     ]
     return dataclasses.replace(model, parameters=tuple(parameters))

@@ -10,7 +10,7 @@ Symbols     f_j products of a pattern over the field (all polynomials to the thi
             and other numbers the kind itself); s rms size of the descriptions of that place in the data, n patterns ×
             laws: every kind may be as large as what was described, in any shape
 Source      model discrepancy as a Gaussian process: Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425
-Limits      To first order, about the fit. What is smoother than a point spacing but not a cubic is in no f_j.
+Limits      To first order, about the fit. Patterns over the field beyond the third degree are in no f_j.
 """
 
 from __future__ import annotations
