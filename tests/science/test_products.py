@@ -266,7 +266,7 @@ def test_the_new_set_is_fitted_with_the_old_model(first, monkeypatch):
     assumed = dataclasses.replace(old, model=model, values=model.start, covariance=1e-12 * np.eye(size))
     asked: list[Likelihood] = []
 
-    def fitted(likelihood):
+    def fitted(likelihood, start):
         asked.append(likelihood)
         raise RuntimeError("enough")
 

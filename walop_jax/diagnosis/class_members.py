@@ -15,6 +15,7 @@ Limits       To first order. Structural effects, other descriptions and patterns
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Collection, Iterator, Sequence
 
@@ -38,7 +39,6 @@ from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Context, Described, FreeForm
 from walop_jax.model.effects.change import AMPLITUDES, KINDS, patched
 from walop_jax.model.effects.change import Change as Sentence
-from walop_jax.model.effects.optics import GENERATORS
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
@@ -55,19 +55,18 @@ def classes_of(
     said: Sequence[str],
     alike: Collection[str] = (),
 ) -> Classes:
-    """The classes of the effects of a model that have some names, without those of which the class is that alone.
+    """The classes of the effects of a model that have some names, and deviations from the shapes of its descriptions.
 
-    With them comes the uncertainty of the shape of its descriptions.
-
-    `said` are the names of the added groups of sentences, `alike` the effects and groups reported as indistinguishable:
-    with large residuals, where one linear step is inaccurate, they count as probable.
+    Without classes of a single member. `said` are the names of the added groups of sentences, `alike` the effects and
+    groups reported as indistinguishable: with large residuals, where one linear step is inaccurate, they count as
+    probable.
     """
     additions = list(_additions(state.result, context, names, said))
     if not additions or not state.result.model.template.cameras.pairs:
         return Classes()
     laid = _Laid(state, alike)
-    found = tuple(addition for addition in itertools.starmap(laid.class_of, additions) if addition.names)
-    return Classes(found, laid.shape())
+    ambiguous = (addition for addition in itertools.starmap(laid.class_of, additions) if addition.names)
+    return Classes(tuple(ambiguous), laid.shape())
 
 
 def _additions(
@@ -166,7 +165,7 @@ class _Laid:
         """Deviations from the shapes of all descriptions, by one linear step; None without a description."""
         if FreeForm.name in self.fit.model.effect_names:  # it has every shape
             return None
-        changes, widths, sizes = shape_changes(self.fit, self.columns)
+        changes, widths = shape_changes(self.fit, self.columns)
         if not changes:
             return None
         sums: tuple[Sum, ...] = tuple(((1.0, change),) for change in changes)
@@ -181,16 +180,17 @@ class _Laid:
         slopes = slopes.reshape(*self.matrix.shape, -1) + self.slopes @ likeness.slopes
         between = slopes @ likeness.covariance @ np.swapaxes(slopes, 1, 2)
         between += likeness.change[:, :, None] * likeness.change[:, None, :]
-        share = sizes * np.sqrt(np.diag(likeness.covariance))
-        growing = [j for j, c in enumerate(changes) if c.of_stars and not c.over_field_alone]
-        growing = sorted(growing, key=lambda j: -share[j])[:MOST_MEMBERS]
-        acting = np.flatnonzero(
-            np.abs(added).max(axis=(0, 1, 2)) > 0
-        ).tolist()  # on stars: not in the polariser
-        steady = [j for j in acting if changes[j].over_field_alone]
-        in_words = (*growing, *(j for j in steady if changes[j].kind not in GENERATORS))
-        in_optics = tuple(j for j in steady if changes[j].kind in GENERATORS)
-        return Shape(likeness, in_words, in_optics, *self._errors_of_p(between))
+        # At another temperature stars have what is zero in the usual setting.
+        steady = [dataclasses.replace(change, factors=change.over_field) for change in changes]
+        _, at_any = self.added([((1.0, change),) for change in steady])
+        acting = np.abs(at_any).max(axis=(0, 1, 2)) > 0
+        # Of other dependences than those described stars have none: each is a program's worth of derivatives.
+        described = self.fit.model.instrument(self.fit.values).effect(Described.name)
+        laws = {(), *(Sentence.parsed(text).beside_field for text in described.sentences)}  # type: ignore[attr-defined]
+        on_stars = tuple(
+            j for j, c in enumerate(changes) if acting[j] and c.of_stars and c.beside_field in laws
+        )
+        return Shape(likeness, on_stars, self._error_of_p(between), self.stated)
 
     def _spread(self, members: Sequence[Likeness]) -> tuple[float, float, float]:
         """Error of p of stars between members, error of the fit, and largest deviation of a member (`ClassOf`)."""
@@ -201,21 +201,21 @@ class _Laid:
         total = np.sqrt(self.errors**2 + np.diagonal(between, axis1=1, axis2=2))
         far = np.median(np.abs(away) / np.where(total > 0, total, np.inf), axis=1).max(axis=1)
         off = float(far[weights > PLAUSIBLE].max(initial=0.0))
-        return *self._errors_of_p(between), off
+        return self._error_of_p(between), self.stated, off
 
-    def _errors_of_p(self, between: Float[np.ndarray, "p m m"]) -> tuple[float, float]:
-        """Errors of p of stars from a covariance of the matrix, and from that of the fit: medians over the field."""
-        within = self.slopes @ covariance_of_free(self.fit) @ np.swapaxes(self.slopes, 1, 2)
+    @functools.cached_property
+    def stated(self) -> float:
+        """Error of p of stars from the covariance of the fit."""
+        return self._error_of_p(self.slopes @ covariance_of_free(self.fit) @ np.swapaxes(self.slopes, 1, 2))
+
+    def _error_of_p(self, square: Float[np.ndarray, "p m m"]) -> float:
+        """Error of p of stars from a covariance of the matrix: median over the field."""
         if self.matrix.shape[1] == 6:
             good = measures_u(self.matrix.reshape(-1, 2, 3))
-            maps = [p_errors(self.matrix[good], square[good], sample_stars()) for square in (between, within)]
+            errors = p_errors(self.matrix[good], square[good], sample_stars())
         else:  # no single exposure gives q and u
-            maps = [
-                np.sqrt(np.diagonal(square, axis1=1, axis2=2).max(axis=1, initial=0.0))
-                for square in (between, within)
-            ]
-        spread, stated = (float(np.median(errors)) if errors.size else 0.0 for errors in maps)
-        return spread, stated
+            errors = np.sqrt(np.diagonal(square, axis1=1, axis2=2).max(axis=1, initial=0.0))
+        return float(np.median(errors)) if errors.size else 0.0
 
 
 class _Step:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import some, two_digits
 from walop_jax.model.effects import Context, Described, Deviations
 from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.effects.optics import GENERATORS
 from walop_jax.model.specification import Model, effect_context, model_without, with_effects
 
 Vector = Float[np.ndarray, " _"]
@@ -80,30 +81,29 @@ class ClassOf(NamedTuple):
 class Shape(NamedTuple):
     """Deviations from the shapes of all descriptions of a model, and errors of p of stars: from them, from the fit.
 
-    In a product those at the positions `in_words` are sentences, those at `in_optics` are in `Deviations`; the others
-    act on no star.
+    Those at the positions `on_stars` act on starlight, and are in the product (`Deviations`).
     """
 
     deviations: Likeness
-    in_words: tuple[int, ...]
-    in_optics: tuple[int, ...]
+    on_stars: tuple[int, ...]
     spread: float
     stated: float
 
     @property
-    def sums(self) -> tuple[Sum, ...]:
-        """Those in words."""
-        return tuple(self.deviations.sums[j] for j in self.in_words)
+    def changes(self) -> dict[int, Sentence]:
+        """Those that act on starlight, by position."""
+        return {j: self.deviations.sums[j][0][1] for j in self.on_stars}
 
-    @property
-    def optical(self) -> dict[int, Sentence]:
-        """Those of `Deviations`, by position."""
-        return {j: self.deviations.sums[j][0][1] for j in self.in_optics}
-
-    @property
-    def places(self) -> tuple[str, ...]:
-        """Places of `Deviations`."""
-        return tuple(dict.fromkeys(f"{change.where} {change.place}" for change in self.optical.values()))
+    def effect(self, context: Context) -> Deviations:
+        """The effect that includes these, all zero."""
+        changes = self.changes.values()
+        places = [
+            " * ".join((f"{change.where} {change.place}", *change.beside_field))
+            for change in changes
+            if change.kind in GENERATORS
+        ]
+        others = [change.text for change in changes if change.kind not in GENERATORS]
+        return Deviations.of(context, places=dict.fromkeys(places), sentences=others)
 
 
 class Classes(NamedTuple):
@@ -114,13 +114,6 @@ class Classes(NamedTuple):
 
     def __bool__(self) -> bool:
         return bool(self.additions) or self.shape is not None
-
-    @property
-    def sums(self) -> Iterator[tuple[Sum, ...]]:
-        """Amplitudes of all members but the additions themselves, and of deviations that grow with anything."""
-        yield from (member.sums for addition in self.additions for member in addition.members[1:])
-        if self.shape is not None:
-            yield self.shape.sums
 
 
 def with_average(result: FitResult, classes: Classes) -> FitResult:
@@ -135,17 +128,17 @@ def with_average(result: FitResult, classes: Classes) -> FitResult:
 def averaged(calibration: Calibration, classes: Classes, context: Context) -> Calibration:
     """The calibration of a fit as the mean over the classes of its additions, with their spread in the covariance.
 
-    Its model includes all members, as sentences; different additions are taken as independent.
+    Its model includes all members, as sentences, and deviations from the shapes of descriptions; different additions
+    are taken as independent.
     """
     if not classes:
         return calibration
     old, model = calibration.model, _holding(calibration, classes, context)
-    held = _parameters_of(classes, model) - set(old.names)
-    new = [i for i, name in enumerate(model.names) if name not in old.names and name not in held]
+    parts = [p.part for p in model.parameters]
+    new = [i for i, name in enumerate(model.names) if name not in old.names and parts[i] != Deviations.name]
     derivatives = list(_amplitudes_of(model, classes))
-    if classes.shape is not None:
-        derivatives.append(_deviations_of(model, classes.shape))
-    model = _with_ties(model, new, np.concatenate(derivatives, axis=1))
+    if new:
+        model = _with_ties(model, new, np.concatenate(derivatives, axis=1))
     place = np.array([model.index(name) for name in old.names])
     count, free = len(model.parameters), old.free
     start, fitted = np.zeros(count), np.zeros((count, count))
@@ -169,11 +162,11 @@ def averaged(calibration: Calibration, classes: Classes, context: Context) -> Ca
         values += average.mean - start
         covariance += average.covariance - fitted
     if classes.shape is not None:  # the descriptions remain: their parameters are as free as before
-        deviations, amplitudes = classes.shape.deviations, derivatives[-1]
+        deviations, amplitudes = classes.shape.deviations, _deviations_of(model, classes.shape)
         slopes = into @ deviations.slopes + amplitudes
         values += into @ deviations.values + amplitudes @ deviations.amplitudes
         covariance += slopes @ deviations.covariance @ slopes.T
-        model = _with_held(model, held, values)
+        model = _with_held(model, Deviations.name, values)
     hidden = calibration.hidden
     if hidden is not None:
         changes = np.zeros((len(hidden), count))
@@ -185,13 +178,19 @@ def averaged(calibration: Calibration, classes: Classes, context: Context) -> Ca
 
 
 def _holding(calibration: Calibration, classes: Classes, context: Context) -> Model:
-    """The model with the sentences of all members."""
+    """The model with the sentences of all members, and with deviations."""
     texts = dict.fromkeys(
-        sentence.text for sums in classes.sums for amplitude in sums for _, sentence in amplitude
+        sentence.text
+        for addition in classes.additions
+        for member in addition.members[1:]
+        for amplitude in member.sums
+        for _, sentence in amplitude
     )
     model = calibration.model
-    if classes.shape is not None and classes.shape.places:
-        model = with_effects(model, [Deviations.of(context, places=classes.shape.places)], context)
+    if classes.shape is not None and classes.shape.on_stars:
+        model = with_effects(model, [classes.shape.effect(context)], context)
+    if not texts:
+        return model
     description = Described.saying(list(texts), np.zeros(len(texts)))
     if Described.name in model.effect_names:
         earlier = calibration.model.instrument(calibration.values).effect(Described.name)
@@ -206,25 +205,19 @@ def _holding(calibration: Calibration, classes: Classes, context: Context) -> Mo
 
 def _amplitudes_of(model: Model, classes: Classes) -> Iterator[Float[np.ndarray, "n a"]]:
     """Derivative of all parameters by the amplitudes of every member but the first of each class, in order."""
-    yield from (
-        _derivatives(model, member.sums) for addition in classes.additions for member in addition.members[1:]
-    )
+    for member in (member for addition in classes.additions for member in addition.members[1:]):
+        derivatives = np.zeros((len(model.parameters), len(member.sums)))
+        for j, combination in enumerate(member.sums):
+            for size, sentence in combination:
+                derivatives[model.index(f"{Described.name}.{sentence.label}"), j] += size
+        yield derivatives
 
 
 def _deviations_of(model: Model, shape: Shape) -> Float[np.ndarray, "n a"]:
     """Derivative of all parameters by the amplitudes of deviations."""
     derivatives = np.zeros((len(model.parameters), len(shape.deviations.sums)))
-    derivatives[:, list(shape.in_words)] = _derivatives(model, shape.sums)
-    for j, change in shape.optical.items():
+    for j, change in shape.changes.items():
         derivatives[model.index(f"{Deviations.name}.{change.label}"), j] = 1.0
-    return derivatives
-
-
-def _derivatives(model: Model, sums: Sequence[Sum]) -> Float[np.ndarray, "n a"]:
-    derivatives = np.zeros((len(model.parameters), len(sums)))
-    for j, combination in enumerate(sums):
-        for size, sentence in combination:
-            derivatives[model.index(f"{Described.name}.{sentence.label}"), j] += size
     return derivatives
 
 
@@ -248,22 +241,10 @@ def _with_ties(model: Model, new: Sequence[int], amplitudes: Float[np.ndarray, "
     return dataclasses.replace(model, parameters=tuple(parameters))
 
 
-def _parameters_of(classes: Classes, model: Model) -> set[str]:
-    """Parameters of deviations from shapes alone."""
-    members, deviations = (
-        {f"{Described.name}.{sentence.label}" for total in sums for _, sentence in total}
-        for sums in (
-            [total for addition in classes.additions for m in addition.members[1:] for total in m.sums],
-            () if classes.shape is None else classes.shape.sums,
-        )
-    )
-    return (deviations - members) | {p.name for p in model.parameters if p.part == Deviations.name}
-
-
-def _with_held(model: Model, names: Collection[str], values: Vector) -> Model:
-    """The model with deviations held at their values: fits of other data would not constrain them."""
+def _with_held(model: Model, part: str, values: Vector) -> Model:
+    """The model with the parameters of an effect held at their values: fits of other data would not constrain them."""
     parameters = [
-        dataclasses.replace(p, free=False, start=float(value)) if p.name in names else p
+        dataclasses.replace(p, free=False, start=float(value)) if p.part == part else p
         for p, value in zip(model.parameters, values, strict=True)
     ]
     return dataclasses.replace(model, parameters=tuple(parameters))

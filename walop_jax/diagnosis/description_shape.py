@@ -10,7 +10,8 @@ Symbols     f_j products of a pattern over the field (all polynomials to the thi
             and other numbers the kind itself); s rms size of the descriptions of that place in the data, n patterns ×
             laws: every kind may be as large as what was described, in any shape
 Source      model discrepancy as a Gaussian process: Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425
-Limits      To first order, about the fit. Patterns over the field beyond the third degree are in no f_j.
+Limits      To first order, about the fit. Patterns over the field beyond the third degree are in no f_j. In a product,
+            stars have those without a dependence and with those described; others change the parameters alone.
 """
 
 from __future__ import annotations
@@ -29,7 +30,6 @@ from walop_jax.likelihood.columns import Columns
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import SINGLE, SLOW, Change, InExposures
 from walop_jax.model.effects.deviations import CUBIC
-from walop_jax.model.effects.factors import FIELD
 from walop_jax.model.effects.optics import GENERATORS, generators_of
 from walop_jax.model.light import mean_wavelengths
 
@@ -46,11 +46,11 @@ class _Place(NamedTuple):
     origin: str
 
 
-def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Change], Vector, Vector]:
-    """Deviations from the shapes of the descriptions in a model, their prior widths, rms values of factors."""
+def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Change], Vector]:
+    """Deviations from the shapes of the descriptions in a model, and their prior widths."""
     instrument = fit.model.instrument(fit.values)
     if not any(isinstance(effect, Described) for effect in instrument.effects):
-        return [], np.zeros(0), np.zeros(0)
+        return [], np.zeros(0)
     described = instrument.effect(Described.name)
     assert isinstance(described, Described)
     data, squares = _AtData.of(columns), dict[_Place, float]()
@@ -62,10 +62,9 @@ def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Change], Vecto
         for _, coefficient, factors in parts:
             size = float(amplitude) * coefficient * data.rms(change.times(*factors))
             squares[place] = squares.get(place, 0.0) + size**2
-        law = tuple(item.text for item in change.grows_with if item.depends_on != FIELD)
-        laws.setdefault(place, {(): None}).setdefault(law)
+        laws.setdefault(place, {(): None}).setdefault(change.beside_field)
     listed = set(described.sentences)
-    changes, widths, sizes = list[Change](), list[float](), list[float]()
+    changes, widths = list[Change](), list[float]()
     for place, square in squares.items():
         shapes = list(_shapes(place, tuple(laws[place]), fit, columns))
         count = len(shapes) / len(place.kinds)
@@ -74,8 +73,7 @@ def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Change], Vecto
             if change.text not in listed and square * rms > 0.0:
                 changes.append(change)
                 widths.append(np.sqrt(square / max(count, 1.0)) / rms)
-                sizes.append(rms)
-    return changes, np.array(widths), np.array(sizes)
+    return changes, np.array(widths)
 
 
 def _shapes(

@@ -188,13 +188,17 @@ class Epoch(Displayed):
 
 
 def fit_like(old: Calibration, calset: CalibrationSet) -> FitResult:
-    """Fit a new set with the model of an old calibration.
+    """Fit a new set with the model of an old calibration, from its values: similar effects have several minima.
 
     Raises ValueError for a set of another instrument and RuntimeError if the fit does not converge.
     """
     if calset.instrument != old.model.name:
         raise ValueError(f"the new set is of {calset.instrument}, the calibration of {old.model.name}")
-    result = with_honest_errors(fit(Likelihood.of(calset, model_like(calset, old.model))))
+    model = model_like(calset, old.model)
+    start = model.start.copy()
+    for name in shared_parameters(old.model, model):
+        start[model.index(name)] = old.values[old.model.index(name)]
+    result = with_honest_errors(fit(Likelihood.of(calset, model), start=start))
     if not result.converged:
         raise RuntimeError(f"the fit of the new set did not converge: {result.minimum.message}")
     return result

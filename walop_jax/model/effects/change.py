@@ -182,9 +182,14 @@ class Change:
         )
 
     @property
-    def over_field_alone(self) -> bool:
-        """True if it depends on the field, and on nothing else."""
-        return all(item.depends_on == FIELD for item in self.grows_with)
+    def over_field(self) -> tuple[str, ...]:
+        """Its factors that are patterns over the field."""
+        return tuple(item.text for item in self.grows_with if item.depends_on == FIELD)
+
+    @property
+    def beside_field(self) -> tuple[str, ...]:
+        """Its factors that are no patterns over the field."""
+        return tuple(item.text for item in self.grows_with if item.depends_on != FIELD)
 
     def times(self, *factors: str) -> Change:
         """The change with further factors."""

@@ -1,10 +1,12 @@
-"""Deviations of missing physics from its description: any change of polarisation at a place, cubic over the field.
+"""Deviations of missing physics from its description, at the same places.
 
-Never a candidate: products of a diagnosis include them, with a covariance, where what was added has no name
-(`diagnosis.description_shape`).
+Never a candidate: products of a diagnosis include them, with a covariance, where an addition has no name
+(`diagnosis.description_shape`). A fit of other data leaves them out.
 
-Equation    M → M_Δ M_R M_D M of `optics`, where each of the nine components of r, d, k is Σ_p c_p f_p(x, y)
-Symbols     f_p products of the factors x, y, r2, x2-y2, xy: all polynomials to the third degree
+Equation    M → M_Δ M_R M_D M of `optics`, each of the nine components of r, d, k being g Σ_p c_p f_p(x, y); other
+            changes as in `change`
+Symbols     f_p products of the factors x, y, r2, x2-y2, xy: all polynomials to the third degree; g the dependence on
+            temperature, hour angle or wavelength that a place has (none: 1)
 Source      Lu & Chipman 1996, JOSA A 13, 1106: every Mueller matrix near the identity is such a product
 Neutral     all zero
 Revealed by nothing: data that show them would have given another description
@@ -12,6 +14,8 @@ Revealed by nothing: data that show them would have given another description
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any, ClassVar, Self
 
@@ -19,9 +23,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from walop_jax.model.conventions import OF_WALOP, Units
 from walop_jax.model.effects.base import Context, Effect
-from walop_jax.model.effects.change import AtPoint, Change, product
+from walop_jax.model.effects.change import AtPoint, Change, patched, product
 from walop_jax.model.effects.optics import GENERATORS, SOURCE, beside, near_identity
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.instrument import Instrument
@@ -35,30 +38,35 @@ CUBIC: tuple[tuple[str, ...], ...] = (
 
 
 class Polynomials(Element):
-    """A change of polarisation with a polynomial over the field for each generator."""
+    """A change of polarisation with a polynomial over the field for each generator, times the factors of a place."""
 
     sizes: Float[Array, "g p"] | float = 0.0
     axis: Float[Array, ""] | float = 0.0
-    units: Units = eqx.field(static=True, default=OF_WALOP)
+    of: Change | None = eqx.field(static=True, default=None)
 
     kind: ClassVar[str] = "deviations"
 
     def mueller(self, ray: Ray) -> Mueller:
         """Diattenuation, then retardance, then depolarisation."""
+        assert self.of is not None
         at = AtPoint(ray.x, ray.y)
-        basis = jnp.stack([product(names, at, self.units) + 0.0 * ray.x for names in CUBIC], axis=-1)
-        return near_identity(
-            dict(zip(GENERATORS, jnp.moveaxis(basis @ jnp.asarray(self.sizes).T, -1, 0), strict=True))
-        )
+        basis = jnp.stack([product(names, at, self.of.units) + 0.0 * ray.x for names in CUBIC], axis=-1)
+        components = jnp.moveaxis(basis @ jnp.asarray(self.sizes).T, -1, 0)
+        factor = self.of.in_train(ray, self.axis)
+        return near_identity({name: size * factor for name, size in zip(GENERATORS, components, strict=True)})
 
 
 class Deviations(Effect):
-    """Deviations from descriptions: any change of polarisation at some places, cubic over the field."""
+    """Deviations from descriptions: any change of polarisation at some places, cubic over the field; other changes."""
 
     sizes: Float[Array, "a g p"] = param(
         unit="", about="share, or retardance in rad", source=f"{SOURCE}; width: expected size", width=0.003
     )
+    amounts: Float[Array, " n"] = param(
+        unit="", about="amplitude of another change", source=f"{SOURCE}; width: that of its kind", width=1.0
+    )
     places: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
+    sentences: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
 
     name: ClassVar[str] = "deviations"
     starts = ()
@@ -72,31 +80,40 @@ class Deviations(Effect):
 
     @classmethod
     def of(cls, context: Context, **values: Any) -> Self:
-        """Those of some `places`, each a preposition and an element, with their `sizes` (zero by default)."""
-        places = tuple(values.get("places", ()))
-        shape = (len(places), len(GENERATORS), len(CUBIC))
-        return cls(sizes=jnp.broadcast_to(jnp.asarray(values.get("sizes", 0.0), float), shape), places=places)
+        """Those at some `places` (preposition, element, factors), and those of other changes, zero unless given.
+
+        Raises ValueError for an unknown parameter.
+        """
+        places, sentences = (tuple(values.pop(name, ())) for name in ("places", "sentences"))
+        sizes = jnp.zeros((len(places), len(GENERATORS), len(CUBIC)))
+        none = cls(sizes=sizes, amounts=jnp.zeros(len(sentences)), places=places, sentences=sentences)
+        return none.given(context, **values)
 
     def labels(self, field: str) -> Sequence[str]:
-        """Place, generator and pattern, as in a description without blanks."""
+        """Descriptions without blanks."""
+        if field == "amounts":
+            return [Change.parsed(text).label for text in self.sentences]
+        changes = map(_at, self.places)
         return [
-            Change(kind, *_parted(place), names).label
-            for place in self.places
-            for kind in GENERATORS
-            for names in CUBIC
+            dataclasses.replace(change, kind=kind, factors=(*names, *change.factors)).label
+            for change, kind, names in itertools.product(changes, GENERATORS, CUBIC)
         ]
 
     def patch(self, instrument: Instrument) -> Instrument:
-        """One more element at every place."""
+        """One more element at every place, and the other changes.
+
+        Raises ValueError for the polariser, through which no star is seen.
+        """
         for sizes, text in zip(self.sizes, self.places, strict=True):
-            where, place = _parted(text)
-            moves = instrument.element(place).moves if where == "of" else None
-            element = Polynomials(name=self.name, moves=moves, sizes=sizes, units=instrument.units)
-            instrument = beside(instrument, element, where, place)
-        return instrument
+            change = _at(text).counted_in(instrument.units)
+            if instrument.polariser is not None and text.startswith(f"of {instrument.polariser.name}"):
+                raise ValueError(f"deviations {text!r}: the light of stars does not pass the polariser")
+            moves = instrument.element(change.place).moves if change.where == "of" else None
+            element = Polynomials(name=self.name, moves=moves, sizes=sizes, of=change)
+            instrument = beside(instrument, element, change.where, change.place)
+        return patched(instrument, zip(map(Change.parsed, self.sentences), self.amounts, strict=True))
 
 
-def _parted(place: str) -> tuple[str, str]:
-    """Preposition and element."""
-    where, _, element = place.rpartition(" ")
-    return where, element
+def _at(place: str) -> Change:
+    """A change at a place with its factors, of any kind."""
+    return Change.parsed(f"{GENERATORS[0]} {place}")
