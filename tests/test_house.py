@@ -186,7 +186,7 @@ MOST_LINES = {
     "instruments": 250,
     "data": 5830,
     "sky": 450,
-    "model": 9760,
+    "model": 9770,
     "likelihood": 3380,
     "simulation": 1130,
     "fit": 2180,
