@@ -110,7 +110,7 @@ def _behind(ahead: Matrix2) -> Matrix2:
 
 
 def _faces(air: _Waves, crystals: _Waves) -> Matrix2:
-    """How amplitudes go over at every face of the stack."""
+    """Transmission of amplitudes through every face of the stack."""
     electric, magnetic = (_with_air(*pair) for pair in zip(air[:2], crystals[:2], strict=True))
     passed = product2(inverse2(electric), _behind(electric))
     return 2.0 * inverse2(passed + product2(inverse2(magnetic), _behind(magnetic)))
