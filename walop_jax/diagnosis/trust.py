@@ -71,11 +71,14 @@ NOISELESS = 1e-6
 _SHOWN = 3
 
 
-def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> FitResult:
+def examined(
+    result: FitResult, seed: int = 0, *, as_written: bool = False, candidates: ScoreTable | None = None
+) -> FitResult:
     """The fit with the verdict on it: what its residuals say against it, beside χ², priors and convergence.
 
     A fit that explains nothing is held against other readings of its data first (`readings`), unless these were
-    tried already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p.
+    tried already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p,
+    `candidates` the scores of its residuals in a diagnosis, if there was one.
     Of a set with more than `TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at.
     A χ² that is a few per cent too large while nothing else is wrong is put down to the stated errors, and the
     standard errors are made from the residuals. Raises `DataError` with the remedy for data that another reading
@@ -105,7 +108,9 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
         doubts = (
             *stated_conditions(design, singles),
             *_significant("hold patterns that noise does not make", pattern_scores(design, seed)),
-            *_significant("are explained better by a missing effect", candidate_scores(design, seed)),
+            *_significant(
+                "are explained better by a missing effect", candidates or candidate_scores(design, seed)
+            ),
             *in_words(components),
             *_groups(design),
             *repeated_noise(design),
