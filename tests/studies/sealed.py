@@ -542,17 +542,15 @@ def table(outcomes: list[Outcome]) -> str:
             f"{stated.count('right')}; {stated.count('class')} of {len(stated)}",
         )
     )
-    classes = [o.after for o in products if o.has_class]
-    for what in ("stars", "elements") if classes else ():
-        pulls = np.concatenate([getattr(one, what).ravel() for one in classes])
-        inside = ", ".join(f"{100 * np.mean(np.abs(pulls) < k):.0f}" for k in (1.0, 2.0))
-        rows.append(
-            (
-                f"products with a class: pulls of {what} rms; inside 1σ, 2σ",
-                f"{np.sqrt(np.mean(pulls**2)):.2f}; {inside} %",
-            )
-        )
-    return "\n".join(f"{name:70s} {value}" for name, value in rows)
+    with_class = [(o, o.after) for o in products if o.has_class and o.after is not None]
+    for explained in (False, True):
+        judged_so = [a for o, a in with_class if not explained or o.verdict.startswith("effect_found")]
+        for what in ("stars", "elements") if judged_so else ():
+            pulls = np.concatenate([getattr(a, what).ravel() for a in judged_so])
+            inside = ", ".join(f"{100 * np.mean(np.abs(pulls) < k):.0f}" for k in (1.0, 2.0))
+            words = f"products with a class{', explained' * explained}: pulls of {what} rms; inside 1σ, 2σ"
+            rows.append((words, f"{np.sqrt(np.mean(pulls**2)):.2f}; {inside} %"))
+    return "\n".join(f"{name:75s} {value}" for name, value in rows)
 
 
 def main() -> int:
