@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.certify import Check, Validity
     from walop_jax.model.effects import EffectKind
-    from walop_jax.science.commissioning import Requirement
+    from walop_jax.science.field_accuracy import Requirement
 
 DOCUMENT = "commissioning.json"
 FOLDER = Option(f"Folder for {DOCUMENT}; it may be that of the fit.", "RUN", Path, "-o")

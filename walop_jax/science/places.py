@@ -258,11 +258,11 @@ def _described(seen: Seen, found: Strongest, cameras: Sequence[str]) -> Disagree
         share, error, gain = _share(subset, k, profile(subset.x, subset.y, place))
         fits.append((gain, place, CameraAtPlace(k, name, share, error)))
     fits.sort(key=lambda fit: -fit[0])
-    best, place = fits[0][0], fits[0][1]
+    best, (x, y, size), _ = fits[0]
     scatter = (subset.chi2.sum() - best) / max(subset.dof.sum() - 4.0, 1.0)
     alike = [camera for gain, _, camera in fits if gain > best - RIVAL * max(1.0, scatter)]
-    inside = profile(subset.x, subset.y, place) > np.exp(-2.0)
-    return DisagreeingPlace(*place, found.sigma, int(inside.sum()), tuple(alike))
+    inside = profile(subset.x, subset.y, (x, y, size)) > np.exp(-2.0)
+    return DisagreeingPlace(x, y, size, found.sigma, int(inside.sum()), tuple(alike))
 
 
 def fitted(seen: Seen, camera: int, start: Place) -> Place:
