@@ -8,8 +8,7 @@ import pytest
 from small_run import small_fit
 
 from walop_jax.calibration.certify import Validity
-from walop_jax.commands.certify import Certificate
-from walop_jax.science.commissioning import requirements
+from walop_jax.science.commissioning import Certificate, requirements
 from walop_jax.science.field_accuracy import FieldAccuracy
 
 FIELD = np.linspace(1e-4, 4.9e-4, 100).reshape(10, 10)  # median 2.95e-4

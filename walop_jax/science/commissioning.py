@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
+from walop_jax.calibration.certify import Check, Validity
+from walop_jax.calibration.product import PRODVERS
 from walop_jax.data.inspection import inspect
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.verdict import Verdict
+from walop_jax.io.display import Display, Displayed
 from walop_jax.science.field_accuracy import FieldAccuracy, Requirement
 
 
@@ -49,3 +55,54 @@ def requirement_advice(asked: Sequence[Requirement]) -> tuple[str, ...]:
     """Advice on requirements that are not met, the needed ones first."""
     ordered = sorted(asked, key=lambda need: not need.needed)
     return tuple(f"{need.found}: {need.advice}" for need in ordered if not need.met)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Certificate(Displayed):
+    """The checks of a product and its requirements for stars, its range of application, hash, and parents.
+
+    `content` is its content hash, `parents` are the SHA-256 of its inputs.
+    """
+
+    path: Path
+    checks: tuple[Check, ...]
+    requirements: tuple[Requirement, ...]
+    validity: Validity
+    content: str
+    parents: tuple[str, ...]
+
+    @property
+    def failed(self) -> tuple[Check, ...]:
+        """The checks that do not hold; the product is valid if there are none."""
+        return tuple(check for check in self.checks if not check.passed)
+
+    @property
+    def go(self) -> bool:
+        """True if the product is valid and everything that is needed is met."""
+        return not self.failed and is_go(self.requirements)
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Advice on requirements that are not met, the needed ones first."""
+        return requirement_advice(self.requirements)
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "product": str(self.path),
+            "go": self.go,
+            "requirements": [dataclasses.asdict(requirement) for requirement in self.requirements],
+            "valid": not self.failed,
+            "schema": PRODVERS,
+            "content": self.content,
+            "parents": list(self.parents),
+            "validity": self.validity._asdict(),
+            "checks": [check._asdict() for check in self.checks],
+        }
+
+    def display(self) -> Display:
+        """Go or no-go, a line for each check and requirement, and advice on those that are not met."""
+        rows = [("ok" if check.passed else "FAILED", check.name, check.found) for check in self.checks]
+        rows += requirement_rows(self.requirements)
+        title = f"{self.path}: {'go' if self.go else 'NO GO'}"
+        return Display(title, head=("", "requirement", "result"), rows=tuple(rows), notes=self.missing)

@@ -85,7 +85,7 @@ class FieldAccuracy:
 
     @property
     def requirements(self) -> tuple[Requirement, ...]:
-        """What the goal asks of the calibration: all that acts on stars measured, p, and no larger error hidden."""
+        """Requirements of the goal: all that acts on stars is measured, p is known, and no larger error could hide."""
         allowed = self.goal / 2
         what = f"what moves stars by {two_digits(100 * allowed)} % is measured"
         asked = []
@@ -109,7 +109,7 @@ class FieldAccuracy:
 
     @property
     def middle(self) -> Requirement:
-        """What a go asks of p: that it is known in half of the field."""
+        """The requirement of a go on p: that it is known in half of the field."""
         cause, allowed = self.limited_by.split(" (")[0], self.goal / 2
         light = two_digits((self.median / allowed) ** 2)
         source = f" (most of the error comes from {cause})" if cause else ""

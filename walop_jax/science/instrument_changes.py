@@ -8,7 +8,6 @@ are given together.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +23,8 @@ MOST_LIKELY = 2.33
 """Standard deviations above the alarm from which 99 % are detected (one-sided)."""
 REACH = 3.0
 """Sizes from the centre of a spot beyond which nothing is left of it."""
-Place = tuple[float, float, float]
-"""Centre (X, Y) and size of a spot, in degrees."""
+Place = tuple[float, ...]
+"""Centre (X, Y) and size of a spot, in degrees, and the sharpness of its edge."""
 UNNAMED = "unnamed"
 """Kind and name of a change that nothing in its range describes."""
 _UNEXPLAINED = "a change that no camera, arm or place of the field makes"
@@ -47,12 +46,11 @@ def chance_of(sigma: float) -> float:
     return float(2.0 * special.ndtr(-abs(sigma)))
 
 
-def profile(
-    x: Float[np.ndarray, " r"], y: Float[np.ndarray, " r"], place: Sequence[float]
-) -> Float[np.ndarray, " r"]:
-    """A spot at positions (deg): 1 in its centre, 0 beyond `REACH` sizes; a place is (x, y, size)."""
+def profile(x: Float[np.ndarray, " r"], y: Float[np.ndarray, " r"], place: Place) -> Float[np.ndarray, " r"]:
+    """A spot at positions (deg): exp(−(d/s)ᵐ/2), 0 beyond `REACH` sizes s; m = 2 where a place does not say."""
     far = ((x - place[0]) ** 2 + (y - place[1]) ** 2) / place[2] ** 2
-    return np.where(far < REACH**2, np.exp(-0.5 * far), 0.0)
+    power = 0.5 * place[3] if len(place) > 3 else 1.0
+    return np.where(far < REACH**2, np.exp(-0.5 * np.minimum(far, REACH**2) ** power), 0.0)
 
 
 class History(NamedTuple):
@@ -79,8 +77,8 @@ class PossibleChange(NamedTuple):
 
     `kind` is gain (a camera), arm (its cameras together, NAME+NAME), gradient or spot (of a camera or an arm), optics,
     or `UNNAMED`; within one catalogue also x, y, time, flux and light of a camera. `place` is the direction of a
-    gradient (deg, from X towards Y), whose size is that at the edge of the field, or centre and size (deg) of a spot
-    (`profile`), whose size is that at its centre.
+    gradient (deg, from X towards Y), whose size is that at the edge of the field, or centre, size (deg) and sharpness
+    of a spot (`profile`), whose size is that at its centre.
     """
 
     name: str

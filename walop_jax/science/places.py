@@ -98,8 +98,7 @@ class Seen(NamedTuple):
 
     def near(self, place: Place) -> Seen:
         """The stars that a place of several times its size may hold."""
-        x, y, size = place
-        return self.of(profile(self.x, self.y, (x, y, _WIDER * size)) > 0)
+        return self.of(profile(self.x, self.y, (*place[:2], _WIDER * place[2])) > 0)
 
 
 class Strongest(NamedTuple):
@@ -255,25 +254,31 @@ def _described(seen: Seen, found: Strongest, cameras: Sequence[str]) -> Disagree
     fits = []
     for k, name in enumerate(cameras):
         place = fitted(subset, k, found.place)
-        share, error, gain = _share(subset, k, profile(subset.x, subset.y, place))
+        share, error, gain = share_of(subset, k, profile(subset.x, subset.y, place))
         fits.append((gain, place, CameraAtPlace(k, name, share, error)))
     fits.sort(key=lambda fit: -fit[0])
-    best, (x, y, size), _ = fits[0]
+    best, place, _ = fits[0]
     scatter = (subset.chi2.sum() - best) / max(subset.dof.sum() - 4.0, 1.0)
     alike = [camera for gain, _, camera in fits if gain > best - RIVAL * max(1.0, scatter)]
-    inside = profile(subset.x, subset.y, (x, y, size)) > np.exp(-2.0)
+    inside = profile(subset.x, subset.y, place) > np.exp(-2.0)
+    x, y, size = place
     return DisagreeingPlace(x, y, size, found.sigma, int(inside.sum()), tuple(alike))
 
 
 def fitted(seen: Seen, camera: int, start: Place) -> Place:
-    """The place at which a camera describes the stars best, near the one that was looked for."""
-    x, y, size = start
+    """The place at which a camera describes the stars best, near the one that was looked for, its edge as sharp."""
+    x, y, size, *edge = start
 
     def place(moved: Float[np.ndarray, " 3"]) -> Place:
-        return x + size * float(moved[0]), y + size * float(moved[1]), size * float(np.exp(moved[2]))
+        return (
+            x + size * float(moved[0]),
+            y + size * float(moved[1]),
+            size * float(np.exp(moved[2])),
+            *edge,
+        )
 
     def misfit(moved: Float[np.ndarray, " 3"]) -> float:
-        return float(moved @ moved) - _share(seen, camera, profile(seen.x, seen.y, place(moved)))[2]
+        return float(moved @ moved) - share_of(seen, camera, profile(seen.x, seen.y, place(moved)))[2]
 
     bounds = [(-_WIDER, _WIDER)] * 2 + [(-1.0, np.log(_WIDER))]
     first = np.vstack([np.zeros(3), 0.5 * np.eye(3)])
@@ -282,14 +287,13 @@ def fitted(seen: Seen, camera: int, start: Place) -> Place:
     return place(solution.x)
 
 
-def described(seen: Seen, camera: int, place: Place) -> Bool[np.ndarray, " s"]:
-    """Stars at a place that a change of a camera there describes to `CUT` standard errors."""
-    shape = seen.alpha[:, camera] * profile(seen.x, seen.y, place)
-    share = _share(seen, camera, profile(seen.x, seen.y, place))[0]
-    return (shape > 0) & (np.abs(seen.z[:, camera] - share * shape) < CUT)
+def described(seen: Seen, camera: int, place: Place, size: float) -> Bool[np.ndarray, " s"]:
+    """Stars whose shift is that of a camera at a place, to `CUT` standard errors or to half of it: spots have edges."""
+    shift = size * seen.alpha[:, camera] * profile(seen.x, seen.y, place)
+    return (shift != 0) & (np.abs(seen.z[:, camera] - shift) < CUT + 0.5 * np.abs(shift))
 
 
-def _share(seen: Seen, camera: int, g: Float[np.ndarray, " s"]) -> tuple[float, float, float]:
+def share_of(seen: Seen, camera: int, g: Float[np.ndarray, " s"]) -> tuple[float, float, float]:
     """β of a camera, its standard error, and by how much it makes χ² smaller."""
     shape = seen.alpha[:, camera] * g
     square, score = float(shape @ shape), float(shape @ seen.z[:, camera])

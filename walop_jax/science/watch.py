@@ -50,7 +50,7 @@ from walop_jax.science.instrument_changes import (
     profile,
     threshold,
 )
-from walop_jax.science.places import Seen, Strongest, described, fitted, seen_from, strongest
+from walop_jax.science.places import Seen, Strongest, described, fitted, seen_from, share_of, strongest
 from walop_jax.science.star_residuals import (
     ABOUT_GAINS,
     CROWDED,
@@ -87,6 +87,8 @@ RIVALS = (
     "filter_shift",
 )
 """Effects of the optics that may have changed, beside the parameters of the model."""
+EDGES = (2.0, 8.0)
+"""Sharpness of spots: a blurred one and one with an edge."""
 _CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
 _MOST_CHANGES = 4
 _ROUNDS = 6
@@ -468,26 +470,30 @@ class Watching:
         np.maximum.at(common, self.pool, weights.inverse * self.variance)
         inverse = common[self.pool] / self.variance
         usable = (inverse > 0) & ~self.spoilt
-        variance = np.where(usable, 1.0 / np.where(usable, inverse, 1.0), 1.0)
-        largest: tuple[Strongest, int, Seen] | None = None
+        if usable.sum() < FEW:
+            return None
+        variance = 1.0 / np.where(usable, inverse, 1.0)
+        found: list[tuple[Strongest, int, Seen]] = []  # that of all rows, and the strongest
         trials = 0
         later = seen_from(self.stars, self.group, self.readings.members, residual, variance)
-        for start, every in enumerate(later):
-            seen = every._replace(z=every.z * usable[:, None], alpha=every.alpha * usable[:, None])
+        for start, seen in enumerate(every.of(usable) for every in later):
             here = strongest(seen, self.readings.edge)
             trials += here.trials
-            if largest is None or abs(here.sigma) > abs(largest[0].sigma):
-                largest = here, start, seen
-        assert largest is not None
-        (spot, start, seen), alarm = largest, threshold(0.5 * ALARM / max(trials, 1))
+            if start == 0 or abs(here.sigma) > abs(found[-1][0].sigma):
+                found = [*found[:1], (here, start, seen)]
+        (spot, start, seen), alarm = found[-1], threshold(0.5 * ALARM / max(trials, 1))
         if abs(spot.sigma) < alarm:
             return None
-        place = fitted(seen.near(spot.place), spot.camera, spot.place)
+        near = seen.near(spot.place)
+        ways = [fitted(near, spot.camera, (*spot.place, edge)) for edge in EDGES]
+        gains = [share_of(near, spot.camera, profile(near.x, near.y, way)) for way in ways]
+        (size, *_), place = max(zip(gains, ways, strict=True), key=lambda way: way[0][2])
         name, since = self.readings.of_cameras[spot.camera].name, History("step", start)
         ranked = [PossibleChange(name, True, since, kind="spot", place=place)]
-        weights = weights._replace(
-            inverse=np.where(described(seen, spot.camera, place), inverse, weights.inverse)
-        )
+        of_spot = np.zeros(len(usable), bool)
+        for _, _, seen in found:
+            of_spot[usable] |= described(seen, spot.camera, place, size)
+        weights = weights._replace(inverse=np.where(of_spot, inverse, weights.inverse))
         for _ in range(2):  # which cameras, and from when on
             best = ranked[0]
             questions = [best._replace(name=reading.name) for reading in self.readings.of_cameras]
