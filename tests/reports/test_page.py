@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 
@@ -46,6 +47,19 @@ def test_page_stands_by_itself(diagnosed, refitted):
         outside = re.sub(r"data:image/[^\"]*", "", text)
         assert not re.search(r"https?:|url\(|@import|<script|<link|<iframe", outside)
         assert all(image["alt"] for image in page.images)
+
+
+def test_figures_of_a_narrow_screen_have_the_width_of_a_column(refitted, diagnosed):
+    """89 mm, so that panels go below each other and type is of 7 pt; nothing has to be moved sideways."""
+    for text in (refitted, diagnosed):
+        narrow = re.findall(
+            r'media="screen and \(max-width: 40rem\)" srcset="data:image/svg[^,]*,([^"]*)"', text
+        )
+        assert len(narrow) == len(Page(text).images)
+        for svg in map(base64.b64decode, narrow):
+            (width,) = re.findall(rb'<svg [^>]*width="([0-9.]+)pt"', svg)
+            assert float(width) == pytest.approx(89.0 / 25.4 * 72.0, abs=0.1)
+        assert "scroll sideways" not in text
 
 
 def test_every_word_that_is_displayed_is_on_the_page(diagnosed, refitted):
