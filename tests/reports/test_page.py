@@ -83,6 +83,22 @@ def test_the_answer_comes_first(diagnosed, refitted):
         assert shown.facts[0][1] in head.replace("\N{NO-BREAK SPACE}", " ")
 
 
+@pytest.mark.parametrize("rows", [3, 100])
+def test_a_long_table_is_folded_with_its_facts_and_notes(rows):
+    shown = Display(
+        "of it all",
+        (("limited by", "clouds"),),
+        ("name", ">value"),
+        tuple((f"a{k}", "1") for k in range(rows)),
+        ("no more",),
+    )
+    section = page_module.Section("numbers", "Numbers", shown)
+    text = page_module.filled(
+        Display("yes"), [section], good=True, untrusted=False, title="", name="", about="", first=""
+    )
+    assert [text.count(words) for words in ("clouds", "no more", "<details>")] == [1, 1, int(rows > 32)]
+
+
 def test_a_no_go_stands_first(tmp_path):
     folder = handmade_run.make_refit(tmp_path / "run")
     row = ("NO", "p known to 0.050 % in 50 % of the field", "0.088 %")

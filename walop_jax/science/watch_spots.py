@@ -44,7 +44,7 @@ class SpotFound(NamedTuple):
 
 
 class Spots:
-    """Places at which the stars of a list could see a spot."""
+    """Places in the field where the stars of a list would show a spot."""
 
     def __init__(self, stars: StarResiduals, edge: float) -> None:
         self.edge = edge
