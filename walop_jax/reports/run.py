@@ -94,7 +94,7 @@ class FigureSource:
         return cls(held=held, **options)
 
     def on(self, canvas: Canvas) -> FigureSource:
-        """The same source with another canvas; what was computed is kept."""
+        """The same source with another canvas; computed results are kept."""
         other = copy.copy(self)
         object.__setattr__(other, "canvas", canvas)
         return other
