@@ -330,6 +330,7 @@ def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
         cmap="RdYlBu",
         aspect="auto" if narrow else "equal",
     )
+    gap = "\n" if narrow else " "
     numbers = [str(k + 1) for k in range(count)]  # below a narrow figure, where names would take half of it
     rows = [f"{name}  {number}" for name, number in zip(names, numbers, strict=True)] if narrow else names
     axis.set_xticks(range(count), numbers if narrow else names, rotation=90, fontsize=SMALL)
@@ -337,8 +338,8 @@ def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     axis.set_ylabel("effect present\n(at its detection limit)", fontsize=FONT)
     axis.set_xlabel("could be mistaken for", fontsize=FONT)
     if omitted := len(found.effects) - count:
-        axis.set_title(f"{omitted} other effects: more than {_STEPS[-1]:g} σ from all", fontsize=FONT)
-    label = f"separation (σ); below {thresholds.SEPARATION:g}: can be mistaken"
+        axis.set_title(f"{omitted} other effects:{gap}more than {_STEPS[-1]:g} σ from all", fontsize=FONT)
+    label = f"separation (σ),{gap}below {thresholds.SEPARATION:g}: can be mistaken"
     if narrow:
         colour_bar(figure, shown, [axis], label, location="bottom", aspect=30)
     else:
