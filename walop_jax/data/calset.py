@@ -57,7 +57,6 @@ from walop_jax.data.units import Place, check_units, unit_of
 from walop_jax.data.write import EXTENSION, read_compression, remark, set_tables
 from walop_jax.io.errors import fail, nearest
 from walop_jax.io.fits_reading import OpenFile, open_fits
-from walop_jax.io.names import DOCUMENTS, PRODUCT
 
 _IMAGE = re.compile(r"[NE](0|[1-9][0-9]{0,2})")  # of one camera: counts or errors
 _NO_SETS = (".csv", ".ecsv", ".txt", ".dat", ".vot", ".xml", ".json", ".toml", ".nc", ".npz", ".h5")
@@ -92,10 +91,8 @@ def read_calibration_set(*paths: str | os.PathLike[str], kinds: Collection[str] 
 
 def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
     if path.is_dir():
-        if any((path / name).exists() for name in (PRODUCT, *DOCUMENTS.values())):
-            advice = f"walop-jax report {path} shows them; give a calibration set, a FITS file"
-            raise fail("is a folder of results", file=path, advice=advice)
-        raise fail("is a folder", file=path, advice="a calibration set is a FITS file: give the files in it")
+        advice = f"a calibration set is a FITS file; walop-jax report {path} shows a folder of results"
+        raise fail("is a folder", file=path, advice=advice)
     if path.suffix.lower() in _NO_SETS:
         advice = "a calibration set is a FITS file (walop-jax docs files); walop_jax.from_arrays makes one of arrays"
         raise fail("is not a calibration set", file=path, advice=advice)

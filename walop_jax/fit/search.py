@@ -192,10 +192,7 @@ def _from_afar(
 
 
 def _far_off(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
-    """The best minimum of a model that is far from the data.
-
-    The errors are scaled to the residuals, and plates are tried at neighbouring orders (a wave of retardance off).
-    """
+    """The best minimum of a model far from its data: errors scaled to the residuals, plates a wave off tried."""
     budget, starts = most_passes(likelihood.model) - best.minimum.steps, 1
 
     def search(label: str, values: Vector, scale: float, maximum_steps: int) -> FoundMinimum:
