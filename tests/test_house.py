@@ -197,8 +197,8 @@ MOST_LINES = {
     "nights": 2810,
     "plans": 2375,
     "paper": 870,
-    "reports": 3085,
-    "commands": 4860,
+    "reports": 3125,
+    "commands": 4885,
 }
 """Lines of each room: raising one is a decision of its own."""
 
