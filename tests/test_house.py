@@ -192,7 +192,7 @@ MOST_LINES = {
     "fit": 2180,
     "calibration": 2845,
     "posterior": 2380,
-    "science": 6400,
+    "science": 6420,
     "diagnosis": 8190,
     "nights": 2810,
     "plans": 2375,
