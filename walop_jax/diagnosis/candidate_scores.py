@@ -14,7 +14,7 @@ import numpy as np
 from scipy import linalg
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar, thresholds
+from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates
 from walop_jax.diagnosis.score import ScoreSpace, ScoreTable, effective_trials
@@ -22,7 +22,6 @@ from walop_jax.model.effects import Described
 
 TOGETHER = 1e8  # numbers in the columns of a batch
 DRAWS = 200  # of noise: a fifth of them give the number of trials to 16 %
-_SHOWN = 3
 
 
 def candidate_scores(design: Design, seed: int = 0) -> ScoreTable:
@@ -79,15 +78,3 @@ def _columns(design: Design, batch: list[Probe]) -> Iterator[tuple[Probe, np.nda
     )
     candidates = collections.ChainMap(*all_candidates(design.columns, names, sentences))
     yield from ((probe, candidates[probe.name].columns) for probe in batch if probe.name in candidates)
-
-
-def candidate_doubts(design: Design, seed: int = 0) -> Iterator[str]:
-    """A sentence if a missing effect or description explains more than noise does."""
-    table = candidate_scores(design, seed)
-    if table.p_global >= thresholds.ALARM:
-        return
-    names = table.significant(thresholds.ALARM, _SHOWN)
-    yield (
-        f"the residuals are explained better with something that the model has not (p = {table.p_global:.2g}, limit "
-        f"{thresholds.ALARM:g}; nearest: {' | '.join(names)}): walop-jax diagnose looks for the cause"
-    )

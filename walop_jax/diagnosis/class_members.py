@@ -8,6 +8,7 @@ Kinds        An effect in exposures of one KIND is a difference between that KIN
 Stars        A member changes the matrix by its own column, and through the shifts of the other parameters.
              Equivalent members count once. The product is their mean, and its covariance has their spread: values and
              covariance of a model that includes all of them, each amplitude 0 in the models of the others.
+Shape        A description has deviations beside its class (`description_shape`), marginalised by one linear step.
 Limits       To first order. Structural effects, other descriptions and patterns of a single place have no sentence and
              no part in it.
 """

@@ -3,8 +3,10 @@
 Model        that of the fit with the sentences of all members of all classes. An amplitude is 0 in the models of the
              others, so that values and covariance of the mixture (`class_average`) are sufficient: the matrix,
              errors of stars and maps follow as for any other calibration.
+             Deviations from the shape of a description are the effect `deviations`, with their covariance.
 Trust        Where the effects of members on stars differ by more than the goal, or by more than the errors of the fit,
-             only a class was identified and the product is not trusted: the ambiguity dominates the error.
+             only a class was identified and the product is not trusted: the ambiguity dominates the error. Likewise for
+             the error of p from deviations.
 Limits       to first order; different additions are taken as independent.
 """
 

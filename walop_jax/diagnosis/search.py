@@ -204,27 +204,28 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
         new: list[Trial] = []
         while waiting and not (ended := judge.over(fits)):
             linear, fits = waiting.pop(0), fits + 1
-            passed = log.passed([judge.fitted(evidence, linear)])
-            new += passed
-            if passed:
-                tried = [passed[0] if candidate is linear else candidate for candidate in tried]
-                if _is_sure(passed[0], waiting):
-                    break
-        if not (new or sentences_asked):  # names that came first by linear steps that were not to be believed
+            for fitted in log.passed([judge.fitted(evidence, linear)]):
+                new.append(fitted)
+                tried = [fitted if candidate is linear else candidate for candidate in tried]
+            if new and _is_sure(new[-1], waiting):
+                break
+        passed = [*new, *confirmed]
+        # Names that came first by linear steps were refused: these steps were inaccurate.
+        if not (passed or sentences_asked):
             sentences_asked = True
             waiting = log.passed(_sentences_behind(evidence, tried), hopeless)
             tried += waiting
             if waiting:
                 continue
         missing = evidence.chi2 - evidence.dof
-        explained = any(t.noise or evidence.chi2 - t.left > thresholds.GOOD_SHARE * missing for t in new)
-        if not others_asked and not explained and (evidence.poor or not new):
+        explained = any(t.noise or evidence.chi2 - t.left > thresholds.GOOD_SHARE * missing for t in passed)
+        if not others_asked and not explained and (evidence.poor or not passed):
             others_asked = True
             alternatives, choices = judge.others(dataclasses.replace(state, fits=fits))
             fits += len(alternatives)
             alternatives = log.passed(alternatives)
-            new, tried = [*new, *alternatives], [*tried, *alternatives]
-        for trial in judge.decided(sorted([*new, *confirmed], key=names_first)):
+            passed, tried = [*passed, *alternatives], [*tried, *alternatives]
+        for trial in judge.decided(sorted(passed, key=names_first)):
             if accepted := next(iter(log.passed([judge.confronted(evidence, trial)])), None):
                 break
         # Sentences were behind a name that was refused: they come before another one that is less probable.

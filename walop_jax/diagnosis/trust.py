@@ -37,7 +37,7 @@ from jaxtyping import Bool
 from scipy import special
 
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.candidate_scores import candidate_doubts
+from walop_jax.diagnosis.candidate_scores import candidate_scores
 from walop_jax.diagnosis.design import Design, pattern_scores
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.readings import refuse_dead_cameras, refuse_mixups
@@ -71,11 +71,14 @@ NOISELESS = 1e-6
 _SHOWN = 3
 
 
-def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> FitResult:
+def examined(
+    result: FitResult, seed: int = 0, *, as_written: bool = False, candidates: ScoreTable | None = None
+) -> FitResult:
     """The fit with the verdict on it: what its residuals say against it, beside χ², priors and convergence.
 
     A fit that explains nothing is held against other readings of its data first (`readings`), unless these were
-    tried already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p.
+    tried already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p,
+    `candidates` the scores of its residuals in a diagnosis, if there was one.
     Of a set with more than `TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at.
     A χ² that is a few per cent too large while nothing else is wrong is put down to the stated errors, and the
     standard errors are made from the residuals. Raises `DataError` with the remedy for data that another reading
@@ -100,12 +103,14 @@ def examined(result: FitResult, seed: int = 0, *, as_written: bool = False) -> F
     components = found_components([*pixels, *variance_components(design)])
     hidden = None
     if near:
-        table, singles = pattern_scores(design, seed), Singles.of(design)
+        singles = Singles.of(design)
         hidden = hidden_mistakes(design, singles)
         doubts = (
             *stated_conditions(design, singles),
-            *_patterns(table),
-            *candidate_doubts(design, seed),
+            *_significant("hold patterns that noise does not make", pattern_scores(design, seed)),
+            *_significant(
+                "are explained better by a missing effect", candidates or candidate_scores(design, seed)
+            ),
             *in_words(components),
             *_groups(design),
             *repeated_noise(design),
@@ -208,14 +213,14 @@ def sampled(result: FitResult, most: int) -> FitResult:
     return dataclasses.replace(result, likelihood=Likelihood.of(calset, result.model))
 
 
-def _patterns(table: ScoreTable) -> Iterator[str]:
-    if table.p_global >= thresholds.ALARM:
-        return
-    names = table.significant(thresholds.ALARM, _SHOWN)
-    yield (
-        f"the residuals hold patterns that noise does not make (p = {table.p_global:.2g}, limit {thresholds.ALARM:g}: "
-        f"{', '.join(names)}): walop-jax diagnose looks for the cause"
-    )
+def _significant(finding: str, table: ScoreTable) -> Iterator[str]:
+    """A doubt if the lowest p-value of a table is below the threshold."""
+    if table.p_global < thresholds.ALARM:
+        names = " | ".join(table.significant(thresholds.ALARM, _SHOWN))
+        yield (
+            f"the residuals {finding} (p = {table.p_global:.2g}, limit {thresholds.ALARM:g}; nearest: {names}): "
+            "walop-jax diagnose looks for the cause"
+        )
 
 
 @dataclasses.dataclass(frozen=True)

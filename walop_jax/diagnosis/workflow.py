@@ -33,6 +33,7 @@ from walop_jax.diagnosis.grammar import Hypotheses, hypotheses
 from walop_jax.diagnosis.leftover import back_to, concluded
 from walop_jax.diagnosis.readings import mixups_of, refusal
 from walop_jax.diagnosis.refits import Refits
+from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.diagnosis.search import State, search
 from walop_jax.diagnosis.stated_conditions import instead_of_names, rival_conditions
 from walop_jax.diagnosis.trust import examined, pixel_structure
@@ -138,13 +139,17 @@ def diagnose(
         not_scored=_not_scored(catalogue, candidates),
         descriptions=len(candidates.sentences) + len(candidates.parts),
     )
+    tables = first.evidence.table, evidence.table
     del first, state, evidence  # the columns of all candidates, gigabytes of a large set
-    return _examined(diagnosis, seed)
+    return _examined(diagnosis, tables, seed)
 
 
-def _examined(diagnosis: Diagnosis, seed: int) -> Diagnosis:
-    """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked."""
-    after = examined(with_honest_errors(diagnosis.after), seed, as_written=True)
+def _examined(diagnosis: Diagnosis, tables: tuple[ScoreTable, ScoreTable], seed: int) -> Diagnosis:
+    """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked.
+
+    `tables` are the scores of the fits before and after.
+    """
+    after = examined(with_honest_errors(diagnosis.after), seed, as_written=True, candidates=tables[1])
     for sentence in only_a_class(diagnosis.members):
         after = after.doubted(Quality.CLASS_ONLY, sentence)
     after = with_average(after, diagnosis.members)
@@ -156,7 +161,7 @@ def _examined(diagnosis: Diagnosis, seed: int) -> Diagnosis:
     explained = diagnosis.before.explains_data or diagnosis.before.nearly_explains_data
     before = diagnosis.before.judged()
     if explained:
-        before = examined(diagnosis.before, seed, as_written=True)
+        before = examined(diagnosis.before, seed, as_written=True, candidates=tables[0])
     return dataclasses.replace(diagnosis, before=before, after=after)
 
 
