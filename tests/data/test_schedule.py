@@ -10,8 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from astropy.coordinates import AltAz, EarthLocation, SkyCoord
+from astropy.time import Time
 
 import walop_jax as walop
+from walop_jax.commands.command import Job
+from walop_jax.commands.plan import scheduled
 from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.data.records import Exposures, Position
 from walop_jax.data.schedule import read_schedule, schedule_of
@@ -111,6 +115,30 @@ def test_a_plan_with_filters_plate_and_sky(tmp_path: Path):
     same(exposures, again)
     assert "their time is not known" in remarks[0]
     assert {target["type"] for target in schedule["targets"]} == {"CAL-CAL", "CAL-MOO", "CAL-POL"}
+
+
+def test_standards_of_a_schedule_are_stars_that_are_up(tmp_path: Path):
+    """Those of the package, zero or not as in the plan, at least 30° high by astropy; others are said to be none."""
+    remarks = "; ".join(scheduled(Job(), PLAN, tmp_path / "s.json", None))
+    schedule = json.loads((tmp_path / "s.json").read_text())
+    validate(schedule)
+    place = {
+        one["name"]: SkyCoord(one["ra"], one["dec"], unit=("hourangle", "deg")) for one in schedule["objects"]
+    }
+    table = walop.standards()
+    rows = {str(name): row for name, row in zip(table["NAME"], table, strict=True)}
+    targets = {target["target"]: target["type"] for target in schedule["targets"] if target["target"] in rows}
+    assert targets
+    site = EarthLocation(lon=PLAN.site.longitude, lat=PLAN.site.latitude, height=PLAN.site.elevation)
+    when = Time(PLAN.exposures().mjd[-3:], format="mjd")  # the standards come last
+    for name, kind in targets.items():
+        assert (kind == "CAL-UPO") == (rows[name]["P"] < 0.005)
+        assert place[name].separation(SkyCoord(rows[name]["RA"], rows[name]["DEC"])).arcsec < 0.2
+        assert place[name].transform_to(AltAz(obstime=when, location=site)).alt.deg.max() > 30.0
+        assert f"is {name}" in remarks
+    fictitious = {f"STD{k:02d}" for k in range(3)} & set(place)
+    assert len(fictitious) + len(targets) == 3
+    assert all(name in remarks.partition("no standard of the package")[0] for name in fictitious)
 
 
 def test_exposures_that_follow_each_other_are_multiples(tmp_path: Path):

@@ -108,6 +108,23 @@ def test_exposures_that_come_when_the_night_is_over_are_told():
         assert Available(SMALL).doubts(dataclasses.replace(SMALL, stops=few, patches=(), stars=())) == ()
 
 
+def test_a_plan_takes_the_time_that_it_is_for(planned):
+    """15 minutes over its exposures, not 5.76 minutes each."""
+    mjd = planned.observing_plan.exposures().mjd
+    assert 1440 * np.ptp(mjd) == pytest.approx(15.0 * (1 - 1 / len(mjd)), rel=1e-3)
+
+
+def test_targets_that_set_before_a_plan_ends_are_left_out():
+    """The night is over after 14 hours; the polariser does not need it."""
+    choices, notes = Available(SMALL, throughout=840.0).choices()
+    assert {choice.kind for choice in choices} == {"clp"}
+    assert len(notes) == 2
+    assert "they cannot be observed for all of the 840 minutes" in notes[0]
+    choices, notes = Available(SMALL, throughout=30.0).choices()
+    assert {choice.kind for choice in choices} == {"clp", "moon", "standard"}
+    assert notes == ()
+
+
 def test_a_schedule_is_planned_in_whole_seconds():
     available = Available(SMALL, seconds={"clp": (0.4, 12.6, 13.2), "moon": (60.0,)})
     assert available.in_whole_seconds().seconds == {"clp": (1.0, 13.0), "moon": (60.0,)}

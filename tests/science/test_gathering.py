@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -335,3 +336,140 @@ def test_the_number_of_catalogues_and_a_missing_pointing_are_said(tmp_path):
         DataError, match=r"has no RA and no DEC and no ROTATOR .* give --ra … --dec … --rotator …"
     ):
         walop.gather(files)
+
+
+def rewritten(files, k, change, words=CENTRE):
+    """The catalogue of a camera, changed."""
+    columns = of_camera(STARS, k, np.random.default_rng(k))
+    change(columns)
+    files[k].unlink()
+    ldac(files[k], columns, words)
+
+
+def test_a_catalogue_that_is_given_twice_or_in_the_wrong_place_is_refused(tmp_path):
+    """Two cameras with the same fluxes, and the ordinary beams before the extraordinary ones: both give wrong q, u."""
+    files = four(STARS, tmp_path)
+    copy = shutil.copy(files[0], tmp_path / "copy.fits")
+    with pytest.raises(DataError, match=r"copy.fits: has the fluxes of .*O1.fits: it is the same catalogue"):
+        walop.gather([files[0], copy, *files[2:]])
+    with pytest.raises(
+        ValueError, match=r"O2.fits is given in the place of camera E1: the order is O1, E1, O2, E2"
+    ):
+        walop.gather([files[0], files[2], files[1], files[3]])
+
+
+def test_catalogues_of_different_exposures_are_refused(tmp_path):
+    files = four(STARS, tmp_path)
+    for k, mjd in enumerate((61000.1, 61000.1001, 61000.1, 61000.1)):
+        rewritten(files, k, lambda columns: None, {**CENTRE, "MJD": mjd})
+    assert np.all(walop.gather(files)["MJD"] == 61000.1)
+    rewritten(files, 3, lambda columns: None, {**CENTRE, "MJD": 61000.2})
+    with pytest.raises(
+        DataError, match=r"MJD is 61000.1 and 61000.1001 and 61000.2 in catalogues of one exposure"
+    ):
+        walop.gather(files)
+
+
+def test_fluxes_in_different_apertures_are_refused(tmp_path):
+    files = four(STARS, tmp_path)
+    rewritten(files, 2, lambda c: c.update(FLUX_APER=c.pop("FLUX_AUTO"), FLUXERR_APER=c.pop("FLUXERR_AUTO")))
+    with pytest.raises(DataError, match=r"different fluxes: FLUX_AUTO \(.*\) and FLUX_APER \(.*O2.fits\)"):
+        walop.gather(files)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_field_with_one_or_two_stars(count, tmp_path):
+    """A bright standard in a short exposure: nothing to register by."""
+    made = walop.gather(four(STARS[:count], tmp_path))
+    np.testing.assert_allclose(by_source(made)["N"], STARS["N"][:count])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"RA": "06:30:00.0", "DEC": "-44:00:00.0", "ROTATOR": 35.0}, ""),
+        ({"RA": "97.5", "DEC": "-44", "ROTATOR": "35"}, ""),
+        ({**CENTRE, "ROTATOR": "north up"}, r"\[header\] ROTATOR: 'north up' is no angle; give --rotator"),
+        ({**CENTRE, "DEC": -444.0}, "DEC of the field centre is -444 deg; at most 90 deg"),
+    ],
+)
+def test_the_pointing_of_a_header(words, message, tmp_path):
+    files = four(STARS, tmp_path)
+    rewritten(files, 0, lambda columns: None, words)
+    if message:
+        with pytest.raises(DataError, match=message):
+            walop.gather(files)
+    else:
+        assert walop.gather(files).meta["RA"] == pytest.approx(97.5, abs=1e-9)
+
+
+@pytest.mark.parametrize("option", ["gain", "tolerance"])
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+def test_numbers_that_are_none_are_refused(option, value, tmp_path):
+    with pytest.raises(ValueError, match=f"{option} = .* must be a number above 0"):
+        walop.gather(four(STARS[:3], tmp_path), **{option: value})
+
+
+def test_identifiers_in_floats_are_refused(tmp_path):
+    """Neighbouring floats are 1024 apart where identifiers of Gaia are."""
+    columns = of_camera(STARS, 0, np.random.default_rng(0))
+    columns["SOURCE_ID"] = columns["SOURCE_ID"].astype(float)
+    with pytest.raises(DataError, match=r"SOURCE_ID: is a float beyond 2\*\*53"):
+        read_camera_catalogue(ldac(tmp_path / "a.fits", columns))
+    columns["SOURCE_ID"] = np.arange(300.0)
+    assert read_camera_catalogue(ldac(tmp_path / "b.fits", columns)).of_stars["SOURCE_ID"][7] == "7"
+
+
+def test_columns_of_stars_that_are_rounded_in_one_camera_agree(tmp_path, caplog):
+    files = four(STARS, tmp_path)
+    rewritten(files, 1, lambda columns: columns.update(BP_RP=columns["BP_RP"].round(3)))
+    made, text = remarks(caplog, files)
+    assert "BP_RP" not in text
+    assert np.isfinite(made["BP_RP"]).all()
+
+
+def test_flags_that_are_empty_are_remarked_on(tmp_path):
+    columns = of_camera(STARS, 0, np.random.default_rng(0))
+    columns["FLAGS"] = np.where(np.arange(300) < 5, np.nan, 0.0)
+    text = "; ".join(read_camera_catalogue(ldac(tmp_path / "a.fits", columns)).remarks)
+    assert "FLAGS is empty in 5 rows: taken as good" in text
+
+
+def test_the_background_of_every_camera_is_the_level_of_the_sky(tmp_path):
+    files = four(STARS, tmp_path)
+    for k in range(4):
+        rewritten(files, k, lambda columns, k=k: columns.update(BACKGROUND=np.full(300, 40.0 + k)))
+    made = walop.gather(files, gain=2.0)
+    np.testing.assert_allclose(made["SKY"][0], [80.0, 82.0, 84.0, 86.0])
+    rewritten(files, 1, lambda columns: None)
+    with pytest.raises(DataError, match="SKY: only some cameras have a level of the sky"):
+        walop.gather(files)
+
+
+def test_words_of_the_header_of_an_observatory(tmp_path):
+    """Begin of the exposure and its length, a filter by number, a pointing in sexagesimal texts."""
+    files = four(STARS, tmp_path)
+    header = {
+        "DATE-OBS": "2026-11-26T01:00:00", "EXPTIME": 240.0, "FILTNUM": 3, "IMAGETYP": "SCIENCE",
+        "TELRA": "06:30:00", "TELDEC": "-44:00:00", "PA": 35.0,
+    }  # fmt: skip
+    for k in range(4):
+        rewritten(files, k, lambda columns: None, header)
+    words = tmp_path / "words.toml"
+    words.write_text(
+        '[KIND]\nword = "IMAGETYP"\nvalues = { MOON = "moon" }\n'
+        '[MJD]\nword = "DATE-OBS"\nexpression = "x + EXPTIME / 2 / 86400"\n[EXPTIME]\nword = "EXPTIME"\n'
+        '[FILTER]\nword = "FILTNUM"\nvalues = { "3" = "NB-660" }\n'
+        '[RA]\nword = "TELRA"\nunit = "hourangle"\n[DEC]\nword = "TELDEC"\nunit = "deg"\n[ROTATOR]\nword = "PA"\n'
+    )
+    made = walop.gather(files, words=words)
+    assert set(made["FILTER"]) == {"NB-660"}
+    assert made["MJD"][0] == pytest.approx(61370.0 + (3600 + 120) / 86400, abs=1e-9)
+    assert made.meta["RA"] == pytest.approx(97.5)
+    assert np.max(np.abs(by_source(made)["X"] - STARS["X"])) < 0.5 / 3600
+
+
+def test_a_text_without_names_of_columns_is_told_from_a_catalogue(tmp_path):
+    (tmp_path / "O1.cat").write_text("1 97.5 -44.0 1000.0 30.0\n")
+    with pytest.raises(DataError, match=r"neither as ASCII_HEAD nor as FITS_LDAC .*CATALOG_TYPE"):
+        read_camera_catalogue(tmp_path / "O1.cat")

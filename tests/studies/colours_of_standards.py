@@ -67,16 +67,26 @@ def main() -> None:
             walop.write_calibration_set(
                 given.save / f"set{seed:02d}.fits", dataclasses.replace(run.calset, sources=plain)
             )
-        fit = walop.refit(run.calset)
-        every.append(pulls(fit, run.truth))
-        named = [step.effect for step in walop.diagnose(run.calset).steps]
+        diagnosis = walop.diagnose(run.calset)
+        fit, exposures = diagnosis.before, run.calset.exposures
+        every.append(np.abs(pulls(fit, run.truth)).reshape(-1, 2))
+        named = [step.effect for step in diagnosis.steps]
         false += bool(named)
-        print(f"seed {seed}: chi2/dof {fit.chi2 / fit.dof:.3f}, named {named or 'nothing'}", flush=True)
-    off = np.abs(np.concatenate(every))
-    print(f"false names in {false} of {given.sets} sets; q, u of stars in each filter: {len(off)} values,")
-    print(
-        f"{100 * np.mean(off < 1):.1f} % within 1, {100 * np.mean(off < 1.96):.1f} % within 1.96 standard errors"
-    )
+        print(
+            f"seed {seed}: chi2/dof {fit.chi2 / fit.dof:.3f}, named {named or 'nothing'}; {coverage(every[-1])}",
+            flush=True,
+        )
+    print(f"false names in {false} of {given.sets} sets; q, u of stars in each filter:")
+    of_filter = exposures.filter[exposures.kind == "standard"]
+    for name in PLAN.filters:
+        print(f"{name}: {coverage(np.concatenate([off[of_filter == name] for off in every]))}")
+    print(f"all: {coverage(np.concatenate(every))}")
+
+
+def coverage(off: np.ndarray) -> str:
+    """How many of the differences, in standard errors, are within 1 and 1.96."""
+    within = [f"{int(np.sum(off < limit))} within {limit:g}" for limit in (1.0, 1.96)]
+    return f"{off.size} values, {' and '.join(within)} standard errors"
 
 
 if __name__ == "__main__":

@@ -79,7 +79,8 @@ def apply(
 
     Of a SURVEY (walop-jax stack) the calibration at the MJD of the stars is taken: those of one night in a catalogue.
 
-    The catalogues of the cameras may be given as they are: they are made one as `walop-jax gather` does.
+    The catalogues of the cameras may be given as they are: they are made one as `walop-jax gather` does, which has
+    options for what they do not state (pointing, names of columns and words, gain).
 
     With --each every CATALOGUE is reduced by itself into the folder OUT, in this process or by Dask (--workers,
     --scheduler): a table appears whole or not at all, and one that is there is not made again.
@@ -93,6 +94,7 @@ def apply(
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.atomic import check_output
     from walop_jax.io.plain_tables import table_format
+    from walop_jax.nights.stacking import is_survey
     from walop_jax.posterior.draws import with_moments
     from walop_jax.science.apply import apply as apply_to_rows
     from walop_jax.science.catalogue import read_catalogue
@@ -124,8 +126,9 @@ def apply(
         check_output(output, overwrite=job.overwrite)
         table_format(output)
     job.begin("reading")
-    table, gathering_remarks = _table_of(catalogue)
-    held = calibration_for(calibration, table, effects, force=force)
+    held = None if is_survey(calibration) else calibration_of(calibration, effects)
+    table, gathering_remarks = _table_of(catalogue, held)
+    held = held or calibration_for(calibration, table, effects, force=force)
     instrument, limit = held.model.template.patched(), math.inf if saturation is None else saturation
     rows = read_catalogue(table, instrument, limit, always_in=held.always_in, never_in=held.never_in)
     job.tell("tabulating the analysis vectors", "tabulating")
@@ -162,18 +165,20 @@ def apply(
     )
     crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
     zones = f"; {crossed} in zones of high cross-talk (FLAG 16)" if crossed else ""
-    text = f"{output}: {table.rows} rows, {len(stars.qu)} stars, {job.seconds:.1f} s{errors_in_words(columns)}{zones}"
+    stars_of = f"{len(outcome.value)} rows, {len(stars.qu)} stars, {job.seconds:.1f} s"
+    text = f"{output}: {stars_of}{errors_in_words(columns)}{zones}"
     return dataclasses.replace(outcome, text=text, next=(f"topcat {output}",) if common else ())
 
 
-def _table_of(catalogue: Any) -> tuple[InputTable, Sequence[str]]:
+def _table_of(catalogue: Any, held: Calibration | None) -> tuple[InputTable, Sequence[str]]:
     """The table of a catalogue, of those of the cameras as one, with remarks on how they were made one."""
     several = isinstance(catalogue, list | tuple)
     if not several or len(catalogue) == 1:
         return table_of(catalogue[0] if several else catalogue, {}), ()
     from walop_jax.data.user_tables import in_memory
 
-    gathered = command_of(gather).run(Job(), {"catalogues": catalogue})
+    instrument = None if held is None else held.design
+    gathered = command_of(gather).run(Job(), {"catalogues": catalogue, "instrument": instrument})
     return in_memory(gathered.value, ", ".join(map(str, catalogue))), gathered.warnings
 
 

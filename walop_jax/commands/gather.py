@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,6 +24,9 @@ ROTATOR = Option(
 )
 TOLERANCE = Option("Stars farther apart than that are not one (arcsec).", "ARCSEC", least=0.01)
 GAIN = Option("Electrons per count, where fluxes are in counts.", kind=float)
+WORDS = Option(
+    "Words of the header that are FILTER, MJD, CHWP_ANGLE, RA, …, as for exposures.", "WORDS.toml", Path
+)
 GAIA = Option("Table with RA, DEC, SOURCE_ID, BP_RP: who the stars are.", "TABLE", Path)
 
 
@@ -38,6 +43,7 @@ def gather(
     tolerance: Annotated[float, TOLERANCE] = 1.0,
     gain: Annotated[float | None, GAIN] = None,
     gaia: Annotated[Any, GAIA] = None,
+    words: Annotated[PathLike | None, WORDS] = None,
     instrument: InstrumentLike = None,
 ) -> Outcome[Any]:
     """Make one catalogue, a row a star, of those of the cameras.
@@ -52,6 +58,7 @@ def gather(
     >>> stars = walop.gather(["O1.fits", "E1.fits", "O2.fits", "E2.fits"], rotator=0.0)  # doctest: +SKIP
     """
     from walop_jax.data.camera_catalogues import read_camera_catalogue
+    from walop_jax.data.header_words import read_words
     from walop_jax.io.plain_tables import astropy_table, table_format, write_table
     from walop_jax.model.instrument import nominal_instrument
     from walop_jax.science.gathering import gather as gathered
@@ -65,8 +72,13 @@ def gather(
     if len(catalogues) != len(names):
         what = f"{len(catalogues)} catalogues for the {len(names)} cameras of {design.name}"
         raise UsageError(f"{what}: give those of {', '.join(names)}, in this order", "catalogues")
+    _check_order(catalogues, names)
+    for option, value in (("tolerance", tolerance), ("gain", gain)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise UsageError(f"{option} = {value} must be a number above 0", option)
     job.begin("reading")
-    cameras = [read_camera_catalogue(path, columns, gain) for path in catalogues]
+    rules = None if words is None else read_words(words)
+    cameras = [read_camera_catalogue(path, columns, gain, rules) for path in catalogues]
     pointing, pointing_remarks = _pointing(cameras, {"RA": ra, "DEC": dec, "ROTATOR": rotator})
     job.begin("matching")
     gathered_stars = gathered(cameras, names, pointing, tolerance)
@@ -96,17 +108,28 @@ def gather(
     )
 
 
+def _check_order(catalogues: Sequence[PathLike], names: Sequence[str]) -> None:
+    """Refuse a catalogue whose file has the name of another camera."""
+    for path, name in zip(catalogues, names, strict=True):
+        parts = set(re.split(r"[^A-Z0-9]+", Path(path).name.upper()))
+        if len(of := parts & {name.upper() for name in names}) == 1 and name.upper() not in of:
+            what = f"{path} is given in the place of camera {name}"
+            raise UsageError(
+                f"{what}: the order is {', '.join(names)}; rename it if it is of {name}", "catalogues"
+            )
+
+
 def _pointing(
     catalogues: Sequence[CameraCatalogue], given: dict[str, float | None]
 ) -> tuple[Pointing, list[str]]:
     """The pointing, as given, of the header, or of the WCS of an image, with a remark on the last."""
-    from walop_jax.data.camera_catalogues import centre_of
+    from walop_jax.data.camera_catalogues import angle_of, centre_of
     from walop_jax.io.errors import fail
     from walop_jax.sky.directions import Pointing
 
     first, remarks = catalogues[0], []
     numbers = {
-        name: _number(first.header.get(name)) if value is None else value for name, value in given.items()
+        name: angle_of(first, name) if value is None else float(value) for name, value in given.items()
     }
     missing = [name for name, value in numbers.items() if value is None]
     if missing and (from_wcs := centre_of(first.header)) is not None:
@@ -118,11 +141,14 @@ def _pointing(
         raise fail(
             f"has no {' and no '.join(missing)} in its header, and no WCS of an image",
             file=first.path,
-            advice=f"give {' '.join(f'--{name.lower()} …' for name in missing)} (deg)",
+            advice=f"give {' '.join(f'--{name.lower()} …' for name in missing)} (deg) to walop-jax gather",
         )
-    return Pointing(*(float(numbers[name]) for name in ("RA", "DEC", "ROTATOR"))), remarks  # pyright: ignore[reportArgumentType]
-
-
-def _number(value: Any) -> float | None:
-    """A number of a header; None where there is none, or a text (sexagesimal)."""
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+    values = [float(numbers[name]) for name in ("RA", "DEC", "ROTATOR")]  # pyright: ignore[reportArgumentType]
+    for name, value, limit in zip(("RA", "DEC", "ROTATOR"), values, (360.0, 90.0, 360.0), strict=True):
+        if not abs(value) <= limit:
+            raise fail(
+                f"{name} of the field centre is {value:g} deg",
+                file=first.path,
+                advice=f"at most {limit:g} deg",
+            )
+    return Pointing(*values), remarks

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import functools
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +22,7 @@ from walop_jax.commands.command import (
     text_file,
 )
 from walop_jax.commands.products import Effects, calibration_of, catalogue_of
+from walop_jax.commands.standards import LOWEST
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
@@ -143,10 +147,11 @@ def plan(
     )
     possible = Available.of(available)  # pyright: ignore[reportArgumentType]
     job.tell("information of exposures", "information")
+    possible = possible if schedule is None else possible.in_whole_seconds()
     with job.repeated() as say:
-        planned = plan_exposures(
-            possible if schedule is None else possible.in_whole_seconds(),
-            minutes,
+        best = functools.partial(
+            plan_exposures,
+            minutes=minutes,
             criterion=chosen,
             known=prior,
             goal=goal,
@@ -156,16 +161,20 @@ def plan(
             seed=job.seed,
             progress=say,
         )
+        planned = best(possible)
+        if possible.doubts(planned.observing_plan):
+            with contextlib.suppress(ValueError):  # then the plan is as it is, with its doubts
+                planned = best(dataclasses.replace(possible, throughout=minutes))
     described = planned.observing_plan.design.description
     files: Writers = {
         PLAN: text_file(plan_text(planned.observing_plan, INSTRUMENT if described else None)),
         INSTRUMENT: text_file(described) if described else None,
     }
-    remarks = () if schedule is None else _scheduled(job, planned.observing_plan, schedule, words)
+    remarks = () if schedule is None else scheduled(job, planned.observing_plan, schedule, words)
     return Outcome(planned, extra={"seed": job.seed}, files=files, saved_as=PLANNED, warnings=remarks)
 
 
-def _scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike | None) -> Sequence[str]:
+def scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike | None) -> Sequence[str]:
     """Write the exposures of a plan as a schedule; filters are numbered in their order unless words say otherwise."""
     from walop_jax.data.header_words import Words, read_words
     from walop_jax.data.schedule import schedule_of
@@ -177,21 +186,66 @@ def _scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike
     exposures = planned.exposures()
     _, star = planned.layout()
     stars = star.max(axis=0)
+    known, remarks = _real_standards(planned, exposures, stars)
+    ra, dec = exposures.ra.copy(), exposures.dec.copy()
+    for number, (_, *place) in known.items():
+        ra[stars == number], dec[stars == number] = place
+    exposures = dataclasses.replace(exposures, ra=ra, dec=dec)
     names = [
-        planned.star_names[s]
+        known[s][0]
+        if s in known
+        else planned.star_names[s]
         if s >= 0
         else f"Moon at {ra:.2f} {dec:+.2f}"
         if kind == "moon"
         else "calibration"
         for s, kind, ra, dec in zip(stars, exposures.kind, exposures.ra, exposures.dec, strict=True)
     ]
-    document, remarks = schedule_of(exposures, planned.site, numbers, facts=rules.schedule, names=names)
+    unpolarised = [name for number, (name, *_) in known.items() if number < planned.unpolarised]
+    document, further = schedule_of(
+        exposures, planned.site, numbers, facts=rules.schedule, names=names, unpolarised=unpolarised
+    )
+    remarks += further
     with atomic_path(path, overwrite=job.overwrite) as temporary:
         temporary.write_text(json_text(document), encoding="utf-8")
     if not rules.filters:
         listed = ", ".join(f"{name} {number}" for name, number in numbers.items())
         remarks.append(f"{path}: filters are numbered in their order ({listed}); --words gives other numbers")
     return remarks
+
+
+def _real_standards(
+    planned: ObservingPlan, exposures: Exposures, star: Any
+) -> tuple[dict[int, tuple[str, float, float]], list[str]]:
+    """Name, RA and DEC (deg) of a standard of the package for each of a plan, the highest at its time; and remarks.
+
+    Standards of a plan are stars of some place. Those for which none is up keep it.
+    """
+    import numpy as np
+
+    from walop_jax.data.standards import UNPOLARISED, shipped_standards
+    from walop_jax.sky.moon import altitude
+
+    table = shipped_standards()
+    table = table[np.unique(table["SOURCE"], return_index=True)[1]]
+    ra, dec = (np.asarray(table[name].to_value("deg"), float) for name in ("RA", "DEC"))
+    zero, chosen, missing = np.asarray(table["P"]) < UNPOLARISED, dict[int, tuple[str, float, float]](), []
+    for number in np.unique(star[star >= 0]).tolist():
+        times = exposures.mjd[star == number]
+        height = np.min([altitude(np.full(len(ra), mjd), ra, dec, planned.site) for mjd in times], axis=0)
+        taken = [name in {name for name, *_ in chosen.values()} for name in table["NAME"]]
+        height[taken | (zero != (number < planned.unpolarised))] = -90.0
+        best = int(height.argmax())
+        if number < planned.standards and height[best] >= LOWEST:
+            chosen[number] = (str(table["NAME"][best]), float(ra[best]), float(dec[best]))
+        else:
+            missing.append(planned.star_names[number])
+    of = [f"{planned.star_names[number]} is {name}" for number, (name, *_) in chosen.items()]
+    remarks = [f"standards of the package that are up: {', '.join(of)}"] if of else []
+    if missing:
+        what = f"{', '.join(missing)}: no standard of the package that is up; RA and Dec are of no star"
+        remarks.append(f"{what}: put yours in `objects`")
+    return chosen, remarks
 
 
 def _stood_at(exposures: Exposures, prefix: str) -> tuple[float | None, ...]:

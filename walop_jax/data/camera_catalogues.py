@@ -11,6 +11,7 @@ import dataclasses
 import os
 import re
 import typing
+from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -22,10 +23,19 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from jaxtyping import Float, Int
 
+from walop_jax.data.header_words import Words, of_header
 from walop_jax.data.schema import Column
 from walop_jax.data.table_files import read_table_file
 from walop_jax.data.units import Place, unit_of
-from walop_jax.data.user_tables import OF_STARS, InputTable, hints, in_memory, numeric_column
+from walop_jax.data.user_tables import (
+    OF_STARS,
+    InputTable,
+    column_of_stars,
+    empty_cells,
+    hints,
+    in_memory,
+    numeric_column,
+)
 from walop_jax.io.errors import DataError, rows_text
 from walop_jax.io.fits_reading import one_line, open_fits
 from walop_jax.io.text import parse_toml, read_text, some
@@ -35,11 +45,12 @@ SHIPPED = ("sextractor", "photutils")
 BITS = (1, 2, 4, 8, 16)
 """Bits of FLAG that a catalogue may set."""
 BAD_PIXEL = 2
+POINTING = ("RA", "DEC", "ROTATOR")
 OF_EXPOSURES = ("FILTER", "MJD", "TEMP", "HA", "CHWP_ANGLE", "CHWP_IN", "CHWP_TURN")
 """Columns, or words of a header, about the exposure: they go with its stars."""
 _LDAC, _HEADER = "LDAC_OBJECTS", "LDAC_IMHEAD"
 _FAINTEST_MAGNITUDE = 40.0
-_COUNTS = ("", "ct", "count", "adu", "electron")
+_COUNTS = ("", "ct", "count", "adu", "dn", "electron")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,8 +59,8 @@ class ColumnMap:
 
     `flux` are pairs of a flux and its error, `sky` pairs of right ascension and declination (or a column of
     coordinates of astropy), `pixel` pairs of coordinates that count from `first_pixel`. `bits` gives each bit of `flag`
-    the bit of FLAG that it stands for, 0 for none. `magnitude` are columns that are no fluxes. `unit` is that of fluxes
-    without one.
+    the bit of FLAG that it stands for, 0 for none. `level` are columns of the background that was subtracted,
+    `magnitude` columns that are no fluxes. `unit` is that of fluxes without one.
     """
 
     program: str
@@ -58,6 +69,7 @@ class ColumnMap:
     pixel: tuple[tuple[str, str], ...] = ()
     first_pixel: int = 1
     flag: tuple[str, ...] = ()
+    level: tuple[str, ...] = ()
     bits: Mapping[str, int] = dataclasses.field(default_factory=dict)
     magnitude: tuple[str, ...] = ()
     unit: str = "count"
@@ -65,10 +77,11 @@ class ColumnMap:
 
 @dataclasses.dataclass(frozen=True)
 class CameraCatalogue:
-    """The stars of one camera: positions (deg), fluxes with errors (counts), and bits of FLAG.
+    """The stars of one camera: positions (deg), fluxes with errors (electrons), level of the sky, and bits of FLAG.
 
-    `of_stars` are columns that go with the stars, `of_exposure` the values that all of them share; `header` is that of
-    the image, empty where the file has none. Fluxes that were not measured are NaN.
+    `flux_name` is the column of the fluxes; `sky` is None where no level is stated. `of_stars` are columns that go with
+    the stars, `of_exposure` the values that all of them share, `pointing` RA, DEC and ROTATOR as stated; `header` is
+    that of the image, empty where the file has none. Fluxes that were not measured are NaN.
     """
 
     path: Path
@@ -76,9 +89,12 @@ class CameraCatalogue:
     dec: Float[np.ndarray, " n"]
     flux: Float[np.ndarray, " n"]
     error: Float[np.ndarray, " n"]
+    flux_name: str
+    sky: Float[np.ndarray, " n"] | None
     flag: Int[np.ndarray, " n"]
     of_stars: Mapping[str, np.ndarray]
     of_exposure: Mapping[str, Any]
+    pointing: Mapping[str, Any]
     header: Mapping[str, Any]
     remarks: tuple[str, ...]
 
@@ -118,9 +134,14 @@ def read_map(source: str | os.PathLike[str]) -> ColumnMap:
 
 
 def read_camera_catalogue(
-    path: str | os.PathLike[str], columns: str | os.PathLike[str] | None = None, gain: float | None = None
+    path: str | os.PathLike[str],
+    columns: str | os.PathLike[str] | None = None,
+    gain: float | None = None,
+    words: Words | None = None,
 ) -> CameraCatalogue:
     """The catalogue of a camera, by a map of columns (None: the one of those that come with the package that fits).
+
+    `words` of the header of its image are columns about the exposure and its pointing, in place of those named so.
 
     `gain` is in electrons per count (None: that of the column's unit, else 1, with a remark). Fluxes are in electrons
     then.
@@ -129,23 +150,24 @@ def read_camera_catalogue(
     know, and where there is neither a position on the sky nor a WCS.
     """
     source, header = _table(Path(path))
-    place = Place(source.path, "")
+    place, stated = Place(source.path, ""), header
+    if words is not None:
+        stated = ChainMap(of_header(header, words, (*OF_EXPOSURES, *POINTING), source.path), header)
     maps = [read_map(columns)] if columns is not None else [read_map(name) for name in SHIPPED]
     column_map = next((candidate for candidate in maps if _pair(source, candidate.flux)), None)
     if column_map is None:
         raise _no_flux(source, maps, place)
-    flux, error = _fluxes(source, column_map, gain, place)
+    flux, error, factor = _fluxes(source, column_map, gain, place)
+    level = next((name.upper() for name in column_map.level if name.upper() in source.names), None)
     ra, dec = _positions(source, column_map, header, place)
     flag, remark = _flags(source, column_map, place)
     bad = ~(np.isfinite(flux) & np.isfinite(error) & (error > 0))
     of_stars = {}
-    for name, (unit, _) in OF_STARS.items():
-        kind = "str" if name == "SOURCE_ID" and source.column(name) is not None else "float"
+    for name in OF_STARS:
         if name in source.names:
-            missing = "" if kind == "str" else np.nan
-            of_stars[name] = numeric_column(source, name, Column(kind, unit, missing=missing))  # pyright: ignore[reportArgumentType]
+            of_stars[name] = column_of_stars(source, name)
     of_exposure = {
-        name: value for name in OF_EXPOSURES if (value := _of_all(source, header, name, place)) is not None
+        name: value for name in OF_EXPOSURES if (value := _of_all(source, stated, name, place)) is not None
     }
     if bad.any():
         source.remarks.append(f"{int(bad.sum())} of {len(bad)} fluxes have no error above 0: not used")
@@ -156,9 +178,12 @@ def read_camera_catalogue(
         dec=dec,
         flux=np.where(bad, np.nan, flux),
         error=np.where(bad, np.nan, error),
+        flux_name=_pair(source, column_map.flux)[0],
+        sky=None if level is None else factor * _plain_numbers(source, level, place),
         flag=np.where(bad, flag | BAD_PIXEL, flag),
         of_stars=of_stars,
         of_exposure=of_exposure,
+        pointing={name: stated.get(name) for name in POINTING},
         header=header,
         remarks=(*source.remarks, *remark, *hints(unused, ("TEFF", "N_FLAG"), unsure=False)),
     )
@@ -235,7 +260,8 @@ def _no_flux(source: InputTable, maps: Sequence[ColumnMap], place: Place) -> Exc
 
 def _fluxes(
     source: InputTable, column_map: ColumnMap, gain: float | None, place: Place
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]:
+    """Fluxes and errors (electrons), and electrons per count."""
     names = _pair(source, column_map.flux)
     unused = [pair[0] for pair in column_map.flux if pair != names and pair[0].upper() in source.names]
     values = []
@@ -248,16 +274,14 @@ def _fluxes(
                 per_time, "counts or electrons are needed, not magnitudes"
             )
             raise place.fail(f"has the unit {unit}", _plain(name)[0], advice)
-        plain = Column("float", missing=np.nan)
-        unitless = in_memory({name: np.ma.asarray(column)}, str(source.path))  # without its unit
-        values.append(numeric_column(unitless, name.upper(), plain))
+        values.append(_plain_numbers(source, name, place))
     flux, error = values
     unit = unit_of(_one(source, names[0], place)).strip().lower() or column_map.unit
     measured = np.isfinite(flux) & np.isfinite(error) & (error > 0)
     if (
         measured.any()
         and np.abs(flux[measured]).max() < _FAINTEST_MAGNITUDE
-        and np.median(error[measured] / np.abs(flux[measured])) < 0.1
+        and np.median(error[measured] - 0.1 * np.abs(flux[measured])) < 0.0
     ):
         low, high, typical = flux[measured].min(), flux[measured].max(), np.median(error[measured])
         what = f"lies between {low:.3g} and {high:.3g} with errors of {typical:.2g}: these are magnitudes"
@@ -269,7 +293,13 @@ def _fluxes(
     if unused:
         source.remarks.append(f"fluxes are {names[0]}, not {some(unused, 3)}")
     factor = 1.0 if gain is None or unit == "electron" else gain
-    return factor * flux, factor * error
+    return factor * flux, factor * error, factor
+
+
+def _plain_numbers(source: InputTable, name: str, place: Place) -> Float[np.ndarray, " n"]:
+    """A column without its unit."""
+    unitless = in_memory({name: np.ma.asarray(_one(source, name, place))}, str(source.path))
+    return numeric_column(unitless, name.upper(), Column("float", missing=np.nan))
 
 
 def _positions(
@@ -355,6 +385,7 @@ def _flags(
     if name is None:
         return flag, ("no flags of the stars: blends and saturated ones are not known",)
     values = numeric_column(source, name, Column("int", missing=0)).astype(np.int64)
+    empty = int(empty_cells(source, name, Column("int", missing=0)).sum())
     undefined = values.copy()
     for bit, meaning in column_map.bits.items():
         flag |= np.where(values & int(bit) > 0, meaning, 0)
@@ -365,7 +396,7 @@ def _flags(
         raise place.fail(
             what, name, "say what its bits mean in a map of columns: --columns FILE.toml, table [bits]"
         )
-    return flag, ()
+    return flag, (f"{name} is empty in {empty} rows: taken as good",) if empty else ()
 
 
 def _of_all(source: InputTable, header: Mapping[str, Any], name: str, place: Place) -> Any:
@@ -377,6 +408,23 @@ def _of_all(source: InputTable, header: Mapping[str, Any], name: str, place: Pla
     if len(values) > 1:
         raise place.fail("is not the same in all rows", name, "give the catalogue of one exposure")
     return values[0] if len(values) else None
+
+
+def angle_of(catalogue: CameraCatalogue, name: str) -> float | None:
+    """An angle of the pointing (deg): a number, or a text in hours (RA) or degrees; None: none is stated."""
+    value = catalogue.pointing[name]
+    if value is None or isinstance(value, bool) or value == "":
+        return None
+    try:
+        return float(value)
+    except ValueError:
+        pass
+    try:
+        angle: Any = Angle(str(value), unit="hourangle" if name == "RA" else "deg").deg
+        return float(angle)
+    except ValueError:
+        advice = f"give --{name.lower()} (deg) to walop-jax gather, or the word that holds it (--words)"
+        raise Place(catalogue.path, "header").fail(f"{value!r} is no angle", name, advice) from None
 
 
 def centre_of(header: Mapping[str, Any]) -> dict[str, float] | None:

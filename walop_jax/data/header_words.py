@@ -13,7 +13,7 @@ import math
 import operator
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +136,22 @@ def exposures_table(
     absent = [name for name in EXPOSURES if name not in columns and not _MOVES.fullmatch(name)]
     remarks = [f"no word for {', '.join(absent)}: taken as not known"] if absent else []
     return table | {"FILE": np.array([file for file, _ in records])}, remarks
+
+
+def of_header(
+    header: Mapping[str, Any], words: Words, names: Collection[str], file: str | os.PathLike[str]
+) -> dict[str, Any]:
+    """The columns `names` that `words` make of one header, those that have a word."""
+    wanted = {name: word for name, word in words.columns.items() if name in names}
+    used = {
+        other
+        for word in wanted.values()
+        if word.expression
+        for other in _names(word.expression, Reader(""), "")
+    }
+    needed = wanted | {name: word for name, word in words.columns.items() if name in used}
+    row = _row({key: header[key] for key in dict.fromkeys(header) if key}, Words(needed), str(file))
+    return {name: value for name, value in row.items() if name in wanted}
 
 
 # ------------------------------------------------------------------------------------------------ files and records

@@ -13,13 +13,13 @@ import itertools
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
-from walop_jax.data.records import Exposures, Position, Site, Sources
+from walop_jax.data.records import Exposures, Position, Site
 from walop_jax.data.units import sexagesimal
 from walop_jax.io.errors import fail
 from walop_jax.io.text import read_text
@@ -36,7 +36,6 @@ FASTEST = 3.0  # turns per minute
 MOST_FILTERS = 4
 SLACK = 30.0  # minutes that a window is longer than its exposures, on both sides
 ALIKE = 180.0  # deg after which a wave plate is the same again
-UNPOLARISED = 0.005
 ELEMENTS = {CALIBRATION_PLATE: "hwp", POLARISER: "polarizer"}
 
 
@@ -52,18 +51,15 @@ def schedule_of(
     *,
     facts: Mapping[str, str] | None = None,
     names: Sequence[str] | None = None,
-    sources: Sources | None = None,
+    unpolarised: Collection[str] = (),
 ) -> tuple[dict[str, Any], list[str]]:
-    """The schedule of exposures in their order, and remarks; `names` are those of their targets.
+    """The schedule of exposures in their order, and remarks; `names` are those of their targets, some `unpolarised`.
 
     `facts` are name, pi, observer, mode. Raises `DataError` for exposures that no schedule can hold: more than four
     filters, other moving elements, a turn that is not one of half turns or faster than three turns a minute.
     """
     facts, remarks = dict(facts or {}), list[str]()
     _check(exposures, filters)
-    unpolarised = set() if sources is None else {
-        str(n) for n, q, u in zip(sources.name, sources.q, sources.u, strict=True) if math.hypot(q, u) < UNPOLARISED
-    }  # fmt: skip
     rows = [_acquired(exposures[e : e + 1], filters) for e in range(len(exposures))]
     rounded = [float(t) for t in exposures.exptime if t != round(t) or t < 1]
     if rounded:

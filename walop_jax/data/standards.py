@@ -17,6 +17,8 @@ USUAL_SCATTER = 0.27
 """Degrees, the smallest variability of an angle that was found (Cotton et al. 2024, arXiv:2410.23466)."""
 
 POLARISED = 3.0  # errors
+UNPOLARISED = 0.005
+"""Largest p of a standard of zero polarisation."""
 
 
 def shipped_standards() -> Any:

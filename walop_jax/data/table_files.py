@@ -49,6 +49,11 @@ def read_table_file(path: Path, needed: Collection[str]) -> tuple[Path, Any, tup
                 return path, *_from_fits(path, extension, needed)
             if _begins(path, _SEXTRACTOR):
                 return path, _astropy_table(_content(path)[0].decode(), "ascii.sextractor"), ()
+            if path.suffix.lower() in (".cat", ".ldac"):
+                what = (
+                    "begins neither as ASCII_HEAD nor as FITS_LDAC of SExtractor: its columns have no names"
+                )
+                raise fail(what, file=path, advice="write it again with one of these as CATALOG_TYPE")
             kind = "" if path.suffix.lower() == ".zip" else _format(path)
             if kind == "fits":
                 return path, *_from_fits(path, extension, needed)

@@ -182,6 +182,28 @@ def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
     return np.full(source.rows, rule.missing)
 
 
+def column_of_stars(source: InputTable, name: str) -> np.ndarray:
+    """A column of `OF_STARS`: numbers (NaN: unknown), identifiers as texts ("": unknown)."""
+    unit, _ = OF_STARS[name]
+    if name != "SOURCE_ID":
+        return numeric_column(source, name, Column("float", unit, missing=np.nan))
+    values, empty, _ = plain_column(source.column(name), name, Column("str"), Place(source.path, ""))
+    refuse_rounded(values, empty, name, Place(source.path, ""))
+    if values.dtype.kind == "f":
+        whole = np.isfinite(values) & ~empty
+        return np.where(whole, np.where(whole, values, 0).astype(np.int64).astype(str), "").astype(object)
+    return numeric_column(source, name, Column("str", missing=""))
+
+
+def refuse_rounded(values: np.ndarray, missing: np.ndarray, name: str, place: Place) -> None:
+    """Refuse identifiers that are floats too large to be distinct."""
+    if values.dtype.kind == "f":
+        digits = np.finfo(values.dtype).nmant + 1
+        what = f"is a float beyond 2**{digits}, where neighbouring numbers are one"
+        advice = "write identifiers as integers or as text"
+        place.refuse(~missing & (np.abs(values) >= 2.0**digits), what, name, advice)
+
+
 def _what_is_there(source: InputTable) -> str:
     return f"the table has {some([str(name) for name in source.table.colnames], _LISTED)}"
 

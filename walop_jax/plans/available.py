@@ -119,8 +119,9 @@ class Available:
 
     `seconds` are exposure times to choose from, by kind; pointings lower than `altitude` (deg) are left out; `places`
     takes standards at single places of their raster, not at all of them for the cost of one. With `any_plate` the
-    calibration plate may stand at any angle behind the polariser, besides its settings in the plan. Raises ValueError
-    for values that contradict each other.
+    calibration plate may stand at any angle behind the polariser, besides its settings in the plan. Targets must be up
+    in the dark when the sky is first observed, and for `throughout` minutes from then on. Raises ValueError for values
+    that contradict each other.
     """
 
     plan: ObservingPlan
@@ -129,6 +130,7 @@ class Available:
     altitude: float = 20.0
     places: bool = False
     any_plate: bool = False
+    throughout: float = 0.0
 
     def __post_init__(self) -> None:
         check_names("kind of exposure", self.seconds, EXPOSED)
@@ -219,6 +221,12 @@ class Available:
             stars=(),
         ).exposures()
         visible, why = self._visible(e)
+        if self.throughout and visible.any():
+            # Standards are chosen when their time has come: only the Moon has a place.
+            last = dataclasses.replace(e, mjd=np.full(total, plan.start + self.throughout / 1440.0))
+            high, dark = self._high_and_dark(last)
+            visible &= dark & (high | (kind == "standard"))
+            why = f"they cannot be observed for all of the {self.throughout:g} minutes"
         if visible.all():
             return tuple(range(total)), []
         lost = total - int(visible.sum())
@@ -227,16 +235,17 @@ class Available:
 
     def _visible(self, exposures: Exposures) -> tuple[Bool[np.ndarray, " e"], str]:
         """Exposures of the sky that are high enough, in the dark; and why others are not."""
-        mjd, site = exposures.mjd, self.plan.site
-        high = altitude(mjd, exposures.ra, exposures.dec, site) >= self.altitude
-        dark = altitude(mjd, *body_direction("sun", mjd, site), site) < DARK
+        high, dark = self._high_and_dark(exposures)
         return high & dark, "it is not dark" if not dark.all() else f"they are below {self.altitude:g}°"
 
-    def doubts(self, plan: ObservingPlan) -> tuple[str, ...]:
-        """Sentences on exposures of a plan that cannot be taken at the times that it gives them.
+    def _high_and_dark(self, exposures: Exposures) -> tuple[Bool[np.ndarray, " e"], Bool[np.ndarray, " e"]]:
+        """Exposures with a target that is high enough, and those in the dark."""
+        mjd, site = exposures.mjd, self.plan.site
+        high = altitude(mjd, exposures.ra, exposures.dec, site) >= self.altitude
+        return high, altitude(mjd, *body_direction("sun", mjd, site), site) < DARK
 
-        Visibility is checked at the begin of the night, before the order of the exposures is known.
-        """
+    def doubts(self, plan: ObservingPlan) -> tuple[str, ...]:
+        """Sentences on exposures of a plan that cannot be taken at the times that it gives them."""
         exposures = plan.exposures()
         exposures = exposures[exposures.direct("moon", "standard")]
         if not len(exposures) or not plan.site.known:

@@ -330,6 +330,7 @@ def plan_from(
         stops=tuple(chosen.choices[line.choice].stop(line.place, line.times) for line in lines),
         patches=(),
         stars=(),
+        spacing=round(minutes / max(sum(line.times for line in lines), 1), 3),
     )
     # Earlier measurements may hold what these lack.
     unseen = () if known is not None else tuple(map(str, about_exposures(plan.exposures())))

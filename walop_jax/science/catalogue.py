@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, plain_column
 from walop_jax.data.table_intensities import equal_rows
 from walop_jax.data.units import Place
-from walop_jax.data.user_tables import OF_STARS, InputTable, numeric_column, vector_columns
+from walop_jax.data.user_tables import OF_STARS, InputTable, numeric_column, refuse_rounded, vector_columns
 from walop_jax.io.errors import rows_text
 from walop_jax.model.instrument import Instrument
 from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
@@ -229,11 +229,8 @@ def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndar
     if values.ndim != 1:
         raise place.fail(f"has shape {values.shape[1:]} in a row, one value is needed", "ID", "split it")
     if values.dtype.kind == "f":
-        largest = 2.0 ** (np.finfo(values.dtype).nmant + 1)
         missing = missing | np.isnan(values)
-        what = f"is a float beyond 2**{np.finfo(values.dtype).nmant + 1}, where neighbouring numbers are one"
-        advice = "write identifiers as integers or as text"
-        place.refuse(~missing & (np.abs(values) >= largest), what, "ID", advice)
+        refuse_rounded(values, missing, named, place)
     if values.dtype.kind in "iuf":
         unknown = ~missing & ((values < 0) | (values == np.iinfo(np.uint64).max))
     else:

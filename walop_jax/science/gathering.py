@@ -8,6 +8,7 @@ each other in both lists, within a tolerance; one with two candidates is ambiguo
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -17,13 +18,30 @@ from jaxtyping import Bool, Float, Int
 
 from walop_jax.data.camera_catalogues import CameraCatalogue, sky_positions
 from walop_jax.data.schema import Column
-from walop_jax.data.user_tables import OF_STARS, in_memory, numeric_column, read_input_table
+from walop_jax.data.user_tables import (
+    OF_STARS,
+    column_of_stars,
+    in_memory,
+    numeric_column,
+    read_input_table,
+)
 from walop_jax.io.errors import fail
-from walop_jax.sky.directions import NOT_MOVED, REACH, Pointing, Registration, mutual, registered
+from walop_jax.sky.directions import (
+    FEWEST_REGISTERED,
+    NOT_MOVED,
+    REACH,
+    Pointing,
+    Registration,
+    mutual,
+    registered,
+)
 
 BLEND = 8  # bit of N_FLAG
 FEWEST = 0.2  # of the stars of a camera must be those of the others
 MISSING = 0.2  # of the stars that all others see, from which on a camera is remarked on
+SAME_FLUXES = 0.5  # of the stars of two cameras: one is a copy of the other
+APART = 0.01  # d, between catalogues of one exposure
+DIGITS = 1e-3  # to which cameras agree on a number of a star
 FARTHEST = 1.0  # deg: the median star of the field is nearer to its centre
 Columns = dict[str, tuple[np.ndarray, str, str]]
 """Values, unit and description of columns by name."""
@@ -51,6 +69,12 @@ def gather(
 
     Raises `DataError` for catalogues of different fields, and for those that have too few stars in common.
     """
+    if len(fluxes := {camera.flux_name: camera for camera in catalogues}) > 1:
+        what = " and ".join(f"{name} ({camera.path})" for name, camera in fluxes.items())
+        raise fail(
+            f"cameras have different fluxes: {what}",
+            advice="one kind of flux, in one aperture, is needed of all cameras: name it with --columns",
+        )
     places = [_place(camera, pointing) for camera in catalogues]
     moves = _registrations(catalogues, places, tolerance)
     texts = dict.fromkeys(text for camera in catalogues for text in camera.remarks)
@@ -63,6 +87,7 @@ def gather(
     index, ambiguous, place = _matched(places, tolerance)
     detected = index >= 0
     _check_common(catalogues, detected, tolerance)
+    _check_distinct(catalogues, index)
     keep = detected.sum(axis=1) >= max(len(catalogues) - 1, min(len(catalogues), 2))
     if dropped := int(np.sum(~keep)):
         remarks.append(f"{dropped} stars that too few cameras see are left out of {len(keep)}")
@@ -91,6 +116,8 @@ def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
     source = (
         read_input_table(table, ("RA", "DEC")) if isinstance(table, str | os.PathLike) else in_memory(table)
     )
+    if not set(OF_STARS) & set(source.names):
+        raise fail(f"has none of {', '.join(OF_STARS)}", file=source.path, advice="name its columns so")
     ra, dec = sky_positions(source)
     near = made.pointing.separation(ra, dec) < FARTHEST
     reference = np.stack(made.pointing.field_of(ra[near], dec[near]), axis=1)
@@ -98,7 +125,7 @@ def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
     bright = np.nan_to_num(np.nansum(made.columns["N"][0], axis=1))
     magnitude = numeric_column(source, "PHOT_G_MEAN_MAG", Column("float", missing=np.nan))[near]
     move = registered(place, reference, bright, np.nan_to_num(-magnitude, nan=-np.inf), tolerance)
-    if not move.pairs:
+    if not move.pairs and (not len(reference) or min(len(place), len(reference)) >= FEWEST_REGISTERED):
         what = f"has no stars in common with the cameras within {REACH / 60.0:g} arcmin"
         raise fail(what, file=source.path, advice="is it of this field? RA and DEC are in degrees")
     _, stars, rows = mutual(move.apply(place), reference, tolerance)
@@ -106,9 +133,8 @@ def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
     for name, (unit, about) in OF_STARS.items():
         if name in source.names:
             texts = name == "SOURCE_ID"
-            rule = Column("str", missing="") if texts else Column("float", unit, missing=np.nan)
             values = np.full(len(place), "" if texts else np.nan, object if texts else float)
-            values[stars] = numeric_column(source, name, rule)[near][rows]
+            values[stars] = column_of_stars(source, name)[near][rows]
             columns[name] = (_whole(values) if texts else values, unit, about)
     remarks = [f"{len(stars)} of {len(place)} stars are in {source.path}"]
     if np.hypot(*move.shift) > 0.5 * tolerance:
@@ -139,7 +165,7 @@ def _registrations(
     first, moves = catalogues[0], [NOT_MOVED]
     for camera, place in zip(catalogues[1:], places[1:], strict=True):
         move = registered(place, places[0], _brightness(camera), _brightness(first), tolerance)
-        if not move.pairs:
+        if not move.pairs and min(len(place), len(places[0])) >= FEWEST_REGISTERED:
             apart = 60.0 * np.hypot(*(np.median(place, axis=0) - np.median(places[0], axis=0)))
             what = f"has no stars in common with {first.path} within {REACH / 60.0:g} arcmin"
             where = f" (their centres are {apart:.2g} arcmin apart)" if apart > 1.0 else ""
@@ -212,6 +238,20 @@ def _check_common(
             )
 
 
+def _check_distinct(catalogues: Sequence[CameraCatalogue], index: Int[np.ndarray, "s k"]) -> None:
+    """Refuse a camera with the fluxes of another one: noise does not repeat."""
+    for first, second in itertools.combinations(range(len(catalogues)), 2):
+        both = index[(index[:, [first, second]] >= 0).all(axis=1)]
+        one, other = (catalogues[k].flux[both[:, k]] for k in (first, second))
+        measured = np.isfinite(one) & np.isfinite(other) & (one != 0)
+        if np.sum(one[measured] == other[measured]) > max(SAME_FLUXES * measured.sum(), 1):
+            raise fail(
+                f"has the fluxes of {catalogues[first].path}: it is the same catalogue",
+                file=catalogues[second].path,
+                advice="give that of each camera once",
+            )
+
+
 def _columns(
     catalogues: Sequence[CameraCatalogue],
     pointing: Pointing,
@@ -242,6 +282,12 @@ def _columns(
             "bits of each camera, 0 is good",
         ),
     }
+    if levels := [camera.sky for camera in catalogues if camera.sky is not None]:
+        if len(levels) < len(catalogues):
+            raise fail(
+                "only some cameras have a level of the sky", column="SKY", advice="give it for all, or none"
+            )
+        columns["SKY"] = (of_cameras(levels, np.nan), "", "level of the sky that was subtracted, electrons")
     remarks = []
     for name, (unit, about) in OF_STARS.items():
         with_column = [k for k, camera in enumerate(catalogues) if name in camera.of_stars]
@@ -263,12 +309,12 @@ def _columns(
             )
         columns[name] = (_whole(values) if texts else values, unit, about)
     for name in sorted({name for camera in catalogues for name in camera.of_exposure}):
-        each_camera = {str(camera.of_exposure.get(name)) for camera in catalogues}
-        if len(each_camera) > 1 and name != "MJD":
-            raise fail(
-                f"{name} is {' and '.join(sorted(each_camera))} in catalogues of one exposure",
-                advice="correct it",
-            )
+        stated = [camera.of_exposure.get(name, "not stated") for camera in catalogues]
+        if name == "MJD":
+            stated = [time for time in stated if time != "not stated"]
+        if np.ptp(np.array(stated, float)) > APART if name == "MJD" else len(set(map(str, stated))) > 1:
+            listed = " and ".join(sorted(set(map(str, stated))))
+            raise fail(f"{name} is {listed} in catalogues of one exposure", advice="correct it")
         value = next(camera.of_exposure[name] for camera in catalogues if name in camera.of_exposure)
         columns[name] = (np.full(len(ra), value), "", "of the exposure")
     return columns, remarks
@@ -280,7 +326,9 @@ def _agreed(values: np.ndarray, texts: bool) -> tuple[np.ndarray, Bool[np.ndarra
     first = np.where(stated.any(axis=1), stated.argmax(axis=1), 0)
     value = values[np.arange(len(values)), first]
     same = (
-        values == value[:, None] if texts else np.isclose(values.astype(float), value.astype(float)[:, None])
+        values == value[:, None]
+        if texts
+        else np.isclose(values.astype(float), value.astype(float)[:, None], rtol=DIGITS, atol=DIGITS)
     )
     differ = np.asarray(np.any(stated & ~same, axis=1))
     return np.where(differ, "" if texts else np.nan, value), differ

@@ -36,7 +36,7 @@ from walop_jax.sky.moon import body_direction, local_sidereal_time, offset_direc
 NAN = float("nan")
 _SOME_NIGHT = 61041.9  # MJD
 NARROW_BANDS: Mapping[str, float] = {"NB-580": 0.580, "NB-660": 0.660}  # centre, µm
-_SPACING = 0.004  # d between exposures
+_MINUTES_A_DAY = 1440.0
 _GOLDEN = 0.5 * (3.0 - np.sqrt(5.0))  # of a turn: spreads any number of angles evenly
 _ZERO_EDGE = 0.9  # of the field
 _SPREAD = 1.0 / 1.324717957244746 ** np.array([1.0, 2.0])  # Roberts 2018: evenly in two dimensions
@@ -112,7 +112,8 @@ class ObservingPlan:
     The polariser goes through `polariser_angles` (deg) for each of `filters` and each setting of the calibration
     plate in `plate` (deg, None: out); Moon patches and standards take the settings in turn, in the first filter.
     `filters` are names of those that are built in, and `FilterCurve`s; also a dict of curves by name. The Moon is
-    observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after.
+    observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after; exposures are
+    `spacing` minutes apart.
     `star_lmax` are the wavelengths (µm) of largest polarisation of the polarised standards, in turn: these are then
     observed in every filter, and the catalogue has their values in the first one; none: they are observed in that one,
     unless stops say, and have 0.55 µm. After them come `zero_exposures` of a field of `zero_stars` stars that are all
@@ -154,6 +155,7 @@ class ObservingPlan:
     teff: float = 5772.0
     temperature: tuple[float, float] = (12.0, 8.0)
     mjd: float | None = None
+    spacing: float = 5.76
     throughput_degree: int | None = None
     moving: Mapping[str, tuple[float | None, ...]] = dataclasses.field(default_factory=dict)
     lamps: int = 0
@@ -191,6 +193,8 @@ class ObservingPlan:
             raise ValueError("numbers of Moon patches and standards cannot be negative")
         if any(not 0.3 <= lmax <= 1.0 for lmax in self.star_lmax):
             raise ValueError(f"star_lmax = {list(self.star_lmax)}: give wavelengths from 0.3 to 1.0 um")
+        if not 0 < self.spacing < np.inf:
+            raise ValueError(f"spacing = {self.spacing}: give minutes above 0")
         if not self.electrons > 0:
             raise ValueError(f"{self.electrons} electrons: a camera needs some light")
         if not (self.filters and self.plate):
@@ -268,6 +272,7 @@ class ObservingPlan:
         # Named only where there are any: plans of other instruments read as they always did.
         fields["stops"] = [stop.document() for stop in self.stops]
         later = {"moving": {}, "lamps": 0, "stops": [], "patches": None, "stars": None, "star_lmax": ()}
+        later |= {"spacing": type(self).spacing}
         later |= {name: getattr(type(self), name) for name in fields if name.startswith("zero_")}
         return {key: value for key, value in fields.items() if key not in later or value != later[key]}
 
@@ -363,7 +368,7 @@ class ObservingPlan:
         number = np.array([stop.number for stop in stops])
         moon, star = np.flatnonzero(kind == "moon"), np.flatnonzero(kind == "standard")
         sky = np.append(moon, star)
-        mjd = self.start + _SPACING * (np.arange(n) - (sky.min() if len(sky) else n))
+        mjd = self.start + self.spacing / _MINUTES_A_DAY * (np.arange(n) - (sky.min() if len(sky) else n))
         ra, dec, rotator = np.full((3, n), NAN)
         if len(moon):
             ra[moon], dec[moon] = self._patches(mjd[moon], number[moon])

@@ -138,6 +138,8 @@ class Registration:
 
 
 NOT_MOVED = Registration(np.zeros(2), 0.0, 0)
+FEWEST_REGISTERED = 3
+"""Stars that a peak needs; positions of fewer are taken as they are."""
 BRIGHTEST = 300
 """Stars by which positions are registered."""
 REACH = 300.0  # arcsec: a larger shift is taken for another field
@@ -168,12 +170,16 @@ def registered(
     count = count + np.roll(count, 1, 0)  # a peak may lie on the edges of four cells
     count = count + np.roll(count, 1, 1)
     peak, chance = np.unravel_index(count.argmax(), count.shape), count.mean()
-    if count.max() < max(3.0, chance + 6.0 * np.sqrt(chance), 0.05 * min(len(bright), len(bright_reference))):
+    if count.max() < max(
+        float(FEWEST_REGISTERED),
+        chance + 6.0 * np.sqrt(chance),
+        0.05 * min(len(bright), len(bright_reference)),
+    ):
         return NOT_MOVED
     registration = Registration(np.array([edges[k] for k in peak]), 0.0, int(count.max()))
     for radius in np.geomspace(2.0 * _CELL, max(3.0 * tolerance, 1.0), _ROUNDS):
         _, rows, matches = mutual(registration.apply(bright), bright_reference, radius)
-        if len(rows) < 3:
+        if len(rows) < FEWEST_REGISTERED:
             break
         registration = _fitted(bright[rows], bright_reference[matches])
     return registration
