@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from walop_jax.commands import COMMANDS, GROUPS, INTERRUPTED
+from walop_jax.commands import COMMANDS, GROUPS, INTERRUPTED, line_of
 from walop_jax.commands.command import COMMON, Argument, Command, Job, Option, Outcome, UsageError, command_of
 from walop_jax.io.progress import interrupts_answered
 
@@ -70,9 +70,9 @@ class _Commands(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """The list, group by group."""
         width = max(map(len, COMMANDS))
-        for title, commands in GROUPS.items():
+        for title, names in GROUPS.items():
             with formatter.section(title):
-                formatter.write_dl([(f"{name:<{width}}", line) for name, line in commands.items()])
+                formatter.write_dl([(f"{name:<{width}}", line_of(name)) for name in names])
 
 
 app = typer.Typer(
@@ -142,8 +142,7 @@ def _command(name: str) -> Any:
     word = name.replace("-", "_")
     command: Command[Any] = command_of(getattr(importlib.import_module(f"walop_jax.commands.{word}"), word))
     alone = typer.Typer(add_completion=False, rich_markup_mode=None)
-    page, line = _paragraphs(command.body), COMMANDS[name]
-    alone.command(name, context_settings=HELP, help=page, short_help=line)(_function(command))
+    alone.command(name, context_settings=HELP, help=_paragraphs(command.body))(_function(command))
     return typer.main.get_command(alone)
 
 
