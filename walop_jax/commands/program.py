@@ -151,7 +151,7 @@ def _function(command: Command[Any]) -> Callable[..., None]:
     defaults = {p.name: p.default for p in inspect.signature(command.body).parameters.values()}
     defaults["elements"] = None
     parameters = [_parameter(name, option, defaults[name]) for name, option in command.options.items()]
-    for name, (default, option) in COMMON.items():
+    for name, (default, _, option) in COMMON.items():
         if option is not None and (name != "overwrite" or command.writes is not None):
             parameters.append(_parameter(name, option, default, name == "seed" and not command.random))
     parameters += [_parameter("quiet", QUIET, False), _parameter("json", JSON, False)]
