@@ -184,7 +184,7 @@ def test_the_core_is_reached_without_the_rest(entry):
 MOST_LINES = {
     "io": 1635,
     "instruments": 250,
-    "data": 5920,
+    "data": 5965,
     "sky": 455,
     "model": 9770,
     "likelihood": 3380,
@@ -198,7 +198,7 @@ MOST_LINES = {
     "plans": 2375,
     "paper": 870,
     "reports": 3085,
-    "commands": 4860,
+    "commands": 4880,
 }
 """Lines of each room: raising one is a decision of its own."""
 

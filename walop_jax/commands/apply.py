@@ -41,6 +41,8 @@ COMMON = Option(
 DEBIAS = Option("Estimator of P_DEBIASED: Plaszczynski et al. 2014, or Wardle and Kronberg 1974.", "MAS|WK")
 SATURATION = Option("Counts from here on are not used (FLAG 256).", "ELECTRONS", float)
 BRIGHT = 1000.0  # electrons: their errors are a few per cent, with a read noise of 100 electrons a tenth
+FEW = 0.5  # of the rows
+QUIET = 0.02  # of the variance of photons: what a mean of fifty exposures has
 APART = 0.005  # deg: rows of one star that lie farther apart may be those of two
 FORCE = Option("Also stars whose filter or temperature it does not cover (FLAG 2048).")
 
@@ -154,7 +156,7 @@ def apply(
         warnings=[
             *gathering_remarks,
             *doubts,
-            *_about_noise(rows.counts, rows.sigma),
+            *about_counts(rows.counts, rows.sigma, instrument.cameras.names),
             *_about_places(rows, stars.flag),
             *([] if seen_twice is None else seen_twice.warnings()),
         ],
@@ -224,9 +226,21 @@ def _counted(alone: bool) -> dict[Any, str]:
     }
 
 
-def _about_noise(counts: Any, sigma: Any) -> Iterator[str]:
-    """A sentence where errors of bright stars are as large as their counts."""
+def about_counts(counts: Any, sigma: Any, names: Sequence[str]) -> Iterator[str]:
+    """Sentences on errors that are none of counts, and on cameras that are hardly used."""
     import numpy as np
+
+    used = np.isfinite(counts)
+    for name, of_camera in zip(names, used.T, strict=True):
+        if used.any() and of_camera.mean() < FEW:
+            what = "N is negative, flagged, saturated or NaN in the others"
+            yield f"{name} is used in {int(of_camera.sum())} of {len(counts)} rows: {what}"
+    lit = used & (counts > 0)
+    if lit.any() and (share := float(np.median(sigma[lit] ** 2 / counts[lit]))) < QUIET:
+        yield (
+            f"N_ERR is {share**-0.5:.2g} times smaller than the noise of photons: is N in electrons? Magnitudes, rates "
+            "and means of exposures are not"
+        )
 
     bright = counts > BRIGHT
     if bright.any() and (share := float(np.median(sigma[bright] / counts[bright]))) > 0.5:
