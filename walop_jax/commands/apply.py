@@ -184,7 +184,7 @@ def _table_of(catalogue: Any, held: Calibration | None) -> tuple[InputTable, Seq
 
     instrument = None if held is None else held.design
     gathered = command_of(gather).run(Job(), {"catalogues": catalogue, "instrument": instrument})
-    return in_memory(gathered.value, ", ".join(map(str, catalogue))), gathered.warnings
+    return in_memory(gathered.value, "stars of the cameras"), gathered.warnings
 
 
 def _common(made: Any) -> tuple[Any, Sequence[str]]:
