@@ -23,7 +23,7 @@ from walop_jax.model.conventions import FIELD_SCALE
 from walop_jax.model.effects.base import Context, Effect, Scalar, numbered_camera
 from walop_jax.model.effects.change import Change
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import param
+from walop_jax.model.parameters import as_number, param
 
 SOURCE = "dust near a focal plane, or a damaged coating: expected size"
 
@@ -87,14 +87,11 @@ class Blemish(Effect):
     @classmethod
     def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
         """Spots on a grid over the field, in any of the cameras."""
-        places, scale = (
-            itertools.product(range(len(context.cameras)), GRID, GRID),
-            context.units.field / FIELD_SCALE,
-        )
-        return tuple(
-            (cls.of(context, camera=camera, x=scale * x, y=scale * y, size=scale * SIZE),)
-            for camera, x, y in places
-        )
+        scale = context.units.field / FIELD_SCALE
+        neutral, places = cls.of(context, size=scale * SIZE), [as_number(scale * place) for place in GRID]
+        cameras = range(len(context.cameras))
+        spots = itertools.product(cameras, places, places)
+        return tuple((neutral.replaced(camera=camera, x=x, y=y),) for camera, x, y in spots)
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
         """A gain of the camera with the pattern of the spot."""
