@@ -151,7 +151,7 @@ def apply(
         counted=counted_flags(rows, used.model.template),
         warnings=[
             *gathering_remarks,
-            *sentences(rows, stars),
+            *sentences(rows, stars, instrument.cameras.names),
             *([] if seen_twice is None else seen_twice.warnings()),
         ],
         remade=_common if common else None,
@@ -179,7 +179,7 @@ def _table_of(catalogue: Any, held: Calibration | None) -> tuple[InputTable, Seq
 
     instrument = None if held is None else held.design
     gathered = command_of(gather).run(Job(), {"catalogues": catalogue, "instrument": instrument})
-    return in_memory(gathered.value, ", ".join(map(str, catalogue))), gathered.warnings
+    return in_memory(gathered.value, "stars of the cameras"), gathered.warnings
 
 
 def _common(made: Any) -> tuple[Any, Sequence[str]]:
