@@ -41,7 +41,7 @@ FIT = Display(
 )
 """What `refit` displays."""
 FOUND = Display(
-    "Diagnosis: effect_found; fit trusted",
+    "Diagnosis: effect found; fit trusted",
     (("found", "clp_wobble"), ("χ²/dof", "1.625 → 1.029")),
     ("effect", "parameter", ">value", ">error", "unit", ">p"),
     (("clp_wobble", "amplitude", "0.0613", "0.0012", "deg", "2.1 × 10⁻⁷"),),

@@ -162,6 +162,16 @@ def test_wrong_usage(call, args):
     assert call(*args).exit_code == 2
 
 
+@pytest.mark.parametrize(
+    ("name", "advice"), [("sample", "writes into the folder"), ("inspect", "prints its result")]
+)
+@pytest.mark.parametrize("option", ["-o", "--output", "--out"])
+def test_commands_without_an_output_advise(call, name, advice, option):
+    refused = call(name, "RUN", option, "X")
+    assert refused.exit_code == 2
+    assert f"{name} {advice}" in refused.stderr
+
+
 # ------------------------------------------------------------------------------------------------ matrix
 
 

@@ -78,15 +78,18 @@ def test_print_command_and_page_say_the_same(found: Diagnosis, call, calset_file
     assert "kind: clp" not in shown  # of one kind there is nothing to say
 
 
-@pytest.mark.parametrize(("verdict", "doubts"), [("unexplained", []), ("effect_found", ["odd"])])
+@pytest.mark.parametrize(
+    ("verdict", "words", "doubts"),
+    [("unexplained", "unexplained", []), ("effect_found", "effect found", ["odd"])],
+)
 def test_what_is_not_to_be_used_is_not_recommended(
-    verdict, doubts, found: Diagnosis, call, calset_file, tmp_path, monkeypatch
+    verdict, words, doubts, found: Diagnosis, call, calset_file, tmp_path, monkeypatch
 ):
     made = dataclasses.replace(found, verdict=verdict, after=small_fit().judged(doubts))
     comes_out(made, monkeypatch)
     done = call("diagnose", calset_file, "-o", tmp_path / "made")
     assert done.exit_code == 3  # as of every other command whose calibration is not to be used
-    assert f"Diagnosis: {verdict}; fit {'not ' * bool(doubts)}trusted" in done.stdout
+    assert f"Diagnosis: {words}; fit {'not ' * bool(doubts)}trusted" in done.stdout
     assert "The calibration cannot be trusted; written to" in done.stdout
     assert "walop-jax report" in done.stderr
     assert "walop-jax apply" not in done.stderr

@@ -53,6 +53,12 @@ def test_sources_print_as_lines(fitted):
     assert len(lines) == len(walop.cite(fitted.run))
 
 
+def test_figures_print_as_lines(call, fitted):
+    figures = walop.plot(walop.read(fitted.run))
+    assert repr(figures) == call("plot", fitted.run).stdout.rstrip("\n")
+    assert len(repr(figures).splitlines()) == len(figures)
+
+
 def test_measured_parameters_stand_first(fitted):
     states = [row[-1] for row in walop.read(fitted.run).display().rows if not row[0].startswith("standard.")]
     assert states == sorted(states, key=lambda state: state == "prior only")

@@ -28,6 +28,8 @@ CARDS = {
     "huge heap": ("PCOUNT", HUGE, f"[EXPOSURES] PCOUNT: is {HUGE}"),
     "huge fields": ("TFIELDS", HUGE, f"[EXPOSURES] TFIELDS: is {HUGE}, not in 0 … 999"),
     "negative fields": ("TFIELDS", -1, "[EXPOSURES] TFIELDS: is -1"),
+    "a field too many": ("TFIELDS", 1000, "[EXPOSURES] TFIELDS: is 1000, not in 0 … 999;"),
+    "an axis too many": ("NAXIS", 1000, "[EXPOSURES] NAXIS: is 1000, not in 0 … 999;"),
     "more fields": ("TFIELDS", 16, "[EXPOSURES]: the columns cannot be read"),
     "many axes": ("NAXIS", HUGE, f"[EXPOSURES] NAXIS: is {HUGE}, not in 0 … 999"),
     "three axes": ("NAXIS", 3, "[EXPOSURES] NAXIS3: is missing"),

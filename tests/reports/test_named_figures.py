@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 
 import handmade_run
 import jax.numpy as jnp
@@ -27,6 +28,7 @@ from walop_jax.model import mueller
 from walop_jax.model.instrument import Instrument
 from walop_jax.paper.wavelength import plate_retardances, retardance
 from walop_jax.posterior.run import Run
+from walop_jax.reports.diagnosis_figures import separation_figure
 from walop_jax.reports.named import FIGURES, draw, possible
 from walop_jax.reports.paper_figures import retardance_figure, retardance_wavelength_figure
 from walop_jax.reports.posterior_figures import informed
@@ -80,8 +82,27 @@ def assert_fits_in_print(figure, millimetres):
     for frame in maps:
         inner = frame.get_window_extent().padded(-1.0)
         assert not any(box.overlaps(inner) for axis, box in numbers if axis is not frame), frame.get_title()
+    for axis in figure.axes:
+        for along, side in enumerate((axis.xaxis, axis.yaxis)):
+            low, high = sorted(side.get_view_interval())
+            inside = [
+                text for text in side.get_majorticklabels() if low <= text.get_position()[along] <= high
+            ]
+            boxes = [text.get_window_extent().padded(-1.0) for text in inside if text.get_text()]
+            assert not any(a.overlaps(b) for a, b in itertools.pairwise(boxes)), [*map(str, inside)]
     titles = [axis.title.get_window_extent() for axis in figure.axes if axis.get_title()]
     assert not any(a.overlaps(b) for i, a in enumerate(titles) for b in titles[:i])
+
+
+def test_twenty_effects_fit_into_a_column():
+    """Each of 20 comes within 4 σ of the next, and is shown; two more are not. Names must not lie on each other."""
+    names = tuple(f"moon_multiple_scattering{k}" for k in range(22))
+    near = (np.arange(22) < 19)[:, None] & (np.eye(22, k=1) > 0)
+    separation = np.where(near, 4.0, 7.0) + np.diag(np.full(22, np.nan))
+    found = dataclasses.replace(handmade_run.limits(), effects=names, separation=separation)
+    figure = separation_figure(found, Canvas(width=89.0 / 25.4))
+    assert_fits_in_print(figure, 89.0)
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()][-1] == f"{names[19]}  20"
 
 
 @pytest.mark.parametrize("name", WITHOUT)

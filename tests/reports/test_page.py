@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 
@@ -48,6 +49,19 @@ def test_page_stands_by_itself(diagnosed, refitted):
         assert all(image["alt"] for image in page.images)
 
 
+def test_figures_of_a_narrow_screen_have_the_width_of_a_column(refitted, diagnosed):
+    """89 mm, so that panels go below each other and type is of 7 pt; nothing has to be moved sideways."""
+    for text in (refitted, diagnosed):
+        narrow = re.findall(
+            r'media="screen and \(max-width: 40rem\)" srcset="data:image/svg[^,]*,([^"]*)"', text
+        )
+        assert len(narrow) == len(Page(text).images)
+        for svg in map(base64.b64decode, narrow):
+            (width,) = re.findall(rb'<svg [^>]*width="([0-9.]+)pt"', svg)
+            assert float(width) == pytest.approx(89.0 / 25.4 * 72.0, abs=0.1)
+        assert "scroll sideways" not in text
+
+
 def test_every_word_that_is_displayed_is_on_the_page(diagnosed, refitted):
     for text, displays in ((refitted, [FIT]), (diagnosed, [FIT, FOUND])):
         page = Page(text)
@@ -67,6 +81,22 @@ def test_the_answer_comes_first(diagnosed, refitted):
         assert 'class="verdict good"' in head
         assert f"<strong>{shown.title}</strong>" in head
         assert shown.facts[0][1] in head.replace("\N{NO-BREAK SPACE}", " ")
+
+
+@pytest.mark.parametrize("rows", [3, 100])
+def test_a_long_table_is_folded_with_its_facts_and_notes(rows):
+    shown = Display(
+        "of it all",
+        (("limited by", "clouds"),),
+        ("name", ">value"),
+        tuple((f"a{k}", "1") for k in range(rows)),
+        ("no more",),
+    )
+    section = page_module.Section("numbers", "Numbers", shown)
+    text = page_module.filled(
+        Display("yes"), [section], good=True, untrusted=False, title="", name="", about="", first=""
+    )
+    assert [text.count(words) for words in ("clouds", "no more", "<details>")] == [1, 1, int(rows > 32)]
 
 
 def test_a_no_go_stands_first(tmp_path):

@@ -62,7 +62,7 @@ def compare(
     from walop_jax.science.star_errors import Truth
 
     if output is not None and (calibration is not None or isinstance(truth, tuple)):
-        raise ValueError("with output the joint fit is made anew: leave calibration and truth in memory out")
+        raise ValueError("with output the joint fit is repeated: leave out calibration and a truth in memory")
     job.begin("reading")
     held = None if calibration is None else calibration_of(calibration, effects)
     if held is None:

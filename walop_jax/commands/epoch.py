@@ -74,7 +74,7 @@ def epoch(
     shown = comparison.display()
     if lacking is not None:
         named = ", ".join(step.effect for step in lacking.steps) or "nothing that has a name"
-        lacks = f"missing from the old model: {named} ({lacking.verdict})"
+        lacks = f"missing from the old model: {named} ({lacking.verdict.replace('_', ' ')})"
         shown = dataclasses.replace(shown, notes=(*shown.notes, lacks))
     return Outcome(
         comparison,

@@ -34,6 +34,14 @@ WIDTH = Option(
 )
 
 
+class Figures(dict[str, str]):
+    """Figures by name, printed as a line each."""
+
+    def __repr__(self) -> str:
+        width = max(map(len, self), default=0)
+        return "\n".join(f"{name:<{width}}  {about}" for name, about in self.items())
+
+
 @command(writes=())
 def plot(
     job: Job,
@@ -85,10 +93,8 @@ def plot(
         )
     if held is None or name is None:
         figures = FIGURES if held is None else possible(FigureSource.of(held))
-        listed = {key: entry.about for key, entry in figures.items()}
-        width = max(map(len, listed), default=0)
-        lines = [f"{key:<{width}}  {about}" for key, about in listed.items()]
-        return Outcome(listed, listed, "\n".join(lines))
+        listed = Figures({key: entry.about for key, entry in figures.items()})
+        return Outcome(listed, listed, repr(listed))
     chosen = f"{name}.png" if output is None and job.typed else output
     path = None if chosen is None else Path(chosen)
     if path is not None:

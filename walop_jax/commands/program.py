@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from walop_jax.commands import COMMANDS, GROUPS, INTERRUPTED
 from walop_jax.commands.command import COMMON, Argument, Command, Job, Option, Outcome, UsageError, command_of
@@ -50,6 +50,9 @@ NEXT = {
 }
 """Commands to type next, where a command itself does not say; names are those of its arguments."""
 
+PRINTED = "prints its result and takes no output: keep it with > FILE, with --json for programs"
+INTO_ARGUMENT = "writes into the folder that it is given: leave -o out"
+
 QUIET = Option("Print nothing but warnings and errors.", short="-q", kind=bool)
 JSON = Option("Machine-readable result to stdout, nothing else.", kind=bool)
 
@@ -73,6 +76,23 @@ class _Commands(TyperGroup):
         for title, commands in GROUPS.items():
             with formatter.section(title):
                 formatter.write_dl([(f"{name:<{width}}", line) for name, line in commands.items()])
+
+
+class _OneCommand(TyperCommand):
+    """A command: where it takes no output, its complaint about -o states what becomes of the result."""
+
+    advice = ""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """The arguments, parsed by typer."""
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as error:
+            if str(getattr(error, "option_name", "")).startswith(("-o", "--out")):
+                raise typer.BadParameter(
+                    f"{ctx.info_name} {self.advice}", ctx, param_hint="--output"
+                ) from None
+            raise
 
 
 app = typer.Typer(
@@ -143,8 +163,12 @@ def _command(name: str) -> Any:
     command: Command[Any] = command_of(getattr(importlib.import_module(f"walop_jax.commands.{word}"), word))
     alone = typer.Typer(add_completion=False, rich_markup_mode=None)
     page, line = _paragraphs(command.body), COMMANDS[name]
-    alone.command(name, context_settings=HELP, help=page, short_help=line)(_function(command))
-    return typer.main.get_command(alone)
+    alone.command(name, cls=_OneCommand, context_settings=HELP, help=page, short_help=line)(
+        _function(command)
+    )
+    made: Any = typer.main.get_command(alone)
+    made.advice = PRINTED if command.writes is None else INTO_ARGUMENT
+    return made
 
 
 def _function(command: Command[Any]) -> Callable[..., None]:

@@ -91,7 +91,8 @@ def read_calibration_set(*paths: str | os.PathLike[str], kinds: Collection[str] 
 
 def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
     if path.is_dir():
-        raise fail("is a folder", file=path, advice="a calibration set is a FITS file; a RUN holds results")
+        advice = f"a calibration set is a FITS file; walop-jax report {path} shows a folder of results"
+        raise fail("is a folder", file=path, advice=advice)
     if path.suffix.lower() in _NO_SETS:
         advice = "a calibration set is a FITS file (walop-jax docs files); walop_jax.from_arrays makes one of arrays"
         raise fail("is not a calibration set", file=path, advice=advice)

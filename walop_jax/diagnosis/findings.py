@@ -359,7 +359,7 @@ class Diagnosis(Drawn):
         before, after = (fit.chi2 / max(fit.dof, 1) for fit in (self.before, self.after))
         verdict = "not examined" if self.after.verdict is None else self.after.verdict.words
         return Display(
-            title=f"Diagnosis: {self.verdict}; fit {verdict}",
+            title=f"Diagnosis: {self.verdict.replace('_', ' ')}; fit {verdict}",
             facts=(
                 ("found", self._found()),
                 ("χ²/dof", f"{before:.4g} → {after:.4g}"),

@@ -192,7 +192,7 @@ def _from_afar(
 
 
 def _far_off(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
-    """The best place for a model that is far from the data: errors scaled to its residuals, other orders tried."""
+    """The best minimum of a model far from its data: errors scaled to the residuals, plates a wave off tried."""
     budget, starts = most_passes(likelihood.model) - best.minimum.steps, 1
 
     def search(label: str, values: Vector, scale: float, maximum_steps: int) -> FoundMinimum:

@@ -337,7 +337,7 @@ def switch_on() -> None:
 
 
 def in_float64(function: Callable[..., Any], name: str) -> Callable[..., Any]:
-    """The function as the public one of a name, which computes in float64."""
+    """The function, computing in float64 whatever the session does, under its public name."""
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:

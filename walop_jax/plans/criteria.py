@@ -208,7 +208,7 @@ def _of_stars(found: Candidates, table: InputTable) -> Criterion:
     targets = np.concatenate(targets_by_colour, axis=1)
     if not targets.shape[1]:
         raise ValueError(
-            f"{table.path}: no star lies where one exposure holds u; observe them at several angles of the rotator"
+            f"{table.path}: no star lies where one exposure measures u; observe them at several angles of the rotator"
         )
     return Criterion("stars", f"error of p of the worst of {targets.shape[1]} stars", "%", targets)
 

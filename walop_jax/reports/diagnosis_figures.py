@@ -26,6 +26,7 @@ from walop_jax.reports.style import (
     BEFORE,
     DIVERGING,
     FONT,
+    NARROW,
     PAGE,
     QUIET,
     SEQUENTIAL,
@@ -302,7 +303,7 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     level = np.where(np.isnan(level), np.log(percent[nearest]), level)
     shown = pixel_map(axis, np.where(good[nearest], np.exp(level), np.nan), field, norm, SEQUENTIAL)
     colour_bar(figure, shown, axis, "error of q, u (%)")
-    axis.plot(found.x[~good], found.y[~good], "x", color="0.5", ms=4, label="one exposure holds no u")
+    axis.plot(found.x[~good], found.y[~good], "x", color="0.5", ms=4, label="u not measured in one exposure")
     if not good.all():
         figure.legend(frameon=False, fontsize=SMALL, loc=ABOVE)
     return figure
@@ -318,15 +319,29 @@ def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     confusable = np.flatnonzero((alike | alike.T).any(axis=0))
     confusable = confusable if confusable.size else np.arange(len(found.effects))
     count, names = len(confusable), [found.effects[i] for i in confusable]
-    size = max(1.5, 0.17 * count)
-    figure, axis = on.single(size + 3.2, size + 2.0)
     separation = found.separation[np.ix_(confusable, confusable)]
-    shown = axis.imshow(separation, norm=BoundaryNorm(_STEPS, 256, extend="max"), cmap="RdYlBu")
-    axis.set_xticks(range(count), names, rotation=90, fontsize=SMALL)
-    axis.set_yticks(range(count), names, fontsize=SMALL)
+    width = on.width or np.inf
+    narrow = width < NARROW
+    size = max(1.5, 0.17 * count)
+    figure, axis = on.single(*((width, 0.13 * count + 1.5) if narrow else (size + 3.2, size + 2.0)))
+    shown = axis.imshow(
+        separation,
+        norm=BoundaryNorm(_STEPS, 256, extend="max"),
+        cmap="RdYlBu",
+        aspect="auto" if narrow else "equal",
+    )
+    gap = "\n" if narrow else " "
+    numbers = [str(k + 1) for k in range(count)]  # below a narrow figure, where names would take half of it
+    rows = [f"{name}  {number}" for name, number in zip(names, numbers, strict=True)] if narrow else names
+    axis.set_xticks(range(count), numbers if narrow else names, rotation=90, fontsize=SMALL)
+    axis.set_yticks(range(count), rows, fontsize=SMALL)
     axis.set_ylabel("effect present\n(at its detection limit)", fontsize=FONT)
     axis.set_xlabel("could be mistaken for", fontsize=FONT)
     if omitted := len(found.effects) - count:
-        axis.set_title(f"{omitted} other effects: more than {_STEPS[-1]:g} σ from all", fontsize=FONT)
-    colour_bar(figure, shown, axis, f"separation (σ); below {thresholds.SEPARATION:g}: can be mistaken")
+        axis.set_title(f"{omitted} other effects:{gap}more than {_STEPS[-1]:g} σ from all", fontsize=FONT)
+    label = f"separation (σ),{gap}below {thresholds.SEPARATION:g}: can be mistaken"
+    if narrow:
+        colour_bar(figure, shown, [axis], label, location="bottom", aspect=30)
+    else:
+        colour_bar(figure, shown, axis, label)
     return figure

@@ -229,7 +229,7 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
 
 
 @styled
-def matrix_change_figure(old: MatrixMaps, new: MatrixMaps) -> Figure:
+def matrix_change_figure(old: MatrixMaps, new: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
     """By how much the elements of the instrument matrix have changed over the field, in per cent.
 
     Those that Paper II calls by one name share a scale. Raises ValueError for maps of different places.
@@ -238,7 +238,7 @@ def matrix_change_figure(old: MatrixMaps, new: MatrixMaps) -> Figure:
         raise ValueError("the maps of the two calibrations are of different places")
     change = 100.0 * (new.values - old.values)
     kinds = [element_kind(i, new.arms) for i in range(len(change))]
-    figure, axes = PAGE.panels(8.6, 2.3 * new.arms, new.arms, 3, sharex=True, sharey=True, squeeze=False)
+    figure, axes = on.panels(8.6, 2.3 * new.arms, new.arms, 3, sharex=True, sharey=True, squeeze=False)
     for axis, values, name, kind in zip(axes.ravel(), change, element_symbols(new.arms), kinds, strict=True):
         far = rounded_up(largest_size(change[np.equal(kinds, kind)]))
         field_axes(axis, f"change of {name}")
@@ -323,7 +323,7 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
 
 
 @styled
-def planned_figure(field: Mapping[str, Sequence[float | None]]) -> Figure:
+def planned_figure(field: Mapping[str, Sequence[float | None]], on: Canvas = PAGE) -> AnyFigure:
     """Error of p (%) over the field before a plan and after it, from `field` of plan.json; crosses: no u there."""
     x, y, before, after = (np.array(field[k], float) for k in ("x", "y", "before", "p_error"))
     places, at = np.unique(np.stack([x, y]), axis=1, return_inverse=True)
@@ -332,7 +332,7 @@ def planned_figure(field: Mapping[str, Sequence[float | None]]) -> Figure:
         worst = np.full(places.shape[1], -np.inf)
         np.maximum.at(worst, at.ravel(), np.where(np.isnan(error), np.inf, 100.0 * error))
         maps.append(np.where(np.isfinite(worst), worst, np.nan))
-    figure, axes = PAGE.panels(8.2, 3.6, 1, 2)
+    figure, axes = on.panels(8.2, 3.6, 1, 2)
     lowest, highest = float(0.5 * np.nanmin(maps[1])), float(2.0 * np.nanmax(maps[1]))
     highest = min(max(float(np.nanmax(maps[0])), highest), max(_RANGE[1], highest))
     for axis, values, title in zip(axes, maps, ("before", "after"), strict=True):

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import functools
 import io
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,6 +43,7 @@ from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import draw
 from walop_jax.reports.posterior_figures import unit_in_words
 from walop_jax.reports.run import FigureSource, RunContents, read_limits
+from walop_jax.reports.style import PAGE, WIDTHS, Canvas
 from walop_jax.reports.wording import (
     CAPTIONS,
     data_in_words,
@@ -60,12 +62,17 @@ SMALL = ("ladder", "protection")
 """Figures that take half of the width."""
 
 
+NARROW = Canvas(width=WIDTHS["column"] / 25.4)
+"""The canvas of the same figure on the screen of a telephone: panels go below each other."""
+
+
 class Picture(NamedTuple):
-    """An image as a data URI, its caption, and whether it takes half of the width."""
+    """An image as a data URI, its caption, whether it takes half of the width; the same image for a narrow screen."""
 
     source: str
     caption: str
     small: bool = False
+    narrow: str = ""
 
     @property
     def alt(self) -> str:
@@ -129,9 +136,10 @@ def png(content: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(content).decode("ascii")
 
 
-def picture(name: str, figure: Figure, **words: str) -> Picture:
-    """A figure with its caption."""
-    return Picture(embedded(figure), CAPTIONS[name].format(**words), name in SMALL)
+def picture(name: str, drawn_on: Callable[[Canvas], Any], **words: str) -> Picture:
+    """A figure, wide and narrow, with its caption."""
+    wide, narrow = embedded(drawn_on(PAGE)), embedded(drawn_on(NARROW))
+    return Picture(wide, CAPTIONS[name].format(**words), name in SMALL, narrow)
 
 
 def drawn(source: FigureSource, names: Sequence[str], missing: list[str], **words: str) -> list[Picture]:
@@ -139,7 +147,7 @@ def drawn(source: FigureSource, names: Sequence[str], missing: list[str], **word
     pictures = []
     for name in names:
         try:
-            pictures.append(picture(name, draw(name, source), **words))
+            pictures.append(picture(name, lambda canvas, name=name: draw(name, source.on(canvas)), **words))
         except (ValueError, OSError) as error:
             if not any(str(error) in sentence for sentence in missing):
                 missing.append(f"The figure {name} is not drawn: {error}.")
@@ -268,8 +276,13 @@ def _residual_pictures(run: RunContents, missing: list[str]) -> list[Picture]:
     if several:
         names = ["ladder", "rms", "shares"] if len(data.comparisons) > 2 else ["ladder", "shares"]
         return drawn(run.source, names, missing)
-    maps = diagnosis_figures.residual_maps(data.points, {"residuals": overall.before}, data.cameras)
-    whole = picture("whole", maps, combination=in_greek(overall.combination))
+    whole = picture(
+        "whole",
+        lambda canvas: diagnosis_figures.residual_maps(
+            data.points, {"residuals": overall.before}, data.cameras, canvas
+        ),
+        combination=in_greek(overall.combination),
+    )
     return [whole, *drawn(run.source, ["shares"], missing)]
 
 
@@ -509,7 +522,7 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
         if "field" not in document:
             missing.append("No map: what this plan is for is no error of p.")
             return []
-        return [picture("planned", figures.planned_figure(document["field"]))]
+        return [picture("planned", functools.partial(figures.planned_figure, document["field"]))]
     if kind == "limits":
         worst = read_limits(folder / LIMITS).worst
         names = ["separation"] if worst is None else ["protection", "separation"]
@@ -519,11 +532,13 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
     if kind == "survey":
         results = []
         try:
-            tracks = survey_figures.tracks_figure(read_input_table(folder / TRACKS).table, document)
-            results = [] if tracks is None else [picture("tracks", tracks)]
+            tracks = functools.partial(
+                survey_figures.tracks_figure, read_input_table(folder / TRACKS).table, document
+            )
+            results = [] if tracks(PAGE) is None else [picture("tracks", tracks)]
         except DataError as error:
             missing.append(f"Parameters against time are not drawn: {error}.")
-        return [*results, picture("nights", survey_figures.nights_figure(document))]
+        return [*results, picture("nights", functools.partial(survey_figures.nights_figure, document))]
     names = [name for name in CAPTIONS if name.endswith(".png") and name.startswith(kind)]
     existing = [name for name in names if (folder / name).exists()]
     missing += [f"{name} is not there." for name in names if name not in existing]
@@ -536,7 +551,7 @@ def _change_of_the_matrix(folder: Path, document: Mapping[str, Any], missing: li
         return []
     try:
         old, new = (read_product(Path(path)).maps for path in (document["old_file"], folder))
-        return [picture("change", figures.matrix_change_figure(old, new))]
+        return [picture("change", functools.partial(figures.matrix_change_figure, old, new))]
     except (ValueError, OSError, KeyError, TypeError) as error:
         missing.append(f"The change of the instrument matrix is not drawn: {error}.")
         return []

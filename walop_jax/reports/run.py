@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
@@ -91,6 +92,12 @@ class FigureSource:
         if isinstance(given, Diagnosis):
             held |= {FIGURE_DATA: figure_data(given)}
         return cls(held=held, **options)
+
+    def on(self, canvas: Canvas) -> FigureSource:
+        """The same source with another canvas; computed results are kept."""
+        other = copy.copy(self)
+        object.__setattr__(other, "canvas", canvas)
+        return other
 
     def __contains__(self, name: str) -> bool:
         return name in (self.held if self.run is None else self.run)

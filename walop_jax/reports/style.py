@@ -13,7 +13,7 @@ import matplotlib.style
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
+from matplotlib.axis import Axis, XAxis
 from matplotlib.collections import PatchCollection
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
@@ -36,6 +36,7 @@ WIDTHS = {"column": 89.0, "page": 183.0}
 """Widths (mm) of figures in journals, by name."""
 SHARED = ("sharex", "sharey")
 NARROWEST = 1.3  # inches of a panel of a given width: narrower ones go below each other
+NUMBER = 0.4  # inches of a number below an axis, with the gap to the next
 LABELS = 0.55  # inches of a panel that its title and numbers take, at any size
 DIVERGING = "RdBu_r"
 SEQUENTIAL = "viridis"
@@ -338,9 +339,14 @@ def plain_ticks(axis: Axis) -> None:
     """Numbers instead of powers of ten on a logarithmic axis, few enough not to collide."""
     low, high = axis.get_view_interval()
     decades = np.log10(high / low)
-    steps = (1, 1.2, 1.5, 2, 3, 5, 7) if decades < 0.7 else (1, 2, 5) if decades < 2 else (1,)
-    ticks = [step * 10.0**power for power in range(-9, 9) for step in steps]
-    ticks = [tick for tick in ticks if 0.999 * low <= tick <= 1.001 * high]
+    width = axis.axes.get_window_extent().width / axis.axes.figure.dpi
+    room = width / NUMBER if isinstance(axis, XAxis) else np.inf
+    ticks, finest = [], 0 if decades < 0.7 else 1 if decades < 2 else 2
+    for steps in ((1, 1.2, 1.5, 2, 3, 5, 7), (1, 2, 5), (1,))[finest:]:
+        ticks = [step * 10.0**power for power in range(-9, 9) for step in steps]
+        ticks = [tick for tick in ticks if 0.999 * low <= tick <= 1.001 * high]
+        if len(ticks) <= room:
+            break
     axis.set_ticks(ticks, labels=[plain(tick, 1 + (tick * 1.001 >= 1)) for tick in ticks])
     axis.set_minor_locator(NullLocator())
 

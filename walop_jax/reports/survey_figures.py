@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from walop_jax.reports.style import AFTER, BEFORE, FONT, PAGE, QUIET, SMALL, calendar, day_of, styled
+from walop_jax.reports.style import AFTER, BEFORE, FONT, PAGE, QUIET, SMALL, Canvas, calendar, day_of, styled
 from walop_jax.science.quality import ERRORS, GAIN, OUTSIDE, Limits
 from walop_jax.science.watch_found import Watch
 
@@ -16,7 +16,7 @@ MOST = 8  # parameters in a figure
 
 
 @styled
-def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
+def tracks_figure(tracks: Any, document: Mapping[str, Any], on: Canvas = PAGE) -> Figure | None:
     """Parameters whose law lets them change, against time; None where there is none.
 
     The band is the value under the law with its error, dots the value of each night alone. A step is a step:
@@ -29,7 +29,7 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
     if not names:
         return None
     count = len(names)
-    figure, axes = PAGE.panels(6.4, 0.9 + 1.25 * count, count, 1, sharex=True, squeeze=False)
+    figure, axes = on.panels(6.4, 0.9 + 1.25 * count, count, 1, sharex=True, squeeze=False)
     for axis, name in zip(axes[:, 0], names, strict=True):
         rows = tracks[np.asarray(tracks["NAME"]).astype(str) == name]
         mjd, value, error, alone, alone_error = (
@@ -60,12 +60,12 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any]) -> Figure | None:
 
 
 @styled
-def nights_figure(document: Mapping[str, Any]) -> Figure:
+def nights_figure(document: Mapping[str, Any], on: Canvas = PAGE) -> Figure:
     """Distance of χ² of every night from its expectation, in standard deviations."""
     nights: Sequence[Mapping[str, Any]] = document["by_night"]
     excess = np.array([night["excess"] for night in nights], float)
     mjd = np.array([night["mjd"] for night in nights], float)
-    figure, axis = PAGE.panels(6.4, 2.0)
+    figure, axis = on.panels(6.4, 2.0)
     axis.axhspan(-2.0, 2.0, color=QUIET, lw=0)
     axis.scatter(day_of(mjd), excess, s=6, color=np.where(excess > 5.0, BEFORE, AFTER).tolist())
     _events(axis, document["events"])

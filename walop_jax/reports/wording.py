@@ -165,7 +165,7 @@ CAPTIONS: Mapping[str, str] = {
     "corner": "Posterior of the coefficients that are most correlated among those that the data constrain: contours "
     "of 39 and 86 %, 1 and 2 σ of two coefficients together.",
     "planned": "Error of p (%) before and after the plan: median over the instruments drawn, largest of all filters "
-    "and colours. Crosses: one exposure holds no u there.",
+    "and colours. Crosses: one exposure does not measure u there.",
     "change": "Change of the instrument matrix over the field, new − old, in per cent.",
     "tracks": "Parameters that change: value under the law and its error (band), values of single nights (dots), "
     "breaks (dashed) and work on the instrument (dotted).",

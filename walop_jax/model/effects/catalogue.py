@@ -145,7 +145,7 @@ def _member(
     absolute, turns = bool(settings.get("absolute", False)), float(settings.get("turns", 1.0))
     if absolute and any(Change.parsed(text).kind != "extinction" for text in does):
         raise ValueError(
-            f"{name}: absolute is for the extinction of the polariser alone; give the addition instead"
+            f"{name}: absolute = true is for the extinction of the polariser only; give the change instead"
         )
     unit = RADIANS[parameters[polar]["unit"]] if polar else 1.0
     return Member(
