@@ -136,7 +136,7 @@ MOST_REACHED = {
     "likelihood.flux": 100,
     "diagnosis.score": 850,
     "commands.matrix": 16600,
-    "commands.refit": 27700,
+    "commands.refit": 27350,
     "commands.diagnose": 31200,
     "commands.apply": 31750,
 }

@@ -456,14 +456,11 @@ class Calibration(Contents, Fitted):
         step = 2.0 * half / (size - 1)
         centre = 0.5 * (size + 1)
         grid = Grid(size, size, (centre, centre), (0.0, 0.0), ((step, 0.0), (0.0, step)))
-        points = grid.points
-        settings = self.usual_settings(size * size, name)
+        x, y, settings = grid.points.x, grid.points.y, self.usual_settings(size * size, name)
         if self.draws is not None:
-            values, covariance = self._elements(points.x, points.y, settings)
+            values, covariance = self._elements(x, y, settings)
         else:
-            values, covariance, _ = self.over_field(
-                points.x, points.y, settings[:1], MAP_NODES, MAP_TOLERANCE
-            )
+            values, covariance, _ = self.over_field(x, y, settings[:1], MAP_NODES, MAP_TOLERANCE)
         errors = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
         planes, flat = (-1, size, size), values.reshape(size * size, -1)
         return MatrixMaps(grid, name, flat.T.reshape(planes), errors.T.reshape(planes), settings[:1].inside())

@@ -350,9 +350,7 @@ def slopes_over_field(
     `counts` of nodes per side are tried in turn, until elements, and standard errors relative to themselves, are right
     to `tolerance` wherever that is checked (`field_table.held_out`).
     """
-
-    def exact(x: Vector, y: Vector) -> tuple[np.ndarray, np.ndarray]:
-        return matrix_slopes(instrument, setting, filters, x, y)
+    exact = functools.partial(matrix_slopes, instrument, setting, filters)
 
     def error(interpolated: tuple[np.ndarray, np.ndarray], truth: tuple[np.ndarray, np.ndarray]) -> float:
         errors, true_errors = (
