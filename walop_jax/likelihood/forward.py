@@ -232,7 +232,8 @@ def _with_gradient(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple
         at = dict(zip(moving, moved, strict=True))
         return _chi2.fun(*tree.unflatten([at.get(n, leaf) for n, leaf in enumerate(leaves)]))
 
-    value, gradient = jax.value_and_grad(chi2)([leaves[n] for n in moving])
+    # Another reverse pass, for second derivatives, keeps the inputs of a batch alone.
+    value, gradient = jax.checkpoint(jax.value_and_grad(chi2))([leaves[n] for n in moving])
     changes = [jnp.vdot(slope, steps[n]) for n, slope in zip(moving, gradient, strict=True)]
     return value, sum(changes, jnp.zeros_like(value))
 
