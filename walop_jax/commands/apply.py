@@ -8,7 +8,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, command_of
+from walop_jax.commands.command import (
+    Argument,
+    Job,
+    Option,
+    Outcome,
+    UsageError,
+    command,
+    command_of,
+    several,
+)
 from walop_jax.commands.each import EACH, SCHEDULER, WORKERS, for_each
 from walop_jax.commands.gather import gather
 from walop_jax.commands.inputs import TableFile
@@ -18,10 +27,8 @@ from walop_jax.commands.products import (
     Product,
     calibration_of,
     catalogue_of,
-    several,
-    table_of,
-    table_outcome,
 )
+from walop_jax.commands.tables import table_of, table_outcome
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
