@@ -21,10 +21,10 @@ computed_once = jax.lax.optimization_barrier
 from cheap ones grow to loops of a thousand operations, compiled as often as there are elements of a matrix."""
 
 
-def matrix2(a: Scalar, b: Scalar, c: Scalar, d: Scalar) -> Matrix2:
-    """The 2 × 2 matrix ((a, b), (c, d)) at every element of arrays that broadcast."""
-    a, b, c, d = jnp.broadcast_arrays(a, b, c, d)
-    return jnp.stack([a, b, c, d]).reshape(2, 2, *a.shape)
+def matrix2(*elements: Inexact[Array, ...]) -> Matrix2:
+    """The 2 × 2 matrix ((a, b), (c, d)) of arrays a, b, c, d that broadcast."""
+    stack = jnp.stack(jnp.broadcast_arrays(*elements))
+    return stack.reshape(2, 2, *stack.shape[1:])
 
 
 def product2(left: Matrix2, right: Matrix2) -> Matrix2:
