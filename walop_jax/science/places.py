@@ -258,7 +258,7 @@ def _smoothed(
 def _described(seen: Seen, found: Strongest, cameras: Sequence[str]) -> DisagreeingPlace:
     """The place about the strongest one, with the cameras that describe its stars as well as the best one."""
     subset = seen.near(found.place)
-    fits = []
+    fits: list[tuple[tuple[float, float, float], Place, int]] = []
     for k in range(len(cameras)):
         place = fitted(subset, k, found.place)
         fits.append((share_of(subset, k, profile(subset.x, subset.y, place)), place, k))
