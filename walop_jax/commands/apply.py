@@ -8,7 +8,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, command_of
+from walop_jax.commands.command import (
+    Argument,
+    Job,
+    Option,
+    Outcome,
+    UsageError,
+    command,
+    command_of,
+    several,
+)
 from walop_jax.commands.each import EACH, SCHEDULER, WORKERS, for_each
 from walop_jax.commands.gather import gather
 from walop_jax.commands.inputs import TableFile
@@ -18,10 +27,8 @@ from walop_jax.commands.products import (
     Product,
     calibration_of,
     catalogue_of,
-    several,
-    table_of,
-    table_outcome,
 )
+from walop_jax.commands.tables import table_of, table_outcome
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
@@ -151,7 +158,7 @@ def apply(
         counted=counted_flags(rows, used.model.template),
         warnings=[
             *gathering_remarks,
-            *sentences(rows, stars),
+            *sentences(rows, stars, instrument.cameras.names),
             *([] if seen_twice is None else seen_twice.warnings()),
         ],
         remade=_common if common else None,
@@ -179,7 +186,7 @@ def _table_of(catalogue: Any, held: Calibration | None) -> tuple[InputTable, Seq
 
     instrument = None if held is None else held.design
     gathered = command_of(gather).run(Job(), {"catalogues": catalogue, "instrument": instrument})
-    return in_memory(gathered.value, ", ".join(map(str, catalogue))), gathered.warnings
+    return in_memory(gathered.value, "stars of the cameras"), gathered.warnings
 
 
 def _common(made: Any) -> tuple[Any, Sequence[str]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,8 @@ from walop_jax.science.overlaps import extents
 from walop_jax.science.polarisation import polarisation
 
 BRIGHT = 1000.0  # electrons: their errors are a few per cent, with a read noise of 100 electrons a tenth
+FEW = 0.5  # of the rows
+QUIET = 0.02  # of the variance of photons: what a mean of fifty exposures has
 APART = 0.005  # deg: rows of one star that lie farther apart may be those of two
 Columns = dict[str, tuple[np.ndarray, str, str]]  # values, description, unit
 
@@ -85,16 +87,37 @@ def header(product: str, estimator: str, on_sky: float, check: CatalogueCheck) -
 # ------------------------------------------------------------------------------------------------------- warnings
 
 
-def sentences(rows: Catalogue, stars: Stars) -> Iterator[str]:
-    """Warnings about a catalogue: those of the stars together, errors like variances, stars with another's rows."""
+def sentences(rows: Catalogue, stars: Stars, names: Sequence[str]) -> Iterator[str]:
+    """Warnings about a catalogue: of its stars together, of counts and errors, of stars with another's rows.
+
+    `names` are those of the cameras.
+    """
     at_places = {place.words() for place in stars.check.places}
     for text in stars.check.warnings():
         yield f"{text} (FLAG {Quality.PLACE if text in at_places else Quality.CATALOGUE:d})"
-    bright = rows.counts > BRIGHT
-    if bright.any() and (share := float(np.median(rows.sigma[bright] / rows.counts[bright]))) > 0.5:
-        yield f"N_ERR of bright stars is {share:.2g} times N: are these variances? Standard errors are wanted"
+    yield from about_counts(rows.counts, rows.sigma, names)
     if number := int(((extents(rows) > APART) & (stars.flag & Quality.DISAGREES > 0)).sum()):
         yield f"{number} of the stars that disagree have rows at different places: is their ID that of one star?"
+
+
+def about_counts(
+    counts: Float[np.ndarray, "r k"], sigma: Float[np.ndarray, "r k"], names: Sequence[str]
+) -> Iterator[str]:
+    """Warnings about errors that are none of counts, and about cameras that are hardly used."""
+    used = np.isfinite(counts)
+    for name, of_camera in zip(names, used.T, strict=True):
+        if used.any() and of_camera.mean() < FEW:
+            what = "N is negative, flagged, saturated or NaN in the others"
+            yield f"{name} is used in {int(of_camera.sum())} of {len(counts)} rows: {what}"
+    lit = used & (counts > 0)
+    if lit.any() and (share := float(np.median(sigma[lit] ** 2 / counts[lit]))) < QUIET:
+        yield (
+            f"N_ERR is {share**-0.5:.2g} times smaller than the noise of photons: is N in electrons? Magnitudes, rates "
+            "and means of exposures are not"
+        )
+    bright = counts > BRIGHT
+    if bright.any() and (share := float(np.median(sigma[bright] / counts[bright]))) > 0.5:
+        yield f"N_ERR of bright stars is {share:.2g} times N: are these variances? Standard errors are wanted"
 
 
 def counted_flags(rows: Catalogue, instrument: Instrument) -> dict[Quality, str]:
