@@ -239,10 +239,10 @@ def _matrix_and_slopes(
     plain, series = plain_positions(instrument), series_indices(instrument)
     size, pairs = values_of(instrument).size, instrument.cameras.pairs
 
-    def at(*columns: Array) -> tuple[np.ndarray, np.ndarray]:
+    def at(*columns: Vector) -> tuple[np.ndarray, np.ndarray]:
         vectors, slopes = (np.asarray(d)[..., 0, :, :] for d in _slopes(instrument, plan, *columns))
         change = np.moveaxis(of_matrix(vectors[:, None], slopes, pairs), 1, -1)
-        basis = instrument.throughput.basis(*map(np.asarray, columns[:2]))[:, None, None, None]
+        basis = instrument.throughput.basis(*columns[:2])[:, None, None, None]
         result = np.empty((*change.shape[:-1], size))
         result[..., plain] = change[..., : len(plain)]
         result[..., series] = through_series(change[..., None, len(plain) :], basis)
@@ -270,7 +270,7 @@ def matrices(
         plan = dataclasses.replace(plan_for_settings(instrument, layout, filters), work=len(x))
         exact = _matrix_and_slopes(instrument, plan)
 
-        def with_covariance(*columns: Array, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
+        def with_covariance(*columns: Vector, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
             elements, slopes = (a.reshape(len(a), size, *a.shape[3:]) for a in exact(*columns))
             return elements, slopes @ covariance @ np.swapaxes(slopes, 1, 2)
 
