@@ -153,7 +153,15 @@ class CatalogueCheck:
 
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each thing that does not hold."""
-        texts = [entry.words() for entry in (*self.changes, *self.places)]
+        texts = [place.words() for place in self.places]
+        if any(change.best.implausible for change in self.changes):
+            texts.insert(
+                0,
+                "the counts contradict the calibration by more than an instrument changes: are they of this "
+                "instrument, of all cameras in one unit and aperture, and in their order?",
+            )
+        else:
+            texts = [*(change.words() for change in self.changes), *texts]
         if self.sky is not None and self.sky.found:
             texts.append(self.sky.words())
         if self.rows_agree:

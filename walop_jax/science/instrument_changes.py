@@ -19,6 +19,8 @@ from walop_jax.io.text import some, with_error, with_minus_sign
 ALARM = 1e-4
 """Probability that noise raises any alarm in a catalogue, or in all that are watched together."""
 RIVAL = 11.0
+LARGEST = 0.5
+"""Relative change of a camera beyond which the counts are not those of the instrument."""
 MOST_LIKELY = 2.33
 """Standard deviations above the alarm from which 99 % are detected (one-sided)."""
 REACH = 3.0
@@ -109,6 +111,12 @@ class PossibleChange(NamedTuple):
     def sigma(self) -> float:
         """Size in standard errors."""
         return self.size / self.error
+
+    @property
+    def implausible(self) -> bool:
+        """True for a camera that would be brighter or fainter by more than cameras become."""
+        relative = self.kind in ("gain", "arm", "gradient", "x", "y", "time")
+        return self.camera and relative and abs(self.size) > LARGEST
 
     def words(self) -> str:
         """The change and its size in words."""
