@@ -11,10 +11,10 @@ from astropy.table import Table
 from star_tables import read, stars
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.commands.apply import about_counts
 from walop_jax.fit.verdict import Hidden, Quality, Structure
 from walop_jax.science import apply as application
 from walop_jax.science.apply import apply
+from walop_jax.science.stokes_columns import about_counts
 
 pytestmark = pytest.mark.usefixtures("tabulated_once")
 

@@ -9,7 +9,7 @@ Gauges      constants are left out of the densities. A free parameter without a 
             value, which keeps undetermined parameters from running away; it is part of ln p, as in a fit
 Ties        a tied parameter has the value of its master, whatever stands in its place
 Derivatives in any mode and order; the optics by the rule of `likelihood.optics`. Points are worked on in batches, in a
-            scan, and a gradient computes each batch anew: its memory is that of one batch
+            scan; χ² of a batch comes with its gradient, so that the memory of a gradient is that of one batch
 """
 
 from __future__ import annotations
@@ -232,7 +232,8 @@ def _with_gradient(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple
         at = dict(zip(moving, moved, strict=True))
         return _chi2.fun(*tree.unflatten([at.get(n, leaf) for n, leaf in enumerate(leaves)]))
 
-    value, gradient = jax.value_and_grad(chi2)([leaves[n] for n in moving])
+    # Another reverse pass, for second derivatives, keeps the inputs of a batch alone.
+    value, gradient = jax.checkpoint(jax.value_and_grad(chi2))([leaves[n] for n in moving])
     changes = [jnp.vdot(slope, steps[n]) for n, slope in zip(moving, gradient, strict=True)]
     return value, sum(changes, jnp.zeros_like(value))
 
