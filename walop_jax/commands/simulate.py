@@ -136,7 +136,9 @@ def simulate(
         text = f"{output}: {plan.name}, {stars} stars of the instrument of {which}"
         suggested, times = (f"walop-jax apply RUN {output} -o OUT.fits",), data["MJD"]
         for number, name in enumerate(plan.design.cameras.names if cameras else ()):
-            of_cameras[_of_camera(Path(str(output)), name)] = field.of_camera(number, job.seed)
+            of_cameras[_of_camera(Path(str(output)), name)] = astropy_table(
+                *field.of_camera(number, job.seed)
+            )
         if of_cameras:
             files = [str(path) for path in of_cameras]
             about["cameras"], text = files, f"{text}; of the cameras: {', '.join(files)}"

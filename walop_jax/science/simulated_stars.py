@@ -7,13 +7,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from astropy.table import Table
 from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import COLOURS, colour_nodes, colour_weights
 from walop_jax.calibration.matrix import sky_vectors
 from walop_jax.data.settings import Settings
-from walop_jax.io.plain_tables import astropy_table
 from walop_jax.model import light
 from walop_jax.model.compiled import array
 from walop_jax.model.instrument import Instrument
@@ -46,8 +44,10 @@ class SimulatedStars:
         """The truth as plain data."""
         return {"q": self.qu[:, 0].tolist(), "u": self.qu[:, 1].tolist(), "teff": self.teff.tolist()}
 
-    def of_camera(self, number: int, seed: int, pointing: Pointing = POINTING) -> Table:
-        """The catalogue of one camera as SExtractor names its columns, in an order and with positions of its own."""
+    def of_camera(
+        self, number: int, seed: int, pointing: Pointing = POINTING
+    ) -> tuple[Columns, dict[str, Any]]:
+        """Columns of one camera, named as by SExtractor, in an order and with positions of its own; its header."""
         columns = {name: values for name, (values, *_) in self.columns.items()}
         draw = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5, number)))
         rows = draw.permutation(len(self.teff))
@@ -64,7 +64,7 @@ class SimulatedStars:
         }
         names = ("SOURCE_ID", "BP_RP", "BP_RP_ERR")
         made |= {name: (columns[name][rows], *self.columns[name][1:]) for name in names}
-        return astropy_table(made, header)
+        return made, header
 
 
 def simulated_stars(
