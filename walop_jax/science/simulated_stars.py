@@ -58,8 +58,8 @@ class SimulatedStars:
         made: Columns = {
             "ALPHA_J2000": (columns["RA"][rows] + off_ra / np.cos(np.deg2rad(dec)), "deg", "right ascension"),
             "DELTA_J2000": (dec + off_dec, "deg", "declination"),
-            "FLUX_AUTO": (columns["N"][rows, number], "electron", "flux"),
-            "FLUXERR_AUTO": (columns["N_ERR"][rows, number], "electron", "standard error of the flux"),
+            "FLUX_AUTO": (columns["N"][rows, number], "count", "flux"),
+            "FLUXERR_AUTO": (columns["N_ERR"][rows, number], "count", "standard error of the flux"),
             "FLAGS": (np.zeros(len(rows), np.int16), "", "flags of SExtractor"),
         }
         names = ("SOURCE_ID", "BP_RP", "BP_RP_ERR")
