@@ -532,6 +532,27 @@ def rounded(experiment: Experiment, plan: Allocation) -> Allocation:
     return _plan(chosen, count, 0.0, chosen.value(count), plan.bound, plan.proof, plan.rounds)
 
 
+def joined(experiment: Experiment, plan: Allocation, near: float) -> Allocation:
+    """The plan with candidates of a family that differ by less than `near` in each coordinate as one, at their mean."""
+    groups: list[list[int]] = []
+    for i, (family, place) in enumerate(zip(plan.family, plan.place, strict=True)):
+        alike = (
+            g
+            for g in groups
+            if plan.family[g[0]] == family and np.all(np.abs(plan.place[g[0]] - place) < near)
+        )
+        group = next(alike, None)
+        groups.append([i]) if group is None else group.append(i)
+    if len(groups) == len(plan.place):
+        return plan
+    weight = np.array([plan.weight[g].sum() for g in groups])
+    places = (np.average([plan.place[i] for i in g], axis=0, weights=plan.weight[g]) for g in groups)
+    some = _Some(
+        experiment.reduced(), [(int(plan.family[g[0]]), p) for g, p in zip(groups, places, strict=True)]
+    )
+    return _plan(some, weight, 0.0, some.value(weight), plan.bound, plan.proof, plan.rounds)
+
+
 def worth(
     experiment: Experiment, plan: Allocation
 ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
