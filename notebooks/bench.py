@@ -12,13 +12,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 import walop_jax as walop
 from walop_jax import Calibration, FitResult, Instrument, Likelihood, ObservingPlan, Settings
-from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.paper.polynomial import fit_paper, measured_qu, sample_stars, transmitted, with_test_stars
-from walop_jax.science.star_errors import joint_errors, star_errors
 
 TILTS = (12.0, 14.0, 16.0, 18.0, 20.0)
 PAPER_CROSS_TALK = (0.16, 0.27, 0.43, 0.62, 0.81)
@@ -59,16 +55,11 @@ def bench_table(seed: int = 0, electrons: float = 1e6) -> list[BenchRow]:
             model = model.change(p.name, free=False)
     fitted = Calibration.from_fit(FitResult.of(Likelihood.of(run.calset, model)).judged())
     true = dataclasses.replace(fitted, values=np.array([run.values[n] for n in model.names]))
-    made, stars = fit_paper(run.calset), sample_stars(seed=seed)
-    at = [int(np.flatnonzero(np.isclose(made.x, tilt))[0]) for tilt in TILTS]
-    x, y = made.x[at], made.y[at]
-    reference, joint = (_vectors(c, x, y, plan.teff) for c in (true, fitted))
-    local = with_test_stars(x, y, made.coefficients[at], made.condition[at], made.transmission[at], stars)
-    paper = star_errors(local.recover(measured_qu(transmitted(reference, stars))), stars)
-    ours = joint_errors(joint, reference, stars)
-    cross_talk = (
-        measured_qu(reference[..., 0] + reference[..., 1])[:, 1] - measured_qu(reference[..., 0])[:, 1]
-    )
+    x, y = np.array(TILTS), np.full(len(TILTS), run.calset.points.y[0])
+    settings = dataclasses.replace(Settings.default(1), teff=np.array([plan.teff]))
+    matrix = true.matrix(x, y, settings)[0]
+    errors = walop.compare(run.calset, fitted, truth=(x, y, matrix)).between
+    cross_talk, paper, ours = matrix[:, 4], errors.paper, errors.joint  # m32
     rows = zip(TILTS, cross_talk.tolist(), PAPER_ERRORS, paper.tolist(), ours.tolist(), strict=True)
     return [BenchRow(t, c, published, tuple(p), tuple(j)) for t, c, published, p, j in rows]
 
@@ -85,9 +76,3 @@ def _as_built(rng: np.random.Generator) -> Instrument:
         nominal = nominal.changed(f"{arm.name}.plate.mgf2", thickness=lambda d, off=off: d + off)
     series = dataclasses.replace(nominal.throughput, degree=0, coefficients=jnp.asarray(throughput))
     return dataclasses.replace(nominal, throughput=series)
-
-
-def _vectors(
-    calibration: Calibration, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], teff: float
-) -> Float[np.ndarray, "p 4 3"]:
-    return AnalysisVectors(calibration).exact(Settings.default(1), x, y, [teff])[:, 0]

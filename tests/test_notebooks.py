@@ -20,14 +20,6 @@ NOT_OURS = {
     "walop_north_design": ("NORTH_DESIGN", "walop_north_design.fits"),
 }
 """Notebooks that read what does not come with the project: the variable that says where it lies, and the file."""
-DEEP = {
-    "bench.py": {
-        "calibration.analysis_vectors": "analysis vectors, of which matrices are made",
-        "paper.polynomial": "the method of Paper II, which is there for comparison",
-        "science.star_errors": "the same: errors of its test stars",
-    },
-}
-"""What notebooks import from rooms of the package, and why; this may only become less."""
 TIMEOUT = 900  # seconds per cell, on a machine that does other things as well
 
 
@@ -92,7 +84,7 @@ def test_deep_imports_are_found():
 @pytest.mark.parametrize("path", [*NOTEBOOKS, *MODULES], ids=lambda path: path.name)
 def test_notebooks_use_public_names(path: Path):
     cells = code_of(read(path)) if path in NOTEBOOKS else [path.read_text(encoding="utf-8")]
-    assert deep_imports(cells) == set(DEEP.get(path.name, {}))
+    assert deep_imports(cells) == set()
 
 
 @pytest.mark.parametrize("path", [*NOTEBOOKS, *MODULES], ids=lambda path: path.name)

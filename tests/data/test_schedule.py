@@ -238,6 +238,13 @@ def test_times_that_are_no_whole_seconds_are_told():
         (lambda one: one.update(polarizer={"engage": True, "continuous": True, "speed": 1}), "turns during"),
         (lambda one: one.update(executed=["soon"]), r"executed: 'soon' is no time"),
         (lambda one: one.update(executed=[]), None),
+        (lambda one: one["exposure"].update(multiples=10**9), "multiples = 1000000000 must be between 1 and"),
+        (lambda one: one["exposure"].update(multiples=0), "multiples = 0 must be between 1 and"),
+        (lambda one: one["exposure"].update(T="30"), "T = '30' must be a finite number"),
+        (lambda one: one["exposure"].update(T=-5), "T = -5 must be above 0"),
+        (lambda one: one["polarizer"].update(angle=None), "angle = None must be a finite number"),
+        (lambda one: one["polarizer"].update(angle=1e6), "angle = 1e.06 must be between 0 and 360"),
+        (lambda one: one.update(hwp=None), "hwp = None must be a table"),
     ],
 )
 def test_what_cannot_be_read_back_is_told(tmp_path: Path, change, message):
@@ -249,3 +256,28 @@ def test_what_cannot_be_read_back_is_told(tmp_path: Path, change, message):
         return
     with pytest.raises(DataError, match=message):
         read_schedule(tmp_path / "s.json", FILTERS)
+
+
+def test_exposures_of_science_are_left_out_and_other_types_refused(tmp_path: Path):
+    schedule = written(tmp_path / "s.json", PLAN.exposures())
+    schedule["targets"][-1]["type"] = "PAS"
+    (tmp_path / "s.json").write_text(json.dumps(schedule))
+    again, names, remarks = read_schedule(tmp_path / "s.json", FILTERS)
+    assert len(again) == len(PLAN.exposures()) - 1
+    assert schedule["targets"][-1]["target"] not in names
+    assert "no calibration (PAS and SCI), left out" in "; ".join(remarks)
+    schedule["targets"][-1]["type"] = "CAL-XXX"
+    (tmp_path / "s.json").write_text(json.dumps(schedule))
+    with pytest.raises(DataError, match="has the type CAL-XXX; give one of format v4"):
+        read_schedule(tmp_path / "s.json", FILTERS)
+
+
+def test_times_that_overlap_are_remarked_on(tmp_path: Path):
+    """Ends, or times of another kind, in place of the begin of each exposure."""
+    schedule = written(tmp_path / "s.json", PLAN.exposures())
+    for target in schedule["targets"]:
+        for one in target["acquisition"]:
+            one["executed"] = ["2026-11-26T01:00:00Z"] * one["exposure"]["multiples"]
+    (tmp_path / "s.json").write_text(json.dumps(schedule))
+    _, _, remarks = read_schedule(tmp_path / "s.json", FILTERS)
+    assert f"{len(PLAN.exposures()) - 1} exposures begin before the one ahead of them has ended" in remarks[0]

@@ -67,3 +67,17 @@ def test_nearest_and_above_the_horizon():
     for wrong in ("308", "a,b", "10,95"):
         with pytest.raises(UsageError, match="near"):
             walop.standards(near=wrong)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"near": "nan,0"}, "a right ascension is between 0 and 360 degrees"),
+        ({"near": "400,0"}, "a right ascension is between 0 and 360 degrees"),
+        ({"up": float("nan")}, "up = nan must be a time"),
+        ({"up": 2461000.5}, "is this a Julian Date"),
+    ],
+)
+def test_directions_and_times_that_are_none_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        walop.standards(**options)

@@ -25,11 +25,10 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.detection_limits import condition_limits
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.readings import with_places
+from walop_jax.diagnosis.rival_conditions import instead_of_names, rival_conditions
 from walop_jax.diagnosis.stated_conditions import (
     Singles,
     condition_scores,
-    instead_of_names,
-    rival_conditions,
     stated_conditions,
 )
 from walop_jax.diagnosis.trust import examined

@@ -5,20 +5,18 @@ import numpy as np
 import pytest
 
 from walop_jax.model import mueller
-from walop_jax.model.mueller import Matrix2
+from walop_jax.model.mueller import inverse2, product2
 
 ANGLES = np.deg2rad([0.0, 17.0, 22.5, 45.0, 90.0, 133.0])
 
 
 def jones(matrix):
-    return Matrix2(
-        *(jnp.asarray(np.asarray(matrix, complex)[i, j]) for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
-    )
+    return jnp.asarray(matrix, complex)
 
 
 def random_jones(rng, count=20):
     parts = rng.standard_normal((4, count)) + 1j * rng.standard_normal((4, count))
-    return Matrix2(*map(jnp.asarray, parts)), parts.T.reshape(count, 2, 2)
+    return jnp.asarray(parts.reshape(2, 2, count)), parts.T.reshape(count, 2, 2)
 
 
 # -------------------------------------------------------------------------------------- hand-typed matrices
@@ -78,17 +76,15 @@ def test_from_jones_moves_stokes_vectors_as_the_field_moves():
     np.testing.assert_allclose(moved, stokes(after), rtol=1e-12, atol=1e-12)
 
 
-def test_matrix2_is_the_algebra_of_two_by_two_matrices():
+def test_products_and_inverses_of_two_by_two_matrices():
     rng = np.random.default_rng(2)
     (a, matrix_a), (b, matrix_b) = random_jones(rng), random_jones(rng)
 
     def back(m):
-        return np.stack([np.asarray(v) for v in m], -1).reshape(-1, 2, 2)
+        return np.asarray(m).reshape(4, -1).T.reshape(-1, 2, 2)
 
-    np.testing.assert_allclose(back(a @ b), matrix_a @ matrix_b, rtol=1e-12)
-    np.testing.assert_allclose(back(a.plus(b)), matrix_a + matrix_b, rtol=1e-12)
-    np.testing.assert_allclose(back(a.inverse()), np.linalg.inv(matrix_a), rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(back(a.times(3.0)), 3 * matrix_a, rtol=1e-12)
+    np.testing.assert_allclose(back(product2(a, b)), matrix_a @ matrix_b, rtol=1e-12)
+    np.testing.assert_allclose(back(inverse2(a)), np.linalg.inv(matrix_a), rtol=1e-10, atol=1e-12)
 
 
 # ------------------------------------------------------------------------------------------------ identities

@@ -66,7 +66,6 @@ def test_the_largest_of_quiet_series_is_as_the_bound_says():
         beyond, most = np.sum(np.array(largest) > u), tried.chance(u)
         assert stats.binom.sf(beyond - 1, 100, most) > 1e-3
         assert stats.binom.cdf(beyond, 100, 0.4 * most) > 1e-3
-    assert tried.chance(tried.alarm()) == pytest.approx(breaks.CHANCE, rel=0.02)
 
 
 def test_a_step_a_bad_night_and_a_drift():

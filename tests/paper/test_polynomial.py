@@ -52,6 +52,24 @@ def test_polynomial_is_least_squares():
         assert condition[p] == pytest.approx(np.linalg.cond(design / np.linalg.norm(design, axis=0)))
 
 
+def test_between_points_on_a_line_all_is_linear_along_it():
+    tilts, rng = np.array([10.0, 0.0, 5.0]), np.random.default_rng(3)
+    coefficients, transmission = rng.standard_normal((3, 2, 5)), rng.standard_normal((3, 4, 3))
+    made = paper.PaperCalibration(
+        tilts, np.ones(3), coefficients, transmission, coefficients[:, :, 0], coefficients[:, :, 1], tilts
+    )
+    at = made.between(np.array([5.0, 1.0, 12.5]), np.ones(3))
+    expected = [
+        transmission[2],
+        0.8 * transmission[1] + 0.2 * transmission[2],
+        1.5 * transmission[0] - 0.5 * transmission[2],
+    ]
+    np.testing.assert_allclose(at.transmission, expected, rtol=1e-12)
+    np.testing.assert_allclose(at.condition, [5.0, 1.0, 12.5], rtol=1e-12)
+    with pytest.raises(ValueError, match="nothing between them"):
+        made.between(np.array([5.0]), np.array([0.9]))
+
+
 def test_transmissions_do_not_need_the_fluxes():
     rng = np.random.default_rng(1)
     vectors = pair(0.04)[None] * rng.uniform(0.9, 1.1, (5, 4, 1)) + 0.03 * rng.standard_normal((5, 4, 3))

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.posterior.samplers import Density
-from walop_jax.posterior.target import Target, exact_density
+from walop_jax.posterior.target import exact_density
 
 from .conftest import Scene
 
@@ -29,7 +26,9 @@ def place(scene: Scene) -> np.ndarray:
 def test_it_is_the_objective_of_the_fit_in_whitened_coordinates(
     scene: Scene, density: Density, place: np.ndarray
 ) -> None:
+    """The fit has all points in one batch; the density has more, the last of them filled up."""
     target = scene.target
+    assert len(scene.result.likelihood.points) == 1 < len(density.arrays[0].data.x)
     sigma = np.sqrt(np.diag(target.covariance))
     again, given = (c / np.outer(sigma, sigma) for c in (target.root @ target.root.T, target.covariance))
     np.testing.assert_allclose(again, given, atol=1e-11)
@@ -49,19 +48,6 @@ def test_its_gradient_is_that_of_finite_differences(
         assert 0.5 * (up - down) == pytest.approx(gradient @ step, rel=1e-6, abs=1e-8)
     at_the_fit = density.value_and_gradient(np.zeros_like(place))[1]
     assert np.abs(at_the_fit).max() < 0.02 < np.abs(gradient).max()
-
-
-@pytest.mark.long
-def test_batches_make_no_difference(scene: Scene, density: Density, place: np.ndarray) -> None:
-    """Four batches, the last of them padded, are the same as one."""
-    one = scene.result.likelihood
-    cut = Likelihood.of(one.calset, one.model, batch=6)
-    several = Target(dataclasses.replace(scene.result, likelihood=cut))
-    assert (len(one.points), len(cut.points)) == (1, 4)
-    value, gradient = density.value_and_gradient(place)
-    again, its_gradient = exact_density(several).value_and_gradient(place)
-    assert again == pytest.approx(value, rel=ROUNDING)
-    np.testing.assert_allclose(its_gradient, gradient, rtol=1e-8, atol=1e-8)
 
 
 def test_inflation_divides_chi2_by_f_squared(scene: Scene, density: Density, place: np.ndarray) -> None:

@@ -17,7 +17,7 @@ import walop_jax as walop
 from walop_jax.io import names
 from walop_jax.io.display import Display
 from walop_jax.io.errors import DataError
-from walop_jax.reports.page import OTHERS, kind_of_run, render, render_other
+from walop_jax.reports.page import kind_of_run, render, render_other
 from walop_jax.reports.run import read_limits, read_run
 from walop_jax.reports.survey_figures import nights_figure
 
@@ -32,7 +32,7 @@ SHOWN = Display(
 
 def written(folder: Path, kind: str, **document: Any) -> tuple[str, tuple[str, ...]]:
     """The page about a folder with such a document, and what it lacks."""
-    (folder / OTHERS[kind].file).write_text(json.dumps({"shown": SHOWN.document(), **document}))
+    (folder / names.DOCUMENTS[kind]).write_text(json.dumps({"shown": SHOWN.document(), **document}))
     assert kind_of_run(folder) == kind
     return render_other(folder, kind)
 

@@ -101,7 +101,7 @@ def test_a_long_table_is_folded_with_its_facts_and_notes(rows):
 
 def test_a_no_go_stands_first(tmp_path):
     folder = handmade_run.make_refit(tmp_path / "run")
-    row = ("NO", "p known to 0.050 % in 50 % of the field", "0.088 %")
+    row = ("NO", "p known to 0.050 % in 50 % of the field", "0.088 % in 50 % of the field, 0.050 % allowed")
     shown = Display(
         "run/calibration.fits: NO GO", head=("", "requirement", "result"), rows=(row,), notes=("more light",)
     )

@@ -14,6 +14,7 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.fit.verdict import Hidden, Quality, Structure
 from walop_jax.science import apply as application
 from walop_jax.science.apply import apply
+from walop_jax.science.stokes_columns import about_counts
 
 pytestmark = pytest.mark.usefixtures("tabulated_once")
 
@@ -75,6 +76,30 @@ def test_a_camera_that_has_become_brighter_is_said(vectors, calibration, tmp_pat
     assert np.all(pulls(found, qu) < 1.3)
     # Before, every q or u was off by nine (three) stated errors.
     assert np.any(pulls(dataclasses.replace(found, changed=0.0 * found.changed), qu) > 1.5)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (2, 1, 0, 3)])
+def test_counts_that_are_none_of_the_instrument_are_no_change_of_it(vectors, calibration, tmp_path, order):
+    """A camera in another unit, or two exchanged: no size of a change is stated, however well it fits."""
+    flux = 10 ** np.random.default_rng(1).uniform(5.0, 7.0, (200, 1))
+    table, _ = noisy(vectors, tmp_path, count=200, flux=flux)
+    scale = np.array([1.0, 1e-3, 1.0, 1.0]) if order == (0, 1, 2, 3) else np.ones(4)
+    for name in ("N", "N_ERR"):
+        table[name] = table[name][:, list(order)] * scale
+    text = "; ".join(apply(calibration, read(table, tmp_path)).check.warnings())
+    assert "of all cameras in one unit and aperture, and in their order?" in text
+    assert "changed since the calibration" not in text
+
+
+def test_counts_with_errors_that_no_photons_have_and_unused_cameras_are_remarked_on():
+    counts = np.full((50, 4), 12.0)
+    (sentence,) = about_counts(counts, np.full((50, 4), 0.01), ("O1", "E1", "O2", "E2"))
+    assert "N_ERR is 3.5e+02 times smaller than the noise of photons" in sentence
+    counts = np.full((50, 4), 1e5)
+    assert list(about_counts(counts, counts**0.5 / 5, ("O1", "E1", "O2", "E2"))) == []  # mean of 25
+    counts[:40, 1] = np.nan
+    (sentence,) = about_counts(counts, counts**0.5, ("O1", "E1", "O2", "E2"))
+    assert "E1 is used in 10 of 50 rows" in sentence
 
 
 def test_two_settings_of_the_plate_name_the_camera(vectors, calibration, tmp_path):

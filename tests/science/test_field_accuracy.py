@@ -65,7 +65,7 @@ def test_good_enough_for_a_goal():
     strict = dataclasses.replace(known, goal=2e-4)
     what = ["0.020 % in 95 % of the field, 0.010 % allowed"]
     what += ["a systematic error of 0.030 % of q or u would go undetected"]
-    assert [one.what for one in strict.shortfalls] == what
+    assert [one.found for one in strict.shortfalls] == what
     # Errors fall with the square root of the light.
     assert strict.shortfalls[0].advice.startswith("4.0 times the light")
     assert strict.shortfalls[1].advice == "look"

@@ -368,6 +368,12 @@ def test_catalogues_of_different_exposures_are_refused(tmp_path):
         DataError, match=r"MJD is 61000.1 and 61000.1001 and 61000.2 in catalogues of one exposure"
     ):
         walop.gather(files)
+    for k, temperature in enumerate((10.0, 10.1, 10.0, 9.9)):  # of sensors beside each other
+        rewritten(files, k, lambda columns: None, {**CENTRE, "TEMP": temperature})
+    assert np.all(walop.gather(files)["TEMP"] == 10.0)
+    rewritten(files, 3, lambda columns: None, {**CENTRE, "TEMP": "cold"})
+    with pytest.raises(DataError, match=r"TEMP is 10.0 and 10.1 and cold in catalogues of one exposure"):
+        walop.gather(files)
 
 
 def test_fluxes_in_different_apertures_are_refused(tmp_path):

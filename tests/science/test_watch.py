@@ -201,6 +201,18 @@ def test_an_arm_a_gradient_and_a_spot_are_told_as_that(kind, vectors):
             assert abs(entry.size) <= 10.0 * width
 
 
+@pytest.mark.parametrize(("depth", "radius"), [(0.1, 0.07), (0.01, 0.05)])
+def test_a_spot_of_few_stars_is_found_however_deep(depth, radius):
+    """Of 600 stars some twenty, and some twelve, lie in it: 100 σ off, and 10 σ."""
+    (change,) = study.watched(600, 5, study.spot(-depth, 2, 0.05, -0.08, radius)).changes
+    best, size = change.best, {entry.name: entry.size for entry in change.alike}
+    assert best.kind == "spot"
+    assert change.between[0] <= 60000.0 + study.START <= change.between[1]
+    assert size["O2"] == pytest.approx(-depth, rel=0.15)
+    assert np.hypot(best.place[0] - 0.05, best.place[1] + 0.08) < 0.2 * radius
+    assert best.place[2] == pytest.approx(radius, rel=0.2)
+
+
 def test_three_stars_that_lie_off_are_no_spot_and_no_optics():
     def odd(night, x, y):
         change = np.zeros((len(x), 4))

@@ -34,7 +34,7 @@ jax.config.update("jax_enable_x64", True)
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np  # noqa: E402
-from scipy import linalg, stats  # noqa: E402
+from scipy import linalg, optimize, stats  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.calibration.product import read_calibration  # noqa: E402
@@ -62,6 +62,11 @@ CHANGING = (
     "collimator.diattenuation", "throughput.n2.p10", "throughput.n3.p01",
 )  # fmt: skip
 """Parameters that change in the series of `smallest` and `stars`."""
+
+
+def alarm_of(tried: breaks.Tried) -> float:
+    """The |z| from which a change is a break."""
+    return float(optimize.brentq(lambda u: tried.chance(u) - breaks.CHANCE, 3.0, 12.0, xtol=1e-3))
 
 
 def cpu() -> float:
@@ -146,7 +151,7 @@ def quiet(count: int, start: int = 0, nights: int = 1000) -> None:
             for s, w in zip(every, weights[:2], strict=True)
         ]
         largest += np.maximum(*z).tolist()
-    alarm = tried.alarm()
+    alarm = alarm_of(tried)
     rates = ", ".join(
         f"{np.mean(np.array(largest) > u):.4f} ({tried.chance(u):.4f}) beyond {u:.2f}"
         for u in (5.1, 5.3, alarm)
@@ -222,7 +227,7 @@ def sealed(count: int, start: int = 0, nights: int = 200) -> None:
         last = first + 1 if bad else nights
         plain = together(nights_at(truth, days, rng))
         laws = laws_of_all(plain, LAWS)
-        alarm = alarm or breaks.Tried.of(breaks.solved(plain, laws)).alarm()
+        alarm = alarm or alarm_of(breaks.Tried.of(breaks.solved(plain, laws)))
         known = 0.0
         while not known > 0.0:
             name = str(rng.choice(names))
@@ -323,7 +328,7 @@ def smallest(count: int, start: int = 0, nights: int = 200) -> None:
         plain = together(nights_at(truth, days, rng))
         laws = laws_of_all(plain, LAWS)
         one = 1.0 / np.sqrt(information(plain, laws, i, middle, nights))
-        alarm = breaks.Tried.of(breaks.solved(plain, laws)).alarm()
+        alarm = alarm_of(breaks.Tried.of(breaks.solved(plain, laws)))
         sigma = float(np.median(tracks(truth[:6], days[:6])[1][:, i]))
         ours, person = alarm * one, 3.0 * np.sqrt(2.0) * sigma
         found, theirs = [], np.nan

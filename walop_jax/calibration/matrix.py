@@ -233,28 +233,36 @@ def planned_matrices(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -
     return light.instrument_matrix(sky_vectors(instrument, plan, x, y)[:, 0], instrument.cameras.pairs)
 
 
+def of_matrix(
+    vectors: Float[np.ndarray, "... k 3"],
+    added: Float[np.ndarray, "... k 3"],
+    pairs: Sequence[tuple[int, int]],
+) -> Float[np.ndarray, "... a 3"]:
+    """Change of the instrument matrix, to first order, where the analysis vectors change.
+
+    m = (a₁ − a₂) / (a₁₀ + a₂₀), a₁, a₂ the analysis vectors of the cameras of an arm.
+    """
+    i, j = (np.array([pair[n] for pair in pairs], int) for n in (0, 1))
+    total = vectors[..., i, :1] + vectors[..., j, :1]
+    common = light.instrument_matrix(vectors, tuple(pairs)) * (added[..., i, :1] + added[..., j, :1])
+    return (added[..., i, :] - added[..., j, :] - common) / total
+
+
 def _matrix_and_slopes(
     instrument: Instrument, plan: Plan
 ) -> Callable[..., tuple[Float[np.ndarray, "p a 3"], Float[np.ndarray, "p a 3 n"]]]:
-    """A function of rows as those of `_slopes_at`: matrices, and their derivatives in all parameters.
-
-    m = (a₁ − a₂) / (a₁₀ + a₂₀) in the one band of the plan, a₁, a₂ the analysis vectors of the cameras of an arm.
-    """
-    first, second = (np.array([pair[i] for pair in instrument.cameras.pairs], int) for i in (0, 1))
+    """A function of rows as those of `_slopes_at`: matrices in the one band of the plan, and their derivatives."""
     plain, series = plain_positions(instrument), series_indices(instrument)
-    size = values_of(instrument).size
+    size, pairs = values_of(instrument).size, instrument.cameras.pairs
 
     def at(*columns: Array) -> tuple[np.ndarray, np.ndarray]:
         vectors, slopes = (np.asarray(d)[..., 0, :, :] for d in _slopes(instrument, plan, *columns))
-        a, b = (np.moveaxis(slopes[..., arms, :], 1, -1) for arms in (first, second))
-        total = (vectors[:, first, :1] + vectors[:, second, :1])[..., None]
-        m = light.instrument_matrix(vectors, instrument.cameras.pairs)
-        change = (a - b - m[..., None] * (a[..., :1, :] + b[..., :1, :])) / total
+        change = np.moveaxis(of_matrix(vectors[:, None], slopes, pairs), 1, -1)
         basis = instrument.throughput.basis(*map(np.asarray, columns[:2]))[:, None, None, None]
-        result = np.empty((*m.shape, size))
+        result = np.empty((*change.shape[:-1], size))
         result[..., plain] = change[..., : len(plain)]
         result[..., series] = through_series(change[..., None, len(plain) :], basis)
-        return m, result
+        return light.instrument_matrix(vectors, pairs), result
 
     return at
 
@@ -339,18 +347,17 @@ def slopes_over_field(
 ) -> tuple[Float[np.ndarray, "p a 3"], Float[np.ndarray, "p a 3 n"]]:
     """`matrix_slopes` at many positions, interpolated where the optics are smooth.
 
-    `counts` of nodes per side are tried in turn, until standard errors are right to `tolerance` (relative) wherever
-    that is checked (`field_table.held_out`).
+    `counts` of nodes per side are tried in turn, until elements, and standard errors relative to themselves, are right
+    to `tolerance` wherever that is checked (`field_table.held_out`).
     """
-
-    def exact(x: Vector, y: Vector) -> tuple[np.ndarray, np.ndarray]:
-        return matrix_slopes(instrument, setting, filters, x, y)
+    exact = functools.partial(matrix_slopes, instrument, setting, filters)
 
     def error(interpolated: tuple[np.ndarray, np.ndarray], truth: tuple[np.ndarray, np.ndarray]) -> float:
         errors, true_errors = (
             np.sqrt(np.sum(slopes @ covariance * slopes, axis=-1)) for _, slopes in (interpolated, truth)
         )
-        return float(np.max(np.abs(errors - true_errors) / np.where(true_errors > 0, true_errors, 1.0)))
+        relative = np.abs(errors - true_errors) / np.where(true_errors > 0, true_errors, 1.0)
+        return float(max(relative.max(), np.abs(interpolated[0] - truth[0]).max()))
 
     corners = Rectangle(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]))
     table = None

@@ -7,68 +7,38 @@ imported at its head, so that its options appear at once.
 from __future__ import annotations
 
 import gc
+import itertools
 import os
+import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-GROUPS: Mapping[str, Mapping[str, str]] = {
-    "Begin": {
-        "demo": "Fit the small calibration set that comes with the package, write its page, and correct stars.",
-        "docs": "Print a reference page, or the list of pages.",
-    },
-    "Calibrate": {
-        "exposures": "Make the table EXPOSURES of a calibration set from the records of an observatory.",
-        "inspect": "List the contents and the faults of calibration sets.",
-        "refit": "Fit all field points of calibration sets jointly.",
-        "clip": "Flag single intensities that lie far from a fit of all others.",
-        "diagnose": "Find the effects that the model lacks, add them, and fit again.",
-        "sample": "Sample the posterior.",
-        "report": "Write one HTML page about a run, figures inside.",
-        "plot": "Draw a figure of a run, by name, as a file.",
-    },
-    "Correct stars": {
-        "matrix": "Give the instrument matrix at a field point, or at every point of a table.",
-        "gather": "Make one catalogue, a row a star, of those of the cameras.",
-        "apply": "Turn the intensities of stars into Stokes parameters.",
-    },
-    "Check a calibration": {
-        "certify": "Check a calibration from its checksums to its physics and its accuracy.",
-        "limits": "Compute the size at which every effect would be detected and named in calibration sets.",
-        "compare": "Compare the method of Paper II, as it is published, with the joint fit.",
-    },
-    "Many nights": {
-        "epoch": "Fit new calibration sets and compare with an old calibration.",
-        "watch": "Find when a calibration became invalid, from the stars of many nights.",
-        "affected": "List the catalogues that a new calibration changes, and by how much.",
-        "quality": "Add a row of quality numbers for each night to a table, and list those outside their limits.",
-        "stack": "Fit many nights at once, each parameter under a law of its change with time.",
-    },
-    "Plan and rehearse": {
-        "plan": "Plan the calibration exposures of a night.",
-        "simulate": "Make a calibration set of an instrument whose as-built values are drawn from their priors.",
-    },
-    "Describe an instrument": {
-        "model": "Write the base model as a file.",
-        "instrument": "Print and check an instrument.",
-        "trace": "Follow the light of one source through the instrument.",
-        "standards": "List standard stars with band, errors, variability and source.",
-        "import-zemax": "Make a calibration set (KIND flux) of the transmissions that an optical design program gives.",
-    },
-    "Credits and conformance": {
-        "cite": "List the sources of the physics in a fitted model, effects included.",
-        "conformance": "Put another program to the test.",
-    },
+GROUPS: Mapping[str, Sequence[str]] = {
+    "Begin": ("demo", "docs"),
+    "Calibrate": ("exposures", "inspect", "refit", "clip", "diagnose", "sample", "report", "plot"),
+    "Correct stars": ("matrix", "gather", "apply"),
+    "Check a calibration": ("certify", "limits", "compare"),
+    "Many nights": ("epoch", "watch", "affected", "quality", "stack"),
+    "Plan and rehearse": ("plan", "simulate"),
+    "Describe an instrument": ("model", "instrument", "trace", "standards", "import-zemax"),
+    "Credits and conformance": ("cite", "conformance"),
 }
-"""The commands in the groups of the help, each with its line there: the first sentence of its docstring."""
+"""The commands in the groups of the help. `import-zemax` is the function `import_zemax` of `import_zemax.py`."""
 
-COMMANDS = {name: line for commands in GROUPS.values() for name, line in commands.items()}
-"""Every command in the order of the help, with its line there.
-
-`import-zemax` is the function `import_zemax` of `import_zemax.py`, and so on.
-"""
+COMMANDS = tuple(itertools.chain(*GROUPS.values()))
+"""Every command in the order of the help."""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
+
+
+def line_of(name: str) -> str:
+    """The line of a command in the help: its docstring until the first colon or full stop, read from the source."""
+    word = name.replace("-", "_")
+    source = Path(__file__).with_name(f"{word}.py").read_text(encoding="utf-8")
+    (first,) = re.findall(rf'^def {word}\(.*?"""(.+?)[:.]\s', source, re.DOTALL | re.MULTILINE)
+    return f"{' '.join(first.split())}."
 
 
 def main() -> None:

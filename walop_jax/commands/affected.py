@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.apply import calibration_for
 from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command
-from walop_jax.commands.products import Effects, Product, named_tables
+from walop_jax.commands.products import Effects, Product
+from walop_jax.commands.tables import named_tables
 from walop_jax.io.names import AFFECTED
 
 if TYPE_CHECKING:

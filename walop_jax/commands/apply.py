@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, command_of
+from walop_jax.commands.command import (
+    Argument,
+    Job,
+    Option,
+    Outcome,
+    UsageError,
+    command,
+    command_of,
+    several,
+)
 from walop_jax.commands.each import EACH, SCHEDULER, WORKERS, for_each
 from walop_jax.commands.gather import gather
 from walop_jax.commands.inputs import TableFile
@@ -18,10 +27,8 @@ from walop_jax.commands.products import (
     Product,
     calibration_of,
     catalogue_of,
-    several,
-    table_of,
-    table_outcome,
 )
+from walop_jax.commands.tables import table_of, table_outcome
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
@@ -40,8 +47,6 @@ COMMON = Option(
 )
 DEBIAS = Option("Estimator of P_DEBIASED: Plaszczynski et al. 2014, or Wardle and Kronberg 1974.", "MAS|WK")
 SATURATION = Option("Counts from here on are not used (FLAG 256).", "ELECTRONS", float)
-BRIGHT = 1000.0  # electrons: their errors are a few per cent, with a read noise of 100 electrons a tenth
-APART = 0.005  # deg: rows of one star that lie farther apart may be those of two
 FORCE = Option("Also stars whose filter or temperature it does not cover (FLAG 2048).")
 
 
@@ -102,7 +107,13 @@ def apply(
     from walop_jax.science.catalogue import read_catalogue
     from walop_jax.science.overlaps import overlap
     from walop_jax.science.polarisation import ESTIMATORS
-    from walop_jax.science.stokes_columns import header, stokes_columns
+    from walop_jax.science.stokes_columns import (
+        counted_flags,
+        errors_in_words,
+        header,
+        sentences,
+        stokes_columns,
+    )
 
     if (workers is not None or scheduler is not None) and not each:
         raise UsageError("a single table is made by one process; see --each", "workers")
@@ -137,12 +148,6 @@ def apply(
     job.begin("writing")
     columns = stokes_columns(stars, rows.star, debias)
     on_the_sky = sum(map(math.isfinite, rows.rotator)) / max(len(rows.rotator), 1)
-    at_places = {place.words() for place in stars.check.places}
-    doubts = (
-        f"{text} (FLAG {Quality.PLACE if text in at_places else Quality.CATALOGUE:d})"
-        for text in stars.check.warnings()
-    )
-    alone = len(set(rows.star.tolist())) == len(rows.star) and len(used.model.template.arms) == 1
     outcome = table_outcome(
         job,
         held,
@@ -150,12 +155,10 @@ def apply(
         columns,
         header(held.content_hash(), debias, on_the_sky, stars.check),
         output,
-        counted=_counted(alone),
+        counted=counted_flags(rows, used.model.template),
         warnings=[
             *gathering_remarks,
-            *doubts,
-            *_about_noise(rows.counts, rows.sigma),
-            *_about_places(rows, stars.flag),
+            *sentences(rows, stars, instrument.cameras.names),
             *([] if seen_twice is None else seen_twice.warnings()),
         ],
         remade=_common if common else None,
@@ -169,7 +172,8 @@ def apply(
     )
     crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
     zones = f"; {crossed} in zones of high cross-talk (FLAG 16)" if crossed else ""
-    text = f"{output}: {len(outcome.value)} rows, {len(stars.qu)} stars, {job.seconds:.1f} s{_errors(columns)}{zones}"
+    stars_of = f"{len(outcome.value)} rows, {len(stars.qu)} stars, {job.seconds:.1f} s"
+    text = f"{output}: {stars_of}{errors_in_words(columns)}{zones}"
     return dataclasses.replace(outcome, text=text, next=(f"topcat {output}",) if common else ())
 
 
@@ -182,7 +186,7 @@ def _table_of(catalogue: Any, held: Calibration | None) -> tuple[InputTable, Seq
 
     instrument = None if held is None else held.design
     gathered = command_of(gather).run(Job(), {"catalogues": catalogue, "instrument": instrument})
-    return in_memory(gathered.value, ", ".join(map(str, catalogue))), gathered.warnings
+    return in_memory(gathered.value, "stars of the cameras"), gathered.warnings
 
 
 def _common(made: Any) -> tuple[Any, Sequence[str]]:
@@ -203,55 +207,3 @@ def calibration_for(
     if is_survey(given):
         return calibration_of_stars(read_survey(given, catalogue_of(effects)), stars, force=force)
     return calibration_of(given, effects)
-
-
-def _counted(alone: bool) -> dict[Any, str]:
-    """The bits of FLAG that are counted, with their warnings; `alone`: stars of one row each, of a single arm."""
-    from walop_jax.fit.verdict import Quality
-
-    settings = ": with one arm a star needs rows at several settings, of one ID" if alone else ""
-    quiet = (Quality.HIGH_CROSSTALK, Quality.CAMERA_MISSING, Quality.SATURATED, Quality.VALIDITY_FORCED)
-    return dict.fromkeys((*quiet, Quality.UNKNOWN_COLOUR), "") | {
-        Quality.NO_STOKES: f"star(s) without a result (FLAG 16384){settings}",
-        Quality.BEYOND_FIELD: "star(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)",
-        Quality.BEYOND_SETTINGS: "star(s) with a filter, temperature or TEFF beyond the calibration",
-        Quality.DISAGREES: "star(s) whose intensities disagree with the calibration (FLAG 131072, CHI2): is "
-        "the background subtracted, are the cameras in order?",
-        Quality.PLACE: "star(s) at a place of the field where stars disagree with the calibration together "
-        "(FLAG 1048576): their errors are enlarged",
-        Quality.OTHER_FRAME: "star(s) without ROTATOR, in the frame of the instrument (FLAG 2097152)",
-        Quality.REPEATED: "star(s) with the place and counts of another star or setting (FLAG 4194304)",
-    }
-
-
-def _about_noise(counts: Any, sigma: Any) -> Iterator[str]:
-    """A sentence where errors of bright stars are as large as their counts."""
-    import numpy as np
-
-    bright = counts > BRIGHT
-    if bright.any() and (share := float(np.median(sigma[bright] / counts[bright]))) > 0.5:
-        yield f"N_ERR of bright stars is {share:.2g} times N: are these variances? Standard errors are wanted"
-
-
-def _about_places(rows: Any, flag: Any) -> Iterator[str]:
-    """A sentence where rows of one star disagree, and lie at different places of the field."""
-    from walop_jax.fit.verdict import Quality
-    from walop_jax.science.overlaps import extents
-
-    if number := int(((extents(rows) > APART) & (flag & Quality.DISAGREES > 0)).sum()):
-        yield f"{number} of the stars that disagree have rows at different places: is their ID that of one star?"
-
-
-def _errors(columns: Mapping[str, tuple[Any, ...]]) -> str:
-    """The median error of p, and how much of it is noise of photons; empty where no star has one."""
-    import numpy as np
-
-    error, q, u, *photons = (columns[name][0] for name in ("P_ERR", "Q_ERR", "U_ERR", "Q_PHOTON", "U_PHOTON"))
-    measured = error > 0
-    if not measured.any():
-        return ""
-    share = sum(values[measured] ** 2 for values in photons) / (q[measured] ** 2 + u[measured] ** 2)
-    return (
-        f"; error of p {100 * float(np.median(error[measured])):.2g} % (median), photons make "
-        f"{100 * float(np.median(share)):.0f} % of its variance"
-    )

@@ -3,83 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Job, Option, Outcome, PathLike, command
 from walop_jax.commands.products import IN_MEMORY, Effects, Product, catalogue_of, fit_of, folder_of
-from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, errors_naming
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run
-    from walop_jax.calibration.certify import Check, Validity
     from walop_jax.model.effects import EffectKind
-    from walop_jax.science.commissioning import Requirement
+    from walop_jax.science.commissioning import Certificate
+    from walop_jax.science.field_accuracy import Requirement
 
 DOCUMENT = "commissioning.json"
 FOLDER = Option(f"Folder for {DOCUMENT}; it may be that of the fit.", "RUN", Path, "-o")
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class Certificate(Displayed):
-    """The checks of a product and its requirements for stars, its range of application, hash, and parents.
-
-    `content` is its content hash, `parents` are the SHA-256 of its inputs.
-    """
-
-    path: Path
-    checks: tuple[Check, ...]
-    requirements: tuple[Requirement, ...]
-    validity: Validity
-    content: str
-    parents: tuple[str, ...]
-
-    @property
-    def failed(self) -> tuple[Check, ...]:
-        """The checks that do not hold; the product is valid if there are none."""
-        return tuple(check for check in self.checks if not check.passed)
-
-    @property
-    def go(self) -> bool:
-        """True if the product is valid and everything that is needed is met."""
-        from walop_jax.science.commissioning import is_go
-
-        return not self.failed and is_go(self.requirements)
-
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """Advice on requirements that are not met, the needed ones first."""
-        from walop_jax.science.commissioning import requirement_advice
-
-        return requirement_advice(self.requirements)
-
-    def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
-        from walop_jax.calibration.product import PRODVERS
-
-        return {
-            "product": str(self.path),
-            "go": self.go,
-            "requirements": [dataclasses.asdict(requirement) for requirement in self.requirements],
-            "valid": not self.failed,
-            "schema": PRODVERS,
-            "content": self.content,
-            "parents": list(self.parents),
-            "validity": self.validity._asdict(),
-            "checks": [check._asdict() for check in self.checks],
-        }
-
-    def display(self) -> Display:
-        """Go or no-go, a line for each check and requirement, and advice on those that are not met."""
-        from walop_jax.science.commissioning import requirement_rows
-
-        rows = [("ok" if check.passed else "FAILED", check.name, check.found) for check in self.checks]
-        rows += requirement_rows(self.requirements)
-        title = f"{self.path}: {'go' if self.go else 'NO GO'}"
-        return Display(title, head=("", "requirement", "result"), rows=tuple(rows), notes=self.missing)
 
 
 @command(writes=(DOCUMENT,))
@@ -110,6 +49,7 @@ def certify(
     from walop_jax.calibration.certify import certify as checks_of
     from walop_jax.calibration.certify import validity
     from walop_jax.calibration.product import product_path, read_product
+    from walop_jax.science.commissioning import Certificate
 
     job.tell("checking")
     source: Any = fit_of(calibration)

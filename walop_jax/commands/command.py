@@ -209,12 +209,12 @@ class Outcome(Generic[T]):
 ELEMENTS = Option("Kinds of elements of your own; see walop-jax docs adding-an-instrument.", "FILE.py", Path)
 """Of every command that reads instruments, runs or models: of the commands that take effects of one's own."""
 
-COMMON = {
-    "overwrite": (False, Option("Replace outputs that exist.")),
-    "progress": (None, None),
-    "seed": (0, Option("Seed of random numbers (default: 0).", kind=int)),
+COMMON: Mapping[str, tuple[Any, Any, Option | None]] = {
+    "overwrite": (False, bool, Option("Replace outputs that exist.")),
+    "progress": (None, Callable[[str], None] | None, None),
+    "seed": (0, int, Option("Seed of random numbers (default: 0).", kind=int)),
 }
-"""The parameters that every command takes in Python, with their defaults, and their options."""
+"""The parameters that every command takes in Python, with their defaults, kinds and options."""
 
 OF_MODELS = ("free", "fixed", "fix", "frozen", "start", "prior", "priors", "tie", "ties", "bounds")
 IN_THE_MODEL = (
@@ -271,17 +271,12 @@ class Command(Generic[T]):
     @functools.cached_property
     def signature(self) -> inspect.Signature:
         """The signature of the Python function: its own arguments, then those that all commands share."""
-        shared: dict[str, tuple[Any, Any]] = {"elements": (None, PathLike | Sequence[type] | None)}
-        shared |= {
-            "overwrite": (False, bool),
-            "progress": (None, Callable[[str], None] | None),
-            "seed": (0, int),
-        }
+        shared = {"elements": (None, PathLike | Sequence[type] | None, ELEMENTS), **COMMON}
         absent = {"elements": not self.elements, "overwrite": self.writes is None}
         keyword = inspect.Parameter.KEYWORD_ONLY
         added = (
             inspect.Parameter(name, keyword, default=default, annotation=kind)
-            for name, (default, kind) in shared.items()
+            for name, (default, kind, _) in shared.items()
             if not absent.get(name)
         )
         return inspect.Signature([*self.own, *added])

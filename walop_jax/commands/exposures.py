@@ -52,7 +52,7 @@ def exposures(
     if first.suffix.lower() == ".json" and len(paths) == 1:
         try:
             content = json.loads(read_text(first))
-        except json.JSONDecodeError:
+        except (json.JSONDecodeError, RecursionError):
             content = None  # an error of the reader below
     if is_schedule(content):
         executed, names, remarks = read_schedule(first, rules.filters)

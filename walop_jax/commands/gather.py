@@ -109,10 +109,11 @@ def gather(
 
 
 def _check_order(catalogues: Sequence[PathLike], names: Sequence[str]) -> None:
-    """Refuse a catalogue whose file has the name of another camera."""
+    """Refuse a catalogue whose file has the name of another camera, such as O1; A and 1 may mean anything."""
+    telling = {name.upper() for name in names if len(name) > 1 and not name.isdigit()}
     for path, name in zip(catalogues, names, strict=True):
-        parts = set(re.split(r"[^A-Z0-9]+", Path(path).name.upper()))
-        if len(of := parts & {name.upper() for name in names}) == 1 and name.upper() not in of:
+        stated = telling & set(re.split(r"[^A-Z0-9]+", Path(path).name.upper()))
+        if len(stated) == 1 and name.upper() not in stated:
             what = f"{path} is given in the place of camera {name}"
             raise UsageError(
                 f"{what}: the order is {', '.join(names)}; rename it if it is of {name}", "catalogues"

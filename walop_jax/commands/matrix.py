@@ -16,9 +16,8 @@ from walop_jax.commands.products import (
     Product,
     angles_of,
     calibration_of,
-    table_of,
-    table_outcome,
 )
+from walop_jax.commands.tables import table_of, table_outcome
 from walop_jax.io.errors import errors_naming, fail, nearest
 
 POINTS = Option("FITS, CSV, ECSV or VOTable with X, Y in degrees.", "TABLE", Path)

@@ -1,4 +1,4 @@
-"""Calibrations and tables as arguments of commands, and tables with the columns that a calibration adds.
+"""Calibrations as arguments of commands.
 
 A calibration may be given in memory, by its file or by the folder of a run. What is given in place of one of them is a
 TypeError that names its type and the types wanted.
@@ -9,18 +9,16 @@ from __future__ import annotations
 import dataclasses
 import os
 import reprlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, several
+from walop_jax.commands.command import Argument, Option, PathLike, UsageError
 from walop_jax.fit.parameter_table import Fitted
 from walop_jax.io.text import in_ascii
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run
-    from walop_jax.data.user_tables import InputTable
-    from walop_jax.fit.verdict import Quality
     from walop_jax.model.effects import EffectKind
     from walop_jax.posterior.result import PosteriorSample
 
@@ -135,33 +133,6 @@ def angles_of(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float
     return angles
 
 
-def table_of(given: Any, columns: Mapping[str, Any]) -> InputTable:
-    """A table: a file of one, an astropy table, or columns by name; `columns` are added, or stand in place of its."""
-    from walop_jax.data.user_tables import in_memory, read_input_table
-
-    named = {name.upper(): values for name, values in columns.items()}
-    if isinstance(given, Mapping):
-        return in_memory({key: given[key] for key in given if str(key).upper() not in named} | named)
-    read = read_input_table(given) if isinstance(given, str | os.PathLike) else in_memory(given)
-    if not named:
-        return read
-    unchanged = {key: read.table[key] for key in read.table.colnames if str(key).upper() not in named}
-    combined = in_memory(unchanged | named, str(read.path))
-    combined.table.meta.update(read.table.meta)
-    combined.remarks.extend(read.remarks)
-    return combined
-
-
-def named_tables(given: Any) -> list[tuple[str, InputTable]]:
-    """Tables, of files or in memory, with the names by which messages call them."""
-    if not several(given):
-        raise UsageError("give at least one table", "catalogues")
-    return [
-        (str(entry) if isinstance(entry, str | os.PathLike) else f"catalogue {number}", table_of(entry, {}))
-        for number, entry in enumerate(several(given), start=1)
-    ]
-
-
 def left_out_sentences(names: Sequence[str], source: PathLike | None = None) -> tuple[str, ...]:
     """A sentence for every effect that cannot be carried over; `source` is the file that the model comes from."""
     where = "" if source is None else f"{os.fspath(source)}: "
@@ -174,53 +145,3 @@ def left_out_sentences(names: Sequence[str], source: PathLike | None = None) -> 
 def left_out_cards(names: Sequence[str]) -> dict[str, str]:
     """The card NOTCARR of a table, which lists the effects that cannot be carried over; none where all are in it."""
     return {"NOTCARR": in_ascii(", ".join(names))} if names else {}
-
-
-def table_outcome(
-    job: Job,
-    held: Calibration,
-    table: InputTable,
-    columns: Mapping[str, tuple[Any, ...]],
-    cards: Mapping[str, Any],
-    output: PathLike | None,
-    *,
-    counted: Mapping[Quality, str],
-    warnings: Sequence[str] = (),
-    extra: Mapping[str, Any] | None = None,
-    remade: Callable[[Any], tuple[Any, Sequence[str]]] | None = None,
-) -> Outcome[Any]:
-    """A table with the columns added by a calibration, written if it has an output.
-
-    The bits of FLAG that are `counted` have a warning each, unless it is empty; `extra` goes into the document. Columns
-    of the table that are not used or are replaced are named. `remade` makes another table of that, with remarks.
-    """
-    from walop_jax.data.user_tables import extended
-    from walop_jax.io.plain_tables import write_table
-
-    lost = held.left_behind
-    extended_table = extended(table, columns, {**cards, **left_out_cards(lost)})
-    extended_table, other_remarks = (extended_table, ()) if remade is None else remade(extended_table)
-    if output is not None:
-        write_table(output, extended_table, overwrite=job.overwrite)
-    counts = {bit: int((columns["FLAG"][0] & bit > 0).sum()) for bit in sorted(counted)}
-    remarks = table.about(columns)
-    document = {
-        "output": output,
-        "rows": table.rows,
-        "trusted": held.verdict.trusted,
-        "flags": {str(int(bit)): count for bit, count in counts.items()},
-        "product": held.content_hash(),
-        NOT_CARRIED_OVER: list(lost),
-        "remarks": list(remarks),
-        **(extra or {}),
-    }
-    about = (f"{counts[bit]} {sentence}" for bit, sentence in counted.items() if sentence and counts[bit])
-    return Outcome(
-        extended_table,
-        document,
-        warnings=(
-            *held.warnings,
-            *left_out_sentences(lost, held.path),
-            *(f"{table.path}: {sentence}" for sentence in (*remarks, *other_remarks, *warnings, *about)),
-        ),
-    )

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from walop_jax.commands import COMMANDS, GROUPS, INTERRUPTED
+from walop_jax.commands import COMMANDS, GROUPS, INTERRUPTED, line_of
 from walop_jax.commands.command import COMMON, Argument, Command, Job, Option, Outcome, UsageError, command_of
 from walop_jax.io.progress import interrupts_answered
 
@@ -73,9 +73,9 @@ class _Commands(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """The list, group by group."""
         width = max(map(len, COMMANDS))
-        for title, commands in GROUPS.items():
+        for title, names in GROUPS.items():
             with formatter.section(title):
-                formatter.write_dl([(f"{name:<{width}}", line) for name, line in commands.items()])
+                formatter.write_dl([(f"{name:<{width}}", line_of(name)) for name in names])
 
 
 class _OneCommand(TyperCommand):
@@ -162,10 +162,8 @@ def _command(name: str) -> Any:
     word = name.replace("-", "_")
     command: Command[Any] = command_of(getattr(importlib.import_module(f"walop_jax.commands.{word}"), word))
     alone = typer.Typer(add_completion=False, rich_markup_mode=None)
-    page, line = _paragraphs(command.body), COMMANDS[name]
-    alone.command(name, cls=_OneCommand, context_settings=HELP, help=page, short_help=line)(
-        _function(command)
-    )
+    page = _paragraphs(command.body)
+    alone.command(name, cls=_OneCommand, context_settings=HELP, help=page)(_function(command))
     made: Any = typer.main.get_command(alone)
     made.advice = PRINTED if command.writes is None else INTO_ARGUMENT
     return made
@@ -176,7 +174,7 @@ def _function(command: Command[Any]) -> Callable[..., None]:
     defaults = {p.name: p.default for p in inspect.signature(command.body).parameters.values()}
     defaults["elements"] = None
     parameters = [_parameter(name, option, defaults[name]) for name, option in command.options.items()]
-    for name, (default, option) in COMMON.items():
+    for name, (default, _, option) in COMMON.items():
         if option is not None and (name != "overwrite" or command.writes is not None):
             parameters.append(_parameter(name, option, default, name == "seed" and not command.random))
     parameters += [_parameter("quiet", QUIET, False), _parameter("json", JSON, False)]

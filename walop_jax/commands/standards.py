@@ -33,7 +33,9 @@ def standards(
     import numpy as np
 
     from walop_jax.data.records import Site
+    from walop_jax.data.schema import EXPOSURES, check
     from walop_jax.data.standards import shipped_standards
+    from walop_jax.data.units import Place
     from walop_jax.instruments.description import default_name, read_description
     from walop_jax.sky.directions import separation
     from walop_jax.sky.moon import altitude
@@ -46,6 +48,9 @@ def standards(
         nearest = np.argsort(away, kind="stable")
         table, ra, dec = table[nearest], ra[nearest], dec[nearest]
     if up is not None:
+        if up != up:
+            raise UsageError("up = nan must be a time (MJD)", "up")
+        check({"MJD": np.array([up])}, {"MJD": EXPOSURES["MJD"]}, Place("up", ""))
         described: Any = default_name() if instrument is None else instrument
         place: Any = described.site if hasattr(described, "site") else read_description(described).place
         height = altitude(np.full(len(ra), up), ra, dec, Site(*place[:4]))
@@ -65,6 +70,8 @@ def _direction(near: str | tuple[float, float]) -> tuple[float, float]:
         ) from None
     if not -90.0 <= dec <= 90.0:
         raise UsageError(f"near = {near!r}: a declination is between -90 and 90 degrees")
+    if not -360.0 <= ra <= 360.0:
+        raise UsageError(f"near = {near!r}: a right ascension is between 0 and 360 degrees")
     return ra, dec
 
 

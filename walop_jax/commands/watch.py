@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command, figure_file
-from walop_jax.commands.products import Effects, Product, calibration_of, named_tables
+from walop_jax.commands.products import Effects, Product, calibration_of
+from walop_jax.commands.tables import named_tables
 
 if TYPE_CHECKING:
     from walop_jax.science.watch import Watch

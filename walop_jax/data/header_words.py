@@ -182,10 +182,10 @@ def _of_json(path: Path, rows: str) -> Iterator[Mapping[str, Any]]:
     text = read_text(path)
     try:
         content = json.loads(text)
-    except json.JSONDecodeError as error:
+    except (json.JSONDecodeError, RecursionError) as error:
         try:
             content = [json.loads(line) for line in text.splitlines() if line.strip()]
-        except json.JSONDecodeError:
+        except (json.JSONDecodeError, RecursionError):
             raise fail(f"is no JSON: {error}", file=path, advice="export the log again") from None
     for key in filter(None, rows.split(".")):
         if not isinstance(content, Mapping) or key not in content:
@@ -235,9 +235,12 @@ def _row(record: Mapping[str, Any], words: Words, file: str) -> dict[str, Any]:
             if word.optional:
                 continue
             listed = " or ".join(word.words)
-            like = nearest(word.words[0], record) if record else ""
+            there = any(name_of in record for name_of in word.words)
+            like = nearest(word.words[0], record) if record and not there else ""
             raise place.fail(
-                f"the word {listed} is missing", name, f"{like}; optional = true where it may be absent"
+                f"the word {listed} is {'empty' if there else 'missing'}",
+                name,
+                f"{like}{'; ' if like else ''}optional = true where it may be absent",
             )
         converted[name] = _value(value, name, rules[name], word, place)
     for name, value in converted.items():

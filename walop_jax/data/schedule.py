@@ -23,6 +23,7 @@ from walop_jax.data.records import Exposures, Position, Site
 from walop_jax.data.units import sexagesimal
 from walop_jax.io.errors import fail
 from walop_jax.io.text import read_text
+from walop_jax.io.toml import Reader
 
 TYPES: Mapping[str, str] = {"clp": "CAL-CAL", "lamp": "CAL-CAL", "moon": "CAL-MOO"}
 """Types of targets by KIND; of standards CAL-POL or CAL-UPO."""
@@ -32,8 +33,13 @@ KINDS_OF: Mapping[str, str] = {
     "CAL-POL": "standard",
     "CAL-UPO": "standard",
 }
+OF_SCIENCE = ("PAS", "SCI")
+"""Types of targets that are no calibration."""
 FASTEST = 3.0  # turns per minute
 MOST_FILTERS = 4
+MOST_EXPOSURES = 10_000
+"""Of an acquisition."""
+TOLERATED = 2.0 / 86400.0  # d: times are of whole seconds
 SLACK = 30.0  # minutes that a window is longer than its exposures, on both sides
 ALIKE = 180.0  # deg after which a wave plate is the same again
 ELEMENTS = {CALIBRATION_PLATE: "hwp", POLARISER: "polarizer"}
@@ -110,17 +116,24 @@ def read_schedule(
     """
     try:
         content = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
+    except (json.JSONDecodeError, RecursionError) as error:
         raise fail(f"is no JSON: {error}", file=path, advice="write it again") from None
     if not is_schedule(content):
         raise fail("is no schedule: it has no objects and targets", file=path, advice="give one of format v4")
-    where = {str(target.get("name")): target for target in content["objects"]}
+    where = {str(entry.get("name")): entry for entry in _tables(content["objects"], path, "objects")}
+    _tables(content["targets"], path, "targets")
     name_of = {number: name for name, number in filters.items()}
     rows, remarks = list(_read(content, where, name_of, path)), list[str]()
+    if science := [str(t.get("target")) for t in content["targets"] if t.get("type") in OF_SCIENCE]:
+        remarks.append(f"{path}: {', '.join(science)}: no calibration ({' and '.join(OF_SCIENCE)}), left out")
     if not rows:
         raise fail("has no exposures", file=path, advice="nothing to be read")
     if unknown := sum(not math.isfinite(row["mjd"]) for row in rows):
         remarks.append(f"{path}: {unknown} exposures without `executed`: their time is not known")
+    begin, end = (np.array([row["mjd"] + k * row["exptime"] / 2 / 86400.0 for row in rows]) for k in (-1, 1))
+    if early := int(np.sum(begin[1:] < end[:-1] - TOLERATED)):
+        what = "begin before the one ahead of them has ended"
+        remarks.append(f"{path}: {early} exposures {what}: are `executed` their begins, in UTC?")
     columns = {
         name: np.array([row[name] for row in rows]) for name in rows[0] if name not in ("positions", "target")
     }
@@ -231,56 +244,82 @@ def _read(
     content: Mapping[str, Any], where: Mapping[str, Any], name_of: Mapping[int, str], path: Any
 ) -> Iterator[dict[str, Any]]:
     for target in content["targets"]:
-        for number, acquisition in enumerate(target.get("acquisition", [])):
-            name = str(target.get("target"))
+        name, form = str(target.get("target")), str(target.get("type"))
+        if form in OF_SCIENCE:
+            continue
+        if form not in KINDS_OF and not form.startswith(("TES-", "LAB-")):
+            raise fail(f"target {name} has the type {form}", file=path, advice="give one of format v4")
+        for number, acquisition in enumerate(_tables(target.get("acquisition", []), path, "acquisition")):
             place = f"{path}: target {name}, acquisition {number}"
+            read = Reader(place)
             try:
-                count, seconds = acquisition["exposure"]["multiples"], acquisition["exposure"]["T"]
-                number_of_filter, plate, polariser = (
-                    acquisition["filter"],
-                    acquisition["hwp"],
-                    acquisition["polarizer"],
+                exposure, plate, polariser = (
+                    read.table(acquisition[key], "", f"{key} = ") for key in ("exposure", "hwp", "polarizer")
                 )
-            except (KeyError, TypeError) as error:
+                count, time, number_of_filter = exposure["multiples"], exposure["T"], acquisition["filter"]
+                inside = read.flag(polariser["engage"], "engage", "polarizer")
+                positions = {CALIBRATION_PLATE: plate, POLARISER: polariser}
+                seconds = read.positive(time, "T", "exposure")
+                settings = {p: _position(state, p, seconds, read) for p, state in positions.items()}
+            except KeyError as error:
                 raise fail(f"has no {error}", file=place, advice="see the format v4") from None
+            if not 1 <= read.whole(count, "multiples", "exposure") <= MOST_EXPOSURES:
+                raise read.fault("exposure", f"multiples = {count} must be between 1 and {MOST_EXPOSURES}")
             if number_of_filter not in name_of:
                 advice = f'give its name: filters = {{ "SDSS-r" = {number_of_filter} }} in the words'
                 raise fail(f"filter {number_of_filter} has no name", file=place, advice=advice)
-            began = acquisition.get("executed", [])
+            began = acquisition.get("executed") or []
             if began and len(began) != count:
                 raise fail(f"has {len(began)} times of {count} exposures", file=place, advice="one for each")
-            kind = "clp" if polariser["engage"] else KINDS_OF.get(str(target.get("type")), "lamp")
+            kind = "clp" if inside else KINDS_OF.get(form, "lamp").replace("clp", "lamp")
             coordinates = where.get(name, {})
-            positions = {CALIBRATION_PLATE: plate, POLARISER: polariser}
             for k in range(count):
                 yield {
                     "target": name,
-                    "kind": "lamp" if kind == "clp" and not polariser["engage"] else kind,
+                    "kind": kind,
                     "mjd": _mjd(began[k], place) + seconds / 2 / 86400.0 if began else math.nan,
-                    "exptime": float(seconds),
+                    "exptime": seconds,
                     "filter": name_of[number_of_filter],
-                    "ra": 15.0 * sexagesimal(coordinates.get("ra")),
-                    "dec": sexagesimal(coordinates.get("dec")),
-                    "positions": {p: _position(state, p, seconds, place) for p, state in positions.items()},
+                    "ra": 15.0 * _angle(coordinates.get("ra"), name, path),
+                    "dec": _angle(coordinates.get("dec"), name, path),
+                    "positions": settings,
                 }
 
 
-def _position(state: Mapping[str, Any], prefix: str, seconds: float, place: str) -> tuple[bool, float, float]:
-    if not state["engage"]:
+def _tables(value: Any, path: Any, what: str) -> list[Mapping[str, Any]]:
+    if not isinstance(value, list) or not all(isinstance(entry, Mapping) for entry in value):
+        raise fail(f"{what} is no list of records", file=path, advice="see the format v4")
+    return value
+
+
+def _angle(text: Any, name: str, path: Any) -> float:
+    try:
+        return sexagesimal(text)
+    except (ValueError, AttributeError):
+        raise fail(f"object {name}: {text!r} is no angle", file=path, advice="as 06:30:12.5") from None
+
+
+def _position(
+    state: Mapping[str, Any], prefix: str, seconds: float, read: Reader
+) -> tuple[bool, float, float]:
+    word = ELEMENTS[prefix]
+    if not read.flag(state["engage"], "engage", word):
         return False, math.nan, 0.0
     if not state.get("continuous"):
         if "angle" not in state:
-            raise fail("is in the beam without an angle", file=place, column=prefix, advice="give it")
-        return True, float(state["angle"]), 0.0
-    turn = 6.0 * float(state.get("speed", 0.0)) * seconds
+            raise fail("is in the beam without an angle", file=read.where, column=prefix, advice="give it")
+        if not 0.0 <= (angle := read.number(state["angle"], "angle", word)) <= 360.0:
+            raise read.fault(word, f"angle = {angle:g} must be between 0 and 360 degrees")
+        return True, angle, 0.0
+    turn = 6.0 * read.positive(state.get("speed"), "speed", word) * seconds
     if prefix == POLARISER:
         raise fail(
             "turns during the exposure",
-            file=place,
+            file=read.where,
             column=prefix,
             advice="leave it out, or take it at angles",
         )
-    _check_half_turns(turn, prefix, place)
+    _check_half_turns(turn, prefix, read.where)
     return True, 0.0, turn
 
 

@@ -103,9 +103,10 @@ def _begins(path: Path, start: bytes) -> bool:
 def _astropy_table(content: bytes | str, kind: str, **options: Any) -> Any:
     from astropy.table import Table  # imported here: it takes a third of a second
 
-    if isinstance(content, bytes):
-        return Table.read(io.BytesIO(content) if kind == "votable" else content.decode(), format=kind)
-    return Table.read(content, format=kind, **options)
+    if isinstance(content, bytes) and kind == "votable":
+        return Table.read(io.BytesIO(content), format=kind)
+    text = content.decode() if isinstance(content, bytes) else content
+    return Table.read(f"{text}\n", format=kind, **options)  # a text of one line would be the name of a file
 
 
 # ------------------------------------------------------------------------------------------------------------- FITS

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 
 from walop_jax.calibration.accuracy import LARGEST_P, change_of_qu
 from walop_jax.calibration.could_hide import as_text, change_by_effect, moves_with, turn_of
-from walop_jax.calibration.matrix import first_setting, matrix_slopes
+from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.diagnosis import thresholds
@@ -175,16 +175,6 @@ class _Starlight:
             number_of = (f"{probe.effect.name}.{parameter}", EFFECT, size, unit, probe.effect.revealed_by)
             acts = bool(np.abs(added).max(initial=0.0) > _NOTHING)
             yield _Mistake(*number_of, along[:, number], bool(alive[number]), effect, change, acts)
-
-
-def of_matrix(
-    vectors: Float[np.ndarray, "p k 3"], added: Float[np.ndarray, "p k 3"], pairs: Sequence[tuple[int, int]]
-) -> Float[np.ndarray, "p a 3"]:
-    """Change of the instrument matrix, to first order, where the analysis vectors change."""
-    i, j = ([pair[i] for pair in pairs] for i in (0, 1))
-    light = vectors[:, i, :1] + vectors[:, j, :1]
-    matrix = (vectors[:, i] - vectors[:, j]) / light
-    return (added[:, i] - added[:, j] - matrix * (added[:, i, :1] + added[:, j, :1])) / light
 
 
 def _at_sizes(probe: Probe, sizes: Float[np.ndarray, " a"]) -> Iterator[tuple[str, Effect]]:

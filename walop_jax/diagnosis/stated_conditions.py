@@ -29,25 +29,22 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy import special
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.exact import log_evidence_ratio
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates, applicable, probes, showable
 from walop_jax.diagnosis.readings import with_exposures, with_places
-from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, ScoreTable, corrected_p, local_p
-from walop_jax.fit.refit import NEARLY, FitResult, fit
+from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, ScoreTable, corrected_p
+from walop_jax.fit.refit import NEARLY
 from walop_jax.io.text import with_error
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import effect_context
 
-_SHOWN = 4  # alternatives that are told in words
-_FITTED, _ROUNDS = 3, 3  # stated numbers that are fitted exactly, and steps of each
-_ALIKE = 25.0  # in χ², within which conditions are told together
+SHOWN = 4  # alternatives that are told in words
+ALIKE = 25.0  # in χ², within which conditions are told together
 _PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
 MOST_OF_ELEMENT = 4  # numbers of an element whose priors may be wrong together
 _ASKED_OTHERWISE = (*thresholds.ASKED_BY_CAMERA, "standard_outlier")  # camera by camera, and as priors
@@ -176,79 +173,15 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     rest = square - best.statistic * table.noise_scale**2
     if not result.explains_data and rest * result.noise_scale**2 > NEARLY * design.projector.free:
         return
-    likely = [item for item in clear if item.statistic - item.rank > best.statistic - best.rank - _ALIKE]
+    likely = [item for item in clear if item.statistic - item.rank > best.statistic - best.rank - ALIKE]
     # Of an element and one of its numbers alone, the shorter statement if it explains as much.
     likely = [item for item in likely if not any(_holds(item, rival) for rival in likely)]
     likely.sort(key=lambda item: (item.rank, item.log_p))  # a mistake of one number before sixteen
     wordings = {item.candidate.name: item.said for item in rivals}
-    causes = "; or for ".join(wordings[score.name](score) for score in likely[:_SHOWN])
-    further = f"; or for {len(likely) - _SHOWN} others" if len(likely) > _SHOWN else ""
+    causes = "; or for ".join(wordings[score.name](score) for score in likely[:SHOWN])
+    further = f"; or for {len(likely) - SHOWN} others" if len(likely) > SHOWN else ""
     p = corrected_p(best.log_p, len(scores))
     yield f"the residuals ask for {causes}{further} (p = {p:.2g}, limit {thresholds.ALARM:g})"
-
-
-def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
-    """A sentence on stated conditions, each of which, if wrong, explains the data as well as a model with `chi2` does.
-
-    `design` is of the fit before anything was added to its model.
-    """
-    scored = [item for item in condition_scores(design) if item.score.testable]
-    square = float(np.sum(design.projector(design.residual) ** 2))
-    least = special.chdtri(1, local_p(thresholds.ALARM, len(scored))) if scored else np.inf
-    gains = [float(item.score.amplitudes[0]) ** 2 * item.square for item in scored]
-    alike = [
-        (gain, item)
-        for gain, item in zip(gains, scored, strict=True)
-        if square - gain < chi2 + _ALIKE and gain > least
-    ]
-    if alike:
-        alike.sort(key=lambda pair: -pair[0])
-        causes = "; or ".join(_in_words(item.stated, item.score) for _, item in alike[:_SHOWN])
-        yield f"what was found explains no more than one number that the set states would, if it were {causes}"
-
-
-def instead_of_names(before: FitResult, after: FitResult) -> str:
-    """The number that the set states which, if wrong, explains the data better than names do; empty: none.
-
-    Numbers that are as probable are told together. Where nothing was added (`after` is `before`) only what explains the
-    data is told.
-
-    Compared are the evidence of the names, ln B of `after` against `before`, and that of the number, fitted exactly,
-    with its width as prior: ½ (χ² − χ²_c) − ½ ln(1 + w² C̃ᵀC̃). One number may so come before sixteen.
-    """
-    listed = [c for c in condition_scores(Design.of(before)) if c.score.testable]
-    listed = [c for c in listed if corrected_p(c.score.log_p, len(listed)) < thresholds.ALARM]
-    if after.noise_scale != before.noise_scale:  # one scale of the errors, or χ² of both are not comparable
-        after = fit(after.likelihood, start=after.values, noise_scale=before.noise_scale)
-    added = after is not before
-    least, likely = log_evidence_ratio(before, after) if added else 0.0, list[tuple[float, str]]()
-    for c in sorted(listed, key=lambda c: c.score.log_p)[:_FITTED]:
-        stated, size, result, current = c.stated, 0.0, before, c
-        for _ in range(_ROUNDS):  # Gauss and Newton: hours are no small step
-            size += float(current.score.amplitudes[0])
-            if abs(size) >= stated.width:  # a latitude beyond the pole, a negative temperature
-                break
-            likelihood = Likelihood.of(stated.changed(size), before.model)
-            result = fit(likelihood, start=result.values, noise_scale=before.noise_scale)
-            rescored = {c.stated.what: c for c in condition_scores(Design.of(result))}
-            if not result.converged or stated.what not in rescored:
-                break
-            current = rescored[stated.what]
-        score, square = current.score, current.square
-        worth = 0.5 * (before.posterior.objective - result.posterior.objective)
-        worth -= 0.5 * float(np.log1p(square * stated.width**2))
-        explained = result.explains_data or result.nearly_explains_data
-        if result.converged and abs(size) < stated.width and worth > least and (added or explained):
-            value = size if stated.value is None else stated.value + size
-            sigma = float(np.sqrt(score.covariance[0, 0]))
-            by = " changed by" if stated.value is None else ""
-            text = f"{stated.what}{by} {with_error(value, sigma)} {stated.unit}".rstrip()
-            text += f" ({stated.remedy}; χ²/dof = {result.chi2 / max(result.dof, 1):.3g})"
-            likely.append((worth, text))
-    best = max((worth for worth, _ in likely), default=0.0)
-    return "; or ".join(
-        text for worth, text in sorted(likely, reverse=True) if worth > best - thresholds.EVEN_ODDS
-    )
 
 
 def _holds(score: Score, rival: Score) -> bool:
@@ -270,7 +203,7 @@ def _conditions(design: Design) -> Iterator[_Single]:
         plausible = 0.0 if item.seen_by_stars else item.width
         yield _Single(
             candidate,
-            lambda score, item=item: _in_words(item, score),
+            lambda score, item=item: condition_in_words(item, score),
             plausible,
             item.unit,
             item.shown_by,
@@ -386,7 +319,8 @@ def _worded(
     return f"{what} {with_error(start + float(score.amplitudes[number]) * width, sigma)} {unit}".rstrip()
 
 
-def _in_words(stated: _Stated, score: Score) -> str:
+def condition_in_words(stated: _Stated, score: Score) -> str:
+    """A number that the set states, with its score, and what to check."""
     if stated.value is None:
         return f"{_worded(f'{stated.what} changed by', score, unit=stated.unit)} ({stated.remedy})"
     text = _worded(stated.what, score, unit=stated.unit, start=stated.value)

@@ -33,9 +33,9 @@ from walop_jax.diagnosis.grammar import Hypotheses, hypotheses
 from walop_jax.diagnosis.leftover import back_to, concluded
 from walop_jax.diagnosis.readings import mixups_of, refusal
 from walop_jax.diagnosis.refits import Refits
+from walop_jax.diagnosis.rival_conditions import instead_of_names, rival_conditions
 from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.diagnosis.search import State, search
-from walop_jax.diagnosis.stated_conditions import instead_of_names, rival_conditions
 from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, with_honest_errors

@@ -44,7 +44,7 @@ class Commands(SphinxDirective):
             parts += [f"## {name}", f"    walop-jax {name} {' '.join(words)}".rstrip()]
             parts.append(inspect.cleandoc(command.body.__doc__ or ""))
             options = {k: o for k, o in command.options.items() if not isinstance(o, Argument)}
-            options |= {"overwrite": COMMON["overwrite"][1]} if command.writes is not None else {}
+            options |= {"overwrite": COMMON["overwrite"][2]} if command.writes is not None else {}
             if options:
                 rows = [f"| `--{k.replace('_', '-')}` | {o.help} |" for k, o in options.items()]
                 parts.append("\n".join(["| option | meaning |", "| --- | --- |", *rows]))

@@ -9,11 +9,12 @@ Gauges      constants are left out of the densities. A free parameter without a 
             value, which keeps undetermined parameters from running away; it is part of ln p, as in a fit
 Ties        a tied parameter has the value of its master, whatever stands in its place
 Derivatives in any mode and order; the optics by the rule of `likelihood.optics`. Points are worked on in batches, in a
-            scan, and a gradient computes each batch anew: its memory is that of one batch
+            scan; χ² of a batch comes with its gradient, so that the memory of a gradient is that of one batch
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -21,6 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from walop_jax.data.records import CalibrationSet
@@ -168,9 +170,7 @@ class Forward(eqx.Module):
 
     def chi2(self, values: Values | Instrument) -> Float[Array, ""]:
         """Sum of the squared residuals."""
-        return engine.summed(
-            jax.checkpoint(lambda data: jnp.sum(self._residuals(values, data) ** 2)), self.data
-        )
+        return engine.summed(lambda data: _chi2(dataclasses.replace(self, data=data), values), self.data)
 
     def log_likelihood(self, values: Values | Instrument) -> Float[Array, ""]:
         """−χ²/2 of the data."""
@@ -214,3 +214,28 @@ class Forward(eqx.Module):
         batches, size = self.data.x.shape
         filled = jnp.concatenate([points, jnp.repeat(points[-1:], batches * size - len(points), axis=0)])
         return filled.reshape(batches, size, *points.shape[1:])
+
+
+@jax.custom_jvp
+def _chi2(batch: Forward, values: Values | Instrument) -> Float[Array, ""]:
+    """χ² of the points of a batch."""
+    return jnp.sum(batch._residuals(values, batch.data) ** 2)
+
+
+def _with_gradient(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+    """χ² and its change: the gradient is made with it, by reverse differentiation, and nothing is computed twice."""
+    leaves, tree = jax.tree.flatten(primals)
+    steps = jax.tree.leaves(tangents, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
+    moving = [n for n, step in enumerate(steps) if not isinstance(step, SymbolicZero)]
+
+    def chi2(moved: list[Array]) -> Array:
+        at = dict(zip(moving, moved, strict=True))
+        return _chi2.fun(*tree.unflatten([at.get(n, leaf) for n, leaf in enumerate(leaves)]))
+
+    # Another reverse pass, for second derivatives, keeps the inputs of a batch alone.
+    value, gradient = jax.checkpoint(jax.value_and_grad(chi2))([leaves[n] for n in moving])
+    changes = [jnp.vdot(slope, steps[n]) for n, slope in zip(moving, gradient, strict=True)]
+    return value, sum(changes, jnp.zeros_like(value))
+
+
+_chi2.defjvp(_with_gradient, symbolic_zeros=True)

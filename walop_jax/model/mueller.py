@@ -1,50 +1,43 @@
 """Mueller and Jones algebra: plain functions, one equation each.
 
-Stokes vectors are (S0, S1, S2, S3) in the convention of `conventions.py`. A Jones matrix is the four arrays
-((a, b), (c, d)) of equal shape, kept apart because 2 × 2 products of long arrays are fastest, and clearest,
-when written out.
+Stokes vectors are (S0, S1, S2, S3) in the convention of `conventions.py`. A Jones matrix has its two axes ahead of all
+others, and products of long arrays are fastest when written out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Inexact
 
 Scalar = Float[Array, "..."]
+Matrix2 = Inexact[Array, "2 2 ..."]
+
+computed_once = jax.lax.optimization_barrier
+"""Values that XLA is to compute once: by itself it computes a cheap one in every loop that asks for it, and cheap ones
+from cheap ones grow to loops of a thousand operations, compiled as often as there are elements of a matrix."""
 
 
-class Matrix2(NamedTuple):
-    """The 2 × 2 matrix ((a, b), (c, d)) at every element of the arrays a, b, c, d (real or complex)."""
+def matrix2(a: Scalar, b: Scalar, c: Scalar, d: Scalar) -> Matrix2:
+    """The 2 × 2 matrix ((a, b), (c, d)) at every element of arrays that broadcast."""
+    a, b, c, d = jnp.broadcast_arrays(a, b, c, d)
+    return jnp.stack([a, b, c, d]).reshape(2, 2, *a.shape)
 
-    a: Inexact[Array, ...]
-    b: Inexact[Array, ...]
-    c: Inexact[Array, ...]
-    d: Inexact[Array, ...]
 
-    def __matmul__(self, other: Matrix2) -> Matrix2:
-        return Matrix2(
-            self.a * other.a + self.b * other.c,
-            self.a * other.b + self.b * other.d,
-            self.c * other.a + self.d * other.c,
-            self.c * other.b + self.d * other.d,
-        )
+def product2(left: Matrix2, right: Matrix2) -> Matrix2:
+    """Product of 2 × 2 matrices, written out."""
+    return computed_once(left[:, :1] * right[:1] + left[:, 1:] * right[1:])
 
-    def plus(self, other: Matrix2) -> Matrix2:
-        """Sum of two matrices."""
-        return Matrix2(self.a + other.a, self.b + other.b, self.c + other.c, self.d + other.d)
 
-    def inverse(self) -> Matrix2:
-        """Inverse matrix."""
-        # One division, and none in the derivatives, which are many times as long: XLA compiles each by itself.
-        k = 1.0 / (self.a * self.d - self.b * self.c)
-        return Matrix2(k * self.d, -k * self.b, -k * self.c, k * self.a)
-
-    def times(self, factor: Inexact[Array, ...] | float) -> Matrix2:
-        """Every element times a scalar."""
-        return Matrix2(factor * self.a, factor * self.b, factor * self.c, factor * self.d)
+def inverse2(matrix: Matrix2) -> Matrix2:
+    """Inverse of 2 × 2 matrices."""
+    # One division, and none in the derivatives, which are many times as long: XLA compiles each by itself.
+    k = 1.0 / (matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0])
+    sign = np.array([[1.0, -1.0], [-1.0, 1.0]]).reshape(2, 2, *(1,) * k.ndim)
+    return computed_once(sign * k * matrix[::-1, ::-1].swapaxes(0, 1))
 
 
 def _matrix(*rows: tuple[Scalar, ...]) -> Float[Array, "... 4 4"]:
@@ -66,7 +59,7 @@ def from_jones(jones: Matrix2) -> Float[Array, "... 4 4"]:
     M_ij = ½ Tr(σ_i J σ_j J†) with the Pauli matrices ordered as S0…S3 (Gil & Ossikovski 2016, eq. 3.11),
     written out; a non-depolarising matrix, Tr(MᵀM) = 4 M00².
     """
-    a, b, c, d = jones
+    (a, b), (c, d) = jones
 
     def power(z: Inexact[Array, ...]) -> Scalar:
         return z.real**2 + z.imag**2

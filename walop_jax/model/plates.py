@@ -18,6 +18,7 @@ Cut axis    with c = (cos α cos χ, sin α cos χ, sin χ) the extraordinary wa
             quadratic in k_z whose two roots are no mirror images; with 𝐄₋, 𝐇₋ the backward waves of the
             first medium and Y = 𝐇₋ 𝐄₋⁻¹ the face is t = (𝐇₂ − Y 𝐄₂)⁻¹ (𝐇₁ − Y 𝐄₁). Solved that way only if
             a plate has a `cut`.
+Arrays      matrices (2, 2, …); inside a stack media or faces are the axis behind these.
 
 Sources     Born & Wolf, Principles of Optics, ch. 15 (waves in uniaxial crystals) and 1.5 (continuity);
             Yeh 1980, Surf. Sci. 96, 41 (the matrix form). Fixed axis: Paper II, appendix B.
@@ -27,14 +28,13 @@ Limits      At normal incidence a plate of air indices is the identity; 𝐄 of 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from walop_jax.model.mueller import Matrix2, from_jones, retarder
+from walop_jax.model.mueller import Matrix2, computed_once, from_jones, inverse2, matrix2, product2, retarder
 
 Real = Float[Array, "..."]
 
@@ -52,26 +52,29 @@ class Plate(NamedTuple):
     cut: Real | None = None
 
 
+Wave = tuple[Real, Real, Real, Real]
+"""k_z of a plane wave, and its electric field along x, y and z."""
+
+
 class _Waves(NamedTuple):
-    electric: Matrix2  # columns: the two forward waves; rows: tangential x, y
+    electric: Matrix2  # columns: the two waves; rows: tangential x, y
     magnetic: Matrix2
     phase: Real  # k_z of the second wave minus that of the first
 
-
-def _tangential(kx: Real, ky: Real, kz: Real, e: tuple[Real, Real, Real]) -> tuple[Real, Real]:
-    ex, ey, ez = e
-    return ky * ez - kz * ey, kz * ex - kx * ez
+    @classmethod
+    def of(cls, kx: Real, ky: Real, first: Wave, second: Wave, phase: Real) -> _Waves:
+        """Tangential fields of two waves."""
+        (kz1, x1, y1, z1), (kz2, x2, y2, z2) = first, second
+        magnetic = (ky * z1 - kz1 * y1, ky * z2 - kz2 * y2, kz1 * x1 - kx * z1, kz2 * x2 - kx * z2)
+        return computed_once(cls(matrix2(x1, x2, y1, y2), matrix2(*magnetic), phase))
 
 
 def _air(sx: Real, sy: Real) -> _Waves:
     kz = jnp.sqrt(1.0 - sx**2 - sy**2)
     g = 1.0 / (1.0 + kz)
-    first = (1.0 - g * sx**2, -g * sx * sy, -sx)
-    second = (-g * sx * sy, 1.0 - g * sy**2, -sy)
-    h1 = _tangential(sx, sy, kz, first)
-    h2 = _tangential(sx, sy, kz, second)
-    electric = Matrix2(first[0], second[0], first[1], second[1])
-    return _Waves(electric, Matrix2(h1[0], h2[0], h1[1], h2[1]), jnp.zeros_like(kz))
+    first = (kz, 1.0 - g * sx**2, -g * sx * sy, -sx)
+    second = (kz, -g * sx * sy, 1.0 - g * sy**2, -sy)
+    return _Waves.of(sx, sy, first, second, jnp.zeros_like(kz))
 
 
 def _anisotropy(plate: Plate) -> Real:
@@ -89,32 +92,31 @@ def _crystal(sx: Real, sy: Real, plate: Plate) -> _Waves:
     factor = 1.0 - along**2 * (1.0 / no2)
     kz_o = jnp.sqrt(no2 - sx**2 - sy**2)
     kz_e = jnp.sqrt(ne2 * factor - across**2)
-    e_o = (-kz_o * cy, kz_o * cx, -across)
-    e_e = (no2 * cx - along * sx, no2 * cy - along * sy, -along * kz_e)
-    h_o = _tangential(sx, sy, kz_o, e_o)
-    h_e = _tangential(sx, sy, kz_e, e_e)
-    electric = Matrix2(e_o[0], e_e[0], e_o[1], e_e[1])
+    ordinary = (kz_o, -kz_o * cy, kz_o * cx, -across)
+    extraordinary = (kz_e, no2 * cx - along * sx, no2 * cy - along * sy, -along * kz_e)
     phase = _anisotropy(plate) * factor * (1.0 / (kz_e + kz_o))
-    return _Waves(electric, Matrix2(h_o[0], h_e[0], h_o[1], h_e[1]), phase)
+    return _Waves.of(sx, sy, ordinary, extraordinary, phase)
 
 
-def _face(before: _Waves, after: _Waves) -> Matrix2:
-    electric = before.electric.inverse() @ after.electric
-    magnetic = before.magnetic.inverse() @ after.magnetic
-    return electric.plus(magnetic).inverse().times(2.0)
+def _with_air(air: Matrix2, crystals: Matrix2) -> Matrix2:
+    """The fields ahead of every face, media along the third axis: air, then the crystals."""
+    ahead, inside = jnp.broadcast_arrays(air[:, :, None], crystals)
+    return computed_once(jnp.concatenate([ahead[:, :, :1], inside], axis=2))
+
+
+def _behind(ahead: Matrix2) -> Matrix2:
+    """The fields behind every face: of the next medium, in the end of air."""
+    return jnp.roll(ahead, -1, axis=2)
+
+
+def _faces(air: _Waves, crystals: _Waves) -> Matrix2:
+    """Transmission of amplitudes through every face of the stack."""
+    electric, magnetic = (_with_air(*pair) for pair in zip(air[:2], crystals[:2], strict=True))
+    passed = product2(inverse2(electric), _behind(electric))
+    return 2.0 * inverse2(passed + product2(inverse2(magnetic), _behind(magnetic)))
 
 
 # ------------------------------------------------------------------ optic axes out of the surface
-
-
-class _BothWays(NamedTuple):
-    forward: _Waves
-    backward: _Waves  # tangential fields of the two backward waves; their phase is not used
-
-
-def _air_both_ways(sx: Real, sy: Real) -> _BothWays:
-    forward = _air(sx, sy)
-    return _BothWays(forward, forward._replace(magnetic=forward.magnetic.times(-1.0)))
 
 
 def _extraordinary_kz(sx: Real, sy: Real, plate: Plate) -> tuple[Real, Real]:
@@ -129,7 +131,8 @@ def _extraordinary_kz(sx: Real, sy: Real, plate: Plate) -> tuple[Real, Real]:
     return (root - b) / a, (-root - b) / a
 
 
-def _crystal_both_ways(sx: Real, sy: Real, plate: Plate) -> _BothWays:
+def _crystal_both_ways(sx: Real, sy: Real, plate: Plate) -> tuple[_Waves, _Waves]:
+    """Forward and backward waves; the phase of the backward ones is not used."""
     cut = 0.0 if plate.cut is None else plate.cut
     no2 = plate.ordinary**2
     cx, cy, cz = jnp.cos(plate.axis) * jnp.cos(cut), jnp.sin(plate.axis) * jnp.cos(cut), jnp.sin(cut)
@@ -137,56 +140,56 @@ def _crystal_both_ways(sx: Real, sy: Real, plate: Plate) -> _BothWays:
 
     def waves(kz_o: Real, kz_e: Real) -> _Waves:
         along = sx * cx + sy * cy + kz_e * cz
-        e_o = (sy * cz - kz_o * cy, kz_o * cx - sx * cz, sx * cy - sy * cx)
-        e_e = (no2 * cx - along * sx, no2 * cy - along * sy, no2 * cz - along * kz_e)
-        h_o, h_e = _tangential(sx, sy, kz_o, e_o), _tangential(sx, sy, kz_e, e_e)
-        electric = Matrix2(e_o[0], e_e[0], e_o[1], e_e[1])
+        ordinary = (kz_o, sy * cz - kz_o * cy, kz_o * cx - sx * cz, sx * cy - sy * cx)
+        extraordinary = (kz_e, no2 * cx - along * sx, no2 * cy - along * sy, no2 * cz - along * kz_e)
         factor = 1.0 - along**2 * (1.0 / no2)
         phase = _anisotropy(plate) * factor * (1.0 / (kz_e + kz_o))
-        return _Waves(electric, Matrix2(h_o[0], h_e[0], h_o[1], h_e[1]), phase)
+        return _Waves.of(sx, sy, ordinary, extraordinary, phase)
 
     forward, backward = _extraordinary_kz(sx, sy, plate)
-    return _BothWays(waves(kz_o, forward), waves(-kz_o, backward))
+    return waves(kz_o, forward), waves(-kz_o, backward)
 
 
-def _face_both_ways(before: _BothWays, after: _BothWays) -> Matrix2:
-    y = (before.backward.magnetic @ before.backward.electric.inverse()).times(-1.0)
-    transmitted = after.forward.magnetic.plus(y @ after.forward.electric)
-    incident = before.forward.magnetic.plus(y @ before.forward.electric)
-    return transmitted.inverse() @ incident
-
-
-def _stack(
-    media: list[_Waves] | list[_BothWays], phases: list[Real], face: Callable[[Any, Any], Matrix2]
-) -> Matrix2:
-    jones = face(media[0], media[1])
-    for before, after, phase in zip(media[1:-1], media[2:], phases, strict=True):
-        turn = jnp.exp(2j * jnp.pi * phase)
-        jones = face(before, after) @ Matrix2(jones.a, jones.b, turn * jones.c, turn * jones.d)
-    return jones
+def _faces_both_ways(air: _Waves, forward: _Waves, backward: _Waves) -> Matrix2:
+    """As `_faces`; the backward waves of air have the same tangential E and the opposite tangential H."""
+    electric, magnetic = (_with_air(*pair) for pair in zip(air[:2], forward[:2], strict=True))
+    back = _with_air(air.electric, backward.electric), _with_air(-air.magnetic, backward.magnetic)
+    y = -product2(back[1], inverse2(back[0]))
+    transmitted = _behind(magnetic) + product2(y, _behind(electric))
+    return product2(inverse2(transmitted), magnetic + product2(y, electric))
 
 
 def stack_jones(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real) -> Matrix2:
     """Jones matrix of plates in contact, in air, for rays of direction (sx, sy, √(1 − s²)).
 
     Referred to the carried axes on both sides, Fresnel losses of every face included. All arguments
-    broadcast; `wavelength` in µm.
+    broadcast; `wavelength` in µm. Plates are an axis of all arrays: the waves of one are compiled, not of each.
     """
     if not plates:
         raise ValueError("a stack needs at least one plate")
-    sx, sy = jnp.broadcast_arrays(sx, sy)
     if any(plate.cut is not None for plate in plates):
-        air = _air_both_ways(sx, sy)
-        crystals = [_crystal_both_ways(sx, sy, plate) for plate in plates]
-        inside = [crystal.forward for crystal in crystals]
-        media, face = [air, *crystals, air], _face_both_ways
+        plates = tuple(p if p.cut is not None else p._replace(cut=jnp.zeros(())) for p in plates)
+    dimensions = max(map(jnp.ndim, (sx, sy, wavelength, *jax.tree.leaves(plates))))
+    sx, sy, _ = jnp.broadcast_arrays(sx, sy, jnp.zeros((1,) * dimensions))
+    crystals = jax.tree.map(lambda *values: _stacked(values, dimensions), *plates)
+    air = _air(sx, sy)
+    if crystals.cut is None:
+        inside = _crystal(sx, sy, crystals)
+        faces = _faces(air, inside)
     else:
-        air = _air(sx, sy)
-        inside = [_crystal(sx, sy, plate) for plate in plates]
-        media, face = [air, *inside, air], _face
-    per_wavelength = 1.0 / wavelength
-    phases = [p.thickness * w.phase * per_wavelength for p, w in zip(plates, inside, strict=True)]
-    return _stack(media, phases, face)
+        inside, backward = _crystal_both_ways(sx, sy, crystals)
+        faces = _faces_both_ways(air, inside, backward)
+    turns = jnp.exp(2j * jnp.pi * (crystals.thickness * inside.phase * (1.0 / wavelength)))
+    jones = faces[:, :, 0].astype(complex)
+    for turn, face in zip(turns, jnp.moveaxis(faces[:, :, 1:], 2, 0), strict=True):
+        jones = product2(face, jnp.stack(jnp.broadcast_arrays(jones[0], turn * jones[1])))
+    return jones
+
+
+def _stacked(values: tuple[Real, ...], dimensions: int) -> Real:
+    """A number of all plates along a new first axis, ahead of `dimensions` others."""
+    stack = jnp.stack(jnp.broadcast_arrays(*values))
+    return stack.reshape(len(values), *(1,) * (1 + dimensions - stack.ndim), *stack.shape[1:])
 
 
 def stack_mueller(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real) -> Float[Array, "... 4 4"]:
@@ -211,7 +214,7 @@ def fixed_axis_retardance(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelen
     total = jnp.zeros_like(sx)
     last = plates[-1].axis
     for plate in plates:
-        crystal = _crystal(sx, sy, plate) if plate.cut is None else _crystal_both_ways(sx, sy, plate).forward
+        crystal = _crystal(sx, sy, plate) if plate.cut is None else _crystal_both_ways(sx, sy, plate)[0]
         sign = jnp.cos(2.0 * (plate.axis - last))
         total = total + sign * 2.0 * jnp.pi * plate.thickness * crystal.phase / wavelength
     return total
@@ -223,7 +226,7 @@ def stack_retardance(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: 
     With U = J / √det J = cos(δ/2) + i sin(δ/2) n·σ up to losses, n near the fast axis; unlike the trace of a Mueller
     matrix, cos(δ/2) has a slope at half a wave.
     """
-    a, b, c, d = stack_jones(sx, sy, plates, wavelength)
+    (a, b), (c, d) = stack_jones(sx, sy, plates, wavelength)
     scale = 0.5 / jnp.sqrt(a * d - b * c)
     cosine = ((a + d) * scale).real
     fast = plates[-1].axis + 0.5 * jnp.pi

@@ -229,22 +229,17 @@ def solve(system: System) -> Solution:
     e, at, basis = system.equations, system.at, system.basis
     size = len(at)
     top, right = np.zeros((size, size)), np.zeros(size)
-    constant_basis = bool(np.all(basis == 1.0))
-    if constant_basis:
-        total, slope = e.matrix.sum(axis=0), e.gradient.sum(axis=0)
-        top, right = total[np.ix_(at, at)].copy(), -slope[at]
-    else:
-        # Functions of time meet in pairs: units are summed once for every pair of functions that differ.
-        kinds, which = np.unique(basis, axis=1, return_inverse=True)
-        rows = [np.flatnonzero(which == k) for k in range(kinds.shape[1])]
-        for a, mine in enumerate(rows):
-            right[mine] = -(kinds[:, a] @ e.gradient[:, at[mine]])
-            for b, columns in enumerate(rows[: a + 1]):
-                weight = kinds[:, a] * kinds[:, b]
-                if weight.any():
-                    summed = np.tensordot(weight, e.matrix, 1)[np.ix_(at[mine], at[columns])]
-                    top[np.ix_(mine, columns)] = summed
-                    top[np.ix_(columns, mine)] = summed.T
+    # Functions of time meet in pairs: units are summed once for every pair of functions that differ.
+    kinds, which = np.unique(basis, axis=1, return_inverse=True)
+    rows = [np.flatnonzero(which == k) for k in range(kinds.shape[1])]
+    for a, mine in enumerate(rows):
+        right[mine] = -(kinds[:, a] @ e.gradient[:, at[mine]])
+        for b, columns in enumerate(rows[: a + 1]):
+            weight = kinds[:, a] * kinds[:, b]
+            if weight.any():
+                summed = np.tensordot(weight, e.matrix, 1)[np.ix_(at[mine], at[columns])]
+                top[np.ix_(mine, columns)] = summed
+                top[np.ix_(columns, mine)] = summed.T
     precision = np.array([entry.precision for entry in system.globals])
     means = np.array([entry.mean for entry in system.globals])
     top[np.diag_indices(size)] += precision

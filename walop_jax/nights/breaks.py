@@ -41,8 +41,6 @@ ROUNDS = 3  # in which all are named again
 KINDS = ("step", "bad night", "drift")
 Carried = Callable[[Parameter], bool]
 """True for a candidate that stars can be corrected for."""
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
-_FARTHEST = 40.0  # of the tail in units of 1/u, beyond which nothing is left of it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,14 +101,11 @@ class Break:
 
 
 def both_beyond(u: float, rho: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-    """P(|z₁| ≥ u, |z₂| ≥ u) of two normal deviates of unit variance with correlation ρ, by quadrature."""
+    """P(|z₁| ≥ u, |z₂| ≥ u) of two normal deviates of unit variance with correlation ρ (Owen 1956)."""
     rho = np.clip(np.abs(rho), 0.0, 1.0 - 1e-12)
-    share = 0.5 * (_NODES + 1.0)
-    x = u + _FARTHEST / u * share**3
-    weight = 0.5 * _WEIGHTS * 3.0 * share**2 * _FARTHEST / u * np.exp(-0.5 * x**2) / math.sqrt(2.0 * math.pi)
-    spread = np.sqrt(1.0 - rho**2)[:, None]
-    inside = special.ndtr((u - rho[:, None] * x) / spread) - special.ndtr((-u - rho[:, None] * x) / spread)
-    return np.clip(2.0 * (1.0 - inside) @ weight, 0.0, None)
+    slope = np.sqrt((1.0 - rho) / (1.0 + rho))
+    corners = 2.0 * special.ndtr(-u) - 2.0 * (special.owens_t(u, slope) + special.owens_t(u, 1.0 / slope))
+    return np.clip(2.0 * corners, 0.0, None)
 
 
 class Tried(NamedTuple):
@@ -163,14 +158,6 @@ class Tried(NamedTuple):
         rho = np.concatenate([correlation(step, after, once).ravel(), beside.ravel()])
         rho = np.minimum(rho[rho > 0.5], 1.0)
         return float(min(1.0, max(total - both_beyond(u, rho).sum(), single)))
-
-    def alarm(self) -> float:
-        """The |z| from which a change is a break."""
-        low, high = 3.0, 12.0
-        while high - low > 1e-3:
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if self.chance(middle) < CHANCE else (middle, high)
-        return high
 
     def largest(self) -> tuple[int, int, int]:
         """Kind, cell and parameter of the largest |z|."""

@@ -473,22 +473,20 @@ def together(nights: Sequence[Night]) -> Together:
     gradient *= scale
     matrix *= scale
     matrix *= scale[:, None]
-    _, file = np.unique([night.sha256 for night in ordered], return_inverse=True)
+    number, file = (
+        np.unique(keys, return_inverse=True)[1].astype(int)
+        for keys in ([night.number for night in ordered], [night.sha256 for night in ordered])
+    )
     equations = Equations(
         np.array([night.mjd for night in ordered]),
-        _numbers(ordered),
-        file.astype(int),
+        number,
+        file,
         chi2,
         gradient,
         matrix,
         scale,
     )
     return Together(ordered, tuple(union.values()), n - len(of_model), origin, mean, width, equations)
-
-
-def _numbers(nights: Sequence[Night]) -> Int[np.ndarray, " u"]:
-    """Nights counted from 0 in the order of time."""
-    return np.unique([night.number for night in nights], return_inverse=True)[1].astype(int)
 
 
 _ONE_STAR = "correct one of them, or give it another NAME"
@@ -516,11 +514,9 @@ def check_together(nights: Sequence[Night]) -> None:
                 raise fail(what, extension="SOURCES", advice=_ONE_STAR)
     earlier: dict[Any, Night] = {}
     for night in nights:
-        for key in ((night.sha256, night.number), (night.begin, night.end)):
+        for key in (night.key, (night.begin, night.end)):
             if key in earlier:
-                what = (
-                    "the same data" if key == (night.sha256, night.number) else "exposures of the same times"
-                )
+                what = "the same data" if key == night.key else "exposures of the same times"
                 where = f"{what} are in {earlier[key].source} and {night.source}"
                 raise fail(f"the night of MJD {night.number} is there twice: {where}", advice="leave one out")
             earlier[key] = night

@@ -89,16 +89,20 @@ class PaperCalibration:
     def between(self, x: Float[np.ndarray, " m"], y: Float[np.ndarray, " m"]) -> PaperCalibration:
         """Coefficients and Δ interpolated bilinearly to other positions, which the paper excludes.
 
-        Raises ValueError where the points are no regular grid.
+        Between points on a line of constant X or Y linearly along it. Raises ValueError where the points are no regular
+        grid, and for positions beside such a line.
         """
-        across, along = np.unique(self.x), np.unique(self.y)
-        if len(across) * len(along) != len(self.x) or min(len(across), len(along)) < 2:
+        axes = [(np.unique(have), asked) for have, asked in ((self.y, y), (self.x, x))]
+        along = [axis for axis in axes if len(axis[0]) > 1]
+        beside = [axis for axis in axes if len(axis[0]) == 1 and not np.allclose(*axis, rtol=0.0, atol=1e-9)]
+        if len(axes[0][0]) * len(axes[1][0]) != len(self.x) or not along or beside:
             raise ValueError("the points with polariser exposures are no regular grid: nothing between them")
-        order = np.lexsort((self.x, self.y)).reshape(len(along), len(across))
+        order = np.lexsort((self.x, self.y)).reshape([len(values) for values, _ in along])
+        grid, places = tuple(values for values, _ in along), np.stack([asked for _, asked in along], axis=1)
 
         def mixed(values: np.ndarray) -> np.ndarray:
             beyond: Any = {"bounds_error": False, "fill_value": None}  # linear there as well
-            return RegularGridInterpolator((along, across), values[order], **beyond)(np.stack([y, x], axis=1))
+            return RegularGridInterpolator(grid, values[order], **beyond)(places)
 
         fields = ("coefficients", "transmission", "delta", "spread", "condition")
         return PaperCalibration(x, y, *(mixed(getattr(self, name)) for name in fields))

@@ -85,7 +85,7 @@ def _chain(
     density: Density, position: np.ndarray, key: np.ndarray, numbers: range, size: Callable[[], float]
 ) -> Iterator[tuple[Any, Any]]:
     """State and information after every step; the step with a given number has random numbers of its own."""
-    begin, step = _kernels(density.with_gradient)
+    begin, step = _kernels(density.function)
     state, random = begin(jnp.asarray(position), density.arrays), jax.random.key(int(key[0]))
     scale = jnp.ones(density.dimension)
     for number in numbers:
@@ -95,21 +95,15 @@ def _chain(
 
 
 @functools.lru_cache(maxsize=1)
-def _kernels(with_gradient: Callable[..., tuple[Array, Array]]) -> tuple[Callable[..., Any], ...]:
+def _kernels(log_density: Callable[..., Array]) -> tuple[Callable[..., Any], ...]:
     """Compiled functions that begin a chain and take a step, for one density."""
     blackjax = importlib.import_module("blackjax")  # optional
 
-    def log_density(position: Array, arrays: tuple[Any, ...]) -> Array:
-        # Value and gradient are known together; this hands both to whoever differentiates.
-        fixed = jax.lax.stop_gradient(position)
-        value, gradient = with_gradient(fixed, *arrays)
-        return value + gradient @ (position - fixed)
-
     def begin(position: Array, arrays: tuple[Any, ...]) -> Any:
-        return blackjax.nuts.init(position, lambda z: log_density(z, arrays))
+        return blackjax.nuts.init(position, lambda z: log_density(z, *arrays))
 
     def step(key: Array, state: Any, size: Array, mass: Array, arrays: tuple[Any, ...]) -> tuple[Any, Any]:
-        kernel = blackjax.nuts(lambda z: log_density(z, arrays), size, mass, max_num_doublings=DOUBLINGS)
+        kernel = blackjax.nuts(lambda z: log_density(z, *arrays), size, mass, max_num_doublings=DOUBLINGS)
         return kernel.step(key, state)
 
     return compiled(begin), compiled(step)

@@ -41,20 +41,13 @@ class Density:
     """ln p, up to a constant, of `dimension` coordinates; near the fit they are independent with width 1.
 
     `function` gives ln p of one position as a JAX scalar; it takes `arrays` after the position, which keeps data out of
-    compiled code. `gradient`, with the same arguments, gives value and gradient; None stands for
-    `jax.value_and_grad(function)`. `batch`, where there is one, is a faster `log_density`.
+    compiled code. `batch`, where there is one, is a faster `log_density`.
     """
 
     dimension: int
     function: Callable[..., Array]
     arrays: tuple[Any, ...] = ()
-    gradient: Callable[..., tuple[Array, Array]] | None = None
     batch: Batch | None = None
-
-    @cached_property
-    def with_gradient(self) -> Callable[..., tuple[Array, Array]]:
-        """Value and gradient of one position, to be traced by JAX; takes `arrays` after the position."""
-        return self.gradient or jax.value_and_grad(self.function)
 
     @cached_property
     def _one(self) -> Callable[..., Array]:
@@ -62,7 +55,7 @@ class Density:
 
     @cached_property
     def _one_with_gradient(self) -> Callable[..., tuple[Array, Array]]:
-        return compiled(self.with_gradient)
+        return compiled(jax.value_and_grad(self.function))
 
     def log_density(self, positions: Positions) -> Float[np.ndarray, " n"]:
         """Return ln p of every position; −inf where it is not finite."""

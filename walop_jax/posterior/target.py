@@ -10,9 +10,7 @@ closed form (`surrogate`) and drawn afterwards.
 from __future__ import annotations
 
 import dataclasses
-import inspect
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import engine
+from walop_jax.likelihood.forward import Forward
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import check_names, with_values
 from walop_jax.posterior.draws import INFLATION
@@ -124,48 +123,24 @@ def exact_density(target: Target, inflate: bool = False) -> Density:
     """The exact posterior of all free parameters in w, where x = x̂ + L w and L Lᵀ is the covariance of the fit.
 
     With `inflate` the errors of the data are times f; ln f has the prior N(0, 1) and ln f √(2n) is the last coordinate.
-    The data go through it batch by batch, however many there are: the memory of a gradient is that of one batch.
+    χ² is that of the forward model: the memory of a gradient is that of one batch of points.
     """
-    likelihood = target.likelihood
-    offset, slope = target.prior_rows(target.centre), target.prior_slopes(target.root)
-    linear = (target.values(target.centre), target.model.selection() @ target.root, offset, slope)
-    batches = jax.tree.map(lambda *parts: jnp.stack(parts), *likelihood.points)
-    arrays = (target.model.template, likelihood.plan, batches, *(jnp.asarray(a) for a in linear))
-    residuals = inspect.unwrap(engine.residuals)  # to be compiled with the density, not on its own
+    forward = Forward.of(target.likelihood.calset, target.model)
+    first, along = target.values(target.centre), target.model.selection() @ target.root
+    linear = (first, along, target.prior_rows(target.centre), target.prior_slopes(target.root))
     measured, free = float(target.measured), len(target.free)
 
-    def chi2_of(values: Array, template: Instrument, plan: Any, batch: engine.PointData) -> Array:
-        _, r = residuals(with_values(template)(values), plan, batch)
-        return jnp.sum(r**2) / target.noise_scale**2
-
-    def log_density(w: Array, chi2: Array, offset: Array, slope: Array) -> Array:
+    def log_density(
+        w: Array, forward: Forward, first: Array, along: Array, offset: Array, slope: Array
+    ) -> Array:
+        chi2 = forward.chi2(first + along @ w[:free]) / target.noise_scale**2
         total = jnp.sum((offset + slope @ w[:free]) ** 2)
         if not inflate:
             return -0.5 * (chi2 + total)
         ln_f = w[-1] * target.ln_f_unit
         return -0.5 * (chi2 * jnp.exp(-2.0 * ln_f) + total + (ln_f / LN_F_WIDTH) ** 2) - measured * ln_f
 
-    def value(w: Array, template: Instrument, plan: Any, batches: engine.PointData, *linear: Array) -> Array:
-        first, along, offset, slope = linear
-        values = first + along @ w[:free]
-        chi2 = engine.summed(lambda batch: chi2_of(values, template, plan, batch), batches)
-        return log_density(w, chi2, offset, slope)
-
-    def with_gradient(
-        w: Array, template: Instrument, plan: Any, batches: engine.PointData, *linear: Array
-    ) -> tuple[Array, Array]:
-        first, along, offset, slope = linear
-        values = first + along @ w[:free]
-        at_position = engine.summed(
-            lambda batch: jax.value_and_grad(chi2_of)(values, template, plan, batch), batches
-        )
-        chi2, by_values = at_position
-        # χ² enters as the line that has its value and slope at w.
-        return jax.value_and_grad(
-            lambda z: log_density(z, chi2 + by_values @ (along @ (z - w)[:free]), offset, slope)
-        )(w)
-
-    return Density(free + int(inflate), value, arrays, gradient=with_gradient)
+    return Density(free + int(inflate), log_density, (forward, *map(jnp.asarray, linear)))
 
 
 @dataclasses.dataclass(frozen=True)

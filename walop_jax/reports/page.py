@@ -23,18 +23,7 @@ from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.display import Display, signed
 from walop_jax.io.errors import DataError, fail
-from walop_jax.io.names import (
-    AFFECTED,
-    COMMISSIONING,
-    COMPARISON,
-    EPOCH,
-    LIMITS,
-    PLANNED,
-    SUMMARY,
-    SURVEY,
-    TRACKS,
-    WATCHED,
-)
+from walop_jax.io.names import COMMISSIONING, DOCUMENTS, LIMITS, SUMMARY, TRACKS
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import probability, rounded, value_and_error, with_error, with_minus_sign
 from walop_jax.model.effects import EFFECTS
@@ -448,30 +437,30 @@ def in_greek(text: str) -> str:
 
 
 class OtherPage(NamedTuple):
-    """A page about no fit: the document it is about, its title, and the key that says whether it can be relied on."""
+    """A page about no fit: its title, and the key of its document that says whether it can be relied on."""
 
-    file: str
     title: str
     trust: str = ""
 
 
 OTHERS = {
-    "comparison": OtherPage(COMPARISON, "Paper II and the joint model", "trusted"),
-    "epoch": OtherPage(EPOCH, "An old calibration and new data", "fits"),
-    "plan": OtherPage(PLANNED, "Which calibration exposures to take"),
-    "limits": OtherPage(LIMITS, "What these data can show"),
-    "survey": OtherPage(SURVEY, "Many nights of one instrument", "trusted"),
-    "watch": OtherPage(WATCHED, "Does the calibration still hold?", "holds"),
-    "affected": OtherPage(AFFECTED, "Catalogues that a new calibration changes"),
-    "commissioning": OtherPage(COMMISSIONING, "Go or no-go", "go"),
+    "comparison": OtherPage("Paper II and the joint model", "trusted"),
+    "epoch": OtherPage("An old calibration and new data", "fits"),
+    "plan": OtherPage("Which calibration exposures to take"),
+    "limits": OtherPage("What these data can show"),
+    "survey": OtherPage("Many nights of one instrument", "trusted"),
+    "watch": OtherPage("Does the calibration still hold?", "holds"),
+    "affected": OtherPage("Catalogues that a new calibration changes"),
+    "commissioning": OtherPage("Go or no-go", "go"),
 }
+"""Pages by the name of their document (`io.names.DOCUMENTS`)."""
 
 
 def kind_of_run(folder: Path) -> str:
     """One of `OTHERS` for a folder that holds such a document and no fit to report; else `fit`."""
     if (folder / SUMMARY).exists():
         return "fit"
-    return next((kind for kind, page in OTHERS.items() if (folder / page.file).exists()), "fit")
+    return next((kind for kind in OTHERS if (folder / DOCUMENTS[kind]).exists()), "fit")
 
 
 def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
@@ -480,8 +469,8 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
     Raises `DataError` for a document that cannot be read or lacks contents of the page.
     """
     page, missing = OTHERS[kind], []
-    document = RunFolder(folder).document(page.file, ("shown",))
-    head = display_of(document, folder / page.file)
+    document = RunFolder(folder).document(DOCUMENTS[kind], ("shown",))
+    head = display_of(document, folder / DOCUMENTS[kind])
     pictures = _pictures(folder, kind, document, missing)
     limits = None
     if kind == "plan" and (folder / LIMITS).exists():

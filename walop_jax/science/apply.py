@@ -28,6 +28,7 @@ from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, CatalogueSearch
 from walop_jax.science.detectors import detector_slopes, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
+from walop_jax.science.instrument_changes import PossibleChange
 from walop_jax.science.left_over_sky import with_sky
 from walop_jax.science.star_residuals import StarResiduals
 from walop_jax.sky.moon import sky_to_instrument
@@ -426,30 +427,27 @@ class _Application:
         counts = np.nan_to_num(self.counts[block.rows])
         lit = np.where(fitted.flux > 0, fitted.flux, np.inf)
         place = (points.x[block.rows], points.y[block.rows], self.catalogue.time[block.rows])
+
+        def moved(camera: int, electrons: Float[np.ndarray, " r"]) -> Float[np.ndarray, "s 2"]:
+            grown = np.zeros_like(counts)
+            grown[:, camera] = electrons / lit
+            return calibration_shift(fitted.gain, grown[..., None], block.star)[..., 0]
+
+        def shift(entry: PossibleChange) -> Float[np.ndarray, "s 2"]:
+            if not entry.camera:
+                return block.derivative[:, :, parameters.index(entry.name)]
+            k = cameras.index(entry.name)
+            return moved(k, check.growth.electrons(entry.kind, *place, counts[:, k]))
+
+        causes = [[entry.size * shift(entry) for entry in change.alike] for change in check.changes]
+        spots = [spot.profile(*place[:2]) for spot in check.places]
+        for spot, g in zip(check.places, spots, strict=True):
+            causes.append([c.size * moved(c.camera, g * counts[:, c.camera]) for c in spot.alike])
         total = np.zeros_like(block.stars.changed)
-        for change in check.changes:
-            largest = np.zeros_like(block.stars.qu)
-            for entry in change.alike:
-                if entry.camera:
-                    grown, k = np.zeros_like(counts), cameras.index(entry.name)
-                    grown[:, k] = check.growth.electrons(entry.kind, *place, counts[:, k]) / lit
-                    shift = calibration_shift(fitted.gain, grown[..., None], block.star)[..., 0]
-                else:
-                    shift = block.derivative[:, :, parameters.index(entry.name)]
-                largest = np.maximum(largest, np.abs(entry.size * np.nan_to_num(shift)))
-            total += largest[:, :, None] ** 2 * np.eye(2)
-        near = np.zeros(len(total), bool)
+        for shifts in causes:
+            total += np.abs(np.nan_to_num(shifts)).max(axis=0)[:, :, None] ** 2 * np.eye(2)
         first = np.flatnonzero(np.diff(block.star, prepend=-1))
-        for spot in check.places:
-            g = spot.profile(*place[:2])
-            near |= np.maximum.reduceat(g, first) > 0
-            largest = np.zeros_like(block.stars.qu)
-            for camera in spot.alike:
-                grown = np.zeros_like(counts)
-                grown[:, camera.camera] = g * counts[:, camera.camera] / lit
-                shift = calibration_shift(fitted.gain, grown[..., None], block.star)[..., 0]
-                largest = np.maximum(largest, np.abs(camera.size * np.nan_to_num(shift)))
-            total += largest[:, :, None] ** 2 * np.eye(2)
+        near = np.any([np.maximum.reduceat(g, first) > 0 for g in [np.zeros(len(counts)), *spots]], axis=0)
         return total, near
 
 

@@ -24,9 +24,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special
 
-from walop_jax.io.display import Display, Displayed
-from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.text import with_error, with_minus_sign
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.science.instrument_changes import (
     ALARM,
@@ -93,8 +90,8 @@ class Growth(NamedTuple):
 IN_UNITS = Growth()
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
-class CatalogueCheck(Displayed):
+@dataclasses.dataclass(frozen=True)
+class CatalogueCheck:
     """Findings from the stars of a catalogue together.
 
     `noise` is χ² per degree of freedom behind the changes (1 expected; without outliers) and `noise_p` its chance;
@@ -156,7 +153,15 @@ class CatalogueCheck(Displayed):
 
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each thing that does not hold."""
-        texts = [entry.words() for entry in (*self.changes, *self.places)]
+        texts = [place.words() for place in self.places]
+        if any(change.best.implausible for change in self.changes):
+            texts.insert(
+                0,
+                "the counts contradict the calibration by more than an instrument changes: are they of this "
+                "instrument, of all cameras in one unit and aperture, and in their order?",
+            )
+        else:
+            texts = [*(change.words() for change in self.changes), *texts]
         if self.sky is not None and self.sky.found:
             texts.append(self.sky.words())
         if self.rows_agree:
@@ -198,43 +203,6 @@ class CatalogueCheck(Displayed):
             "smallest_gain_seen": self.smallest if np.isfinite(self.smallest) else None,
             "warnings": list(self.warnings()),
         }
-
-    def to_table(self) -> Any:
-        """All questions with their first answers, as an astropy table."""
-        about = {
-            "KIND": "gain, x, y, time, flux, light, or optics",
-            "NAME": "camera or parameter",
-            "SIZE": "change, this one alone",
-            "ERROR": "standard error, calibration included",
-            "SIGMA": "SIZE / ERROR",
-            "UNIT": "unit of SIZE",
-        }
-        return astropy_table(
-            {
-                name: (np.array([getattr(test, name.lower()) for test in self.tests]), "", text)
-                for name, text in about.items()
-            }
-        )
-
-    def display(self) -> Display:
-        """The verdict, the noise, and the answers for every camera."""
-        rows = tuple(
-            (t.name, t.kind, with_error(t.size, t.error), with_minus_sign(f"{t.sigma:+.1f}"))
-            for t in self.tests
-            if t.camera
-        )
-        smallest = (
-            f"{100 * self.smallest:.2g} %"
-            if np.isfinite(self.smallest)
-            else "none: no row has a camera to spare"
-        )
-        facts = (
-            ("stars, rows", f"{self.stars}, {self.rows_used}"),
-            ("χ²/dof", f"{self.noise:.3f}"),
-            ("smallest change seen", f"{smallest} of one camera"),
-        )
-        title = "The catalogue agrees with the calibration" if self.holds else "The catalogue DISAGREES"
-        return Display(title, facts, ("camera", "grows with", "change", ">σ"), rows, self.warnings())
 
 
 NOTHING_TO_SPARE = CatalogueCheck(0, 0, 0, 1.0, 1.0, None, 1.0, (1.0, 1.0), (), (), np.nan)

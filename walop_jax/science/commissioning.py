@@ -4,27 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
-from walop_jax.calibration.could_hide import off_by, unmeasured
+from walop_jax.calibration.certify import Check, Validity
+from walop_jax.calibration.product import PRODVERS
 from walop_jax.data.inspection import inspect
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.verdict import Verdict
-from walop_jax.io.text import two_digits
-from walop_jax.science.field_accuracy import SHARE, FieldAccuracy
-
-
-@dataclasses.dataclass(frozen=True)
-class Requirement:
-    """A requirement on a calibration: whether it is met, the value, and advice if not.
-
-    One that is not `needed` is no reason against a go.
-    """
-
-    what: str
-    met: bool
-    found: str
-    advice: str = ""
-    needed: bool = True
+from walop_jax.io.display import Display, Displayed
+from walop_jax.science.field_accuracy import FieldAccuracy, Requirement
 
 
 def requirements(
@@ -43,48 +32,10 @@ def requirements(
         ),
     ]  # fmt: skip
     if accuracy is not None:
-        allowed, goal = accuracy.goal / 2, two_digits(100 * accuracy.goal)
-        limit = accuracy.limited_by.split(" (")[0]
-        for where, reached, needed in (
-            ("50 % of the field", accuracy.median, True),
-            (accuracy.judged, accuracy.reached, False),
-        ):
-            cause = f", most of it from {limit}" if limit else ""
-            advice = (
-                f"{two_digits((reached / allowed) ** 2)} times the light, over several nights (walop-jax stack); "
-                "walop-jax plan says which exposures"
-            )
-            if not needed and accuracy.without_u > 1.0 - SHARE:
-                strip = f"{100 * accuracy.without_u:.0f} % of the field"
-                cause = f", worst beside the {strip} where one exposure carries almost no information on u"
-                advice = "observe the stars there with the calibration plate at 22.5° as well"
-            text = f"p known to {two_digits(100 * allowed)} % in {where}"
-            value = f"{two_digits(100 * reached)} %{cause}"
-            checks.append(Requirement(text, reached <= allowed, value, advice, needed))
-        for name, effect in unmeasured(accuracy.not_measured).items():
-            text = f"what moves stars by {two_digits(100 * allowed)} % is measured"
-            lacking = f"{name} not measured, {off_by(*effect.error)} at the usual size"
-            checks.append(Requirement(text, effect.error[0] <= allowed, lacking, effect.remedy))
-        if accuracy.hidden > 0:
-            checks.append(
-                Requirement(
-                    f"no undetectable error exceeds {goal} %",
-                    accuracy.hidden <= accuracy.goal,
-                    f"q or u off by {two_digits(100 * accuracy.hidden)} % from {accuracy.hidden_by}",
-                    accuracy.remedy or "walop-jax limits says which exposures would show it",
-                    needed=False,
-                )
-            )
+        checks += [accuracy.middle, *accuracy.requirements]
     for finding in () if calset is None else inspect(calset).findings:
-        checks.append(
-            Requirement(
-                "exposures and errors",
-                False,
-                finding.what,
-                finding.advice,
-                needed=finding.severity == "fault",
-            )
-        )
+        fault = finding.severity == "fault"
+        checks.append(Requirement("exposures and errors", False, finding.what, finding.advice, fault))
     return tuple(checks)
 
 
@@ -104,3 +55,54 @@ def requirement_advice(asked: Sequence[Requirement]) -> tuple[str, ...]:
     """Advice on requirements that are not met, the needed ones first."""
     ordered = sorted(asked, key=lambda need: not need.needed)
     return tuple(f"{need.found}: {need.advice}" for need in ordered if not need.met)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Certificate(Displayed):
+    """The checks of a product and its requirements for stars, its range of application, hash, and parents.
+
+    `content` is its content hash, `parents` are the SHA-256 of its inputs.
+    """
+
+    path: Path
+    checks: tuple[Check, ...]
+    requirements: tuple[Requirement, ...]
+    validity: Validity
+    content: str
+    parents: tuple[str, ...]
+
+    @property
+    def failed(self) -> tuple[Check, ...]:
+        """The checks that do not hold; the product is valid if there are none."""
+        return tuple(check for check in self.checks if not check.passed)
+
+    @property
+    def go(self) -> bool:
+        """True if the product is valid and everything that is needed is met."""
+        return not self.failed and is_go(self.requirements)
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Advice on requirements that are not met, the needed ones first."""
+        return requirement_advice(self.requirements)
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {
+            "product": str(self.path),
+            "go": self.go,
+            "requirements": [dataclasses.asdict(requirement) for requirement in self.requirements],
+            "valid": not self.failed,
+            "schema": PRODVERS,
+            "content": self.content,
+            "parents": list(self.parents),
+            "validity": self.validity._asdict(),
+            "checks": [check._asdict() for check in self.checks],
+        }
+
+    def display(self) -> Display:
+        """Go or no-go, a line for each check and requirement, and advice on those that are not met."""
+        rows = [("ok" if check.passed else "FAILED", check.name, check.found) for check in self.checks]
+        rows += requirement_rows(self.requirements)
+        title = f"{self.path}: {'go' if self.go else 'NO GO'}"
+        return Display(title, head=("", "requirement", "result"), rows=tuple(rows), notes=self.missing)

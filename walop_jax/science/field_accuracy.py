@@ -84,39 +84,45 @@ class FieldAccuracy:
         return float(np.mean(self.error < self.goal))
 
     @property
-    def shortfalls(self) -> tuple[Shortfall, ...]:
+    def requirements(self) -> tuple[Requirement, ...]:
+        """Requirements of the goal: all that acts on stars is measured, p is known, and no larger error could hide."""
+        allowed = self.goal / 2
+        what = f"what moves stars by {two_digits(100 * allowed)} % is measured"
+        asked = []
+        for name, gap in unmeasured(self.not_measured).items():
+            found = f"{name} not measured, {off_by(*gap.error)} at the usual size"
+            asked.append(Requirement(what, gap.error[0] <= allowed, found, gap.remedy))
+        light = two_digits((self.reached / allowed) ** 2)  # errors fall with its square root
+        advice = (
+            f"{light} times the light; walop-jax plan RUN --goal {100 * allowed:.2g} says how long that takes"
+        )
+        if self.without_u > 1.0 - SHARE and self.median <= allowed:
+            strip = f"the strip without u ({100 * self.without_u:.0f} % of the field)"
+            advice = f"observe stars near {strip} with the plate at 22.5° as well"
+        asked.append(_p_known(self.reached, allowed, self.judged, advice, needed=False))
+        if self.hidden > 0:
+            what = f"no error above {two_digits(100 * self.goal)} % goes undetected: {self.hidden_by}"
+            found = f"a systematic error of {two_digits(100 * self.hidden)} % of q or u would go undetected"
+            advice = self.remedy or "walop-jax limits says which exposures would show it"
+            asked.append(Requirement(what, self.hidden <= self.goal, found, advice, needed=False))
+        return tuple(asked)
+
+    @property
+    def middle(self) -> Requirement:
+        """The requirement of a go on p: that it is known in half of the field."""
+        cause, allowed = self.limited_by.split(" (")[0], self.goal / 2
+        light = two_digits((self.median / allowed) ** 2)
+        source = f" (most of the error comes from {cause})" if cause else ""
+        advice = f"{light} times the light{source}, over several nights: walop-jax stack, walop-jax plan"
+        return _p_known(self.median, allowed, "50 % of the field", advice)
+
+    @property
+    def shortfalls(self) -> tuple[Requirement, ...]:
         """Everything that the calibration lacks for the goal; empty: it is good enough."""
         if not self.trusted:
-            return (
-                Shortfall("the calibration is not trusted", "walop-jax diagnose looks for missing effects"),
-            )
-        allowed, lacks = self.goal / 2, []
-        for name, gap in unmeasured(self.not_measured).items():
-            if gap.error[0] > allowed:
-                lacks.append(
-                    Shortfall(f"{name} not measured, {off_by(*gap.error)} at the usual size", gap.remedy)
-                )
-        if self.reached > allowed:
-            if self.without_u > 1.0 - SHARE and self.median <= allowed:
-                advice = "observe stars near the strip without u with the plate at 22.5° as well"
-            else:
-                light = two_digits((self.reached / allowed) ** 2)  # errors fall with its square root
-                goal = f"{100 * allowed:.2g}"
-                advice = f"{light} times the light; walop-jax plan RUN --goal {goal} says how long that takes"
-            lacks.append(
-                Shortfall(
-                    f"{two_digits(100 * self.reached)} % in {self.judged}, {two_digits(100 * allowed)} % allowed",
-                    advice,
-                )
-            )
-        if self.hidden > self.goal:
-            lacks.append(
-                Shortfall(
-                    f"a systematic error of {two_digits(100 * self.hidden)} % of q or u would go undetected",
-                    self.remedy or "walop-jax limits says which exposures would show it",
-                )
-            )
-        return tuple(lacks)
+            advice = "walop-jax diagnose looks for missing effects"
+            return (Requirement("", False, "the calibration is not trusted", advice),)
+        return tuple(need for need in self.requirements if not need.met)
 
     @property
     def median(self) -> float:
@@ -137,7 +143,7 @@ class FieldAccuracy:
             "limited_by": self.limited_by, "hidden": self.hidden, "hidden_by": self.hidden_by,
             "hidden_worst": self.hidden_worst, "not_measured": [entry.name for entry in self.not_measured],
             "reached": self.reached, "good_enough": not self.shortfalls,
-            "shortfalls": [dataclasses.asdict(entry) for entry in self.shortfalls],
+            "shortfalls": [{"what": lack.found, "advice": lack.advice} for lack in self.shortfalls],
         }  # fmt: skip
 
     def facts(self, *, complete: bool = True) -> tuple[tuple[str, str], ...]:
@@ -149,7 +155,7 @@ class FieldAccuracy:
         median_error += f"; below {goal} over {100 * self.share:.0f} % of the field"
         lines = [("p of a star", median_error if complete else f"{median_error}, if nothing were missing")]
         if complete:
-            verdict = [f"no: {lacks[0].what}", *(lack.what for lack in lacks[1:])] if lacks else []
+            verdict = [f"no: {lacks[0].found}", *(lack.found for lack in lacks[1:])] if lacks else []
             verdict = verdict or [f"yes: {two_digits(100 * self.reached)} % in {self.judged}"]
             lines += zip([f"good for {goal}", *[""] * (len(verdict) - 1)], verdict, strict=True)
             lines += [("what to do", lack.advice) for lack in lacks[:1] if lack.advice != self.remedy]
@@ -166,11 +172,23 @@ class FieldAccuracy:
 
 
 @dataclasses.dataclass(frozen=True)
-class Shortfall:
-    """Something that a calibration lacks for a goal, and what to do."""
+class Requirement:
+    """A requirement on a calibration: whether it is met, the result, and advice if not.
+
+    One that is not `needed` is no reason against a go.
+    """
 
     what: str
-    advice: str
+    met: bool
+    found: str
+    advice: str = ""
+    needed: bool = True
+
+
+def _p_known(error: float, allowed: float, where: str, advice: str, *, needed: bool = True) -> Requirement:
+    limit = f"{two_digits(100 * allowed)} %"
+    found = f"{two_digits(100 * error)} % in {where}, {limit} allowed"
+    return Requirement(f"p known to {limit} in {where}", not error > allowed, found, advice, needed)
 
 
 def reached(error: Float[np.ndarray, "*p"]) -> float:

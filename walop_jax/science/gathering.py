@@ -40,7 +40,11 @@ BLEND = 8  # bit of N_FLAG
 FEWEST = 0.2  # of the stars of a camera must be those of the others
 MISSING = 0.2  # of the stars that all others see, from which on a camera is remarked on
 SAME_FLUXES = 0.5  # of the stars of two cameras: one is a copy of the other
-APART = 0.01  # d, between catalogues of one exposure
+APART = {
+    "MJD": 0.01,
+    "TEMP": 0.5,
+    "HA": 0.05,
+}  # between catalogues of one exposure; other values are the same
 DIGITS = 1e-3  # to which cameras agree on a number of a star
 FARTHEST = 1.0  # deg: the median star of the field is nearer to its centre
 Columns = dict[str, tuple[np.ndarray, str, str]]
@@ -310,14 +314,22 @@ def _columns(
         columns[name] = (_whole(values) if texts else values, unit, about)
     for name in sorted({name for camera in catalogues for name in camera.of_exposure}):
         stated = [camera.of_exposure.get(name, "not stated") for camera in catalogues]
-        if name == "MJD":
-            stated = [time for time in stated if time != "not stated"]
-        if np.ptp(np.array(stated, float)) > APART if name == "MJD" else len(set(map(str, stated))) > 1:
+        if _differ(name, stated):
             listed = " and ".join(sorted(set(map(str, stated))))
             raise fail(f"{name} is {listed} in catalogues of one exposure", advice="correct it")
         value = next(camera.of_exposure[name] for camera in catalogues if name in camera.of_exposure)
         columns[name] = (np.full(len(ra), value), "", "of the exposure")
     return columns, remarks
+
+
+def _differ(name: str, stated: Sequence[Any]) -> bool:
+    """True where catalogues of one exposure state different values; cameras have their own clocks and sensors."""
+    if name not in APART:
+        return len(set(map(str, stated))) > 1
+    try:
+        return float(np.ptp([float(value) for value in stated if value != "not stated"])) > APART[name]
+    except ValueError:
+        return True
 
 
 def _agreed(values: np.ndarray, texts: bool) -> tuple[np.ndarray, Bool[np.ndarray, " s"]]:

@@ -19,8 +19,14 @@ from walop_jax.io.text import some, with_error, with_minus_sign
 ALARM = 1e-4
 """Probability that noise raises any alarm in a catalogue, or in all that are watched together."""
 RIVAL = 11.0
+LARGEST = 0.5
+"""Relative change of a camera beyond which the counts are not those of the instrument."""
 MOST_LIKELY = 2.33
 """Standard deviations above the alarm from which 99 % are detected (one-sided)."""
+REACH = 3.0
+"""Sizes from the centre of a spot beyond which nothing is left of it."""
+Place = tuple[float, ...]
+"""Centre (X, Y) and size of a spot, in degrees, and the sharpness of its edge."""
 UNNAMED = "unnamed"
 """Kind and name of a change that nothing in its range describes."""
 _UNEXPLAINED = "a change that no camera, arm or place of the field makes"
@@ -40,6 +46,13 @@ def threshold(chance: float) -> float:
 def chance_of(sigma: float) -> float:
     """Probability that a normal number is as far from 0, to either side."""
     return float(2.0 * special.ndtr(-abs(sigma)))
+
+
+def profile(x: Float[np.ndarray, " r"], y: Float[np.ndarray, " r"], place: Place) -> Float[np.ndarray, " r"]:
+    """A spot at positions (deg): exp(−(d/s)ᵐ/2), 0 beyond `REACH` sizes s; m = 2 where a place does not say."""
+    far = ((x - place[0]) ** 2 + (y - place[1]) ** 2) / place[2] ** 2
+    power = 0.5 * place[3] if len(place) > 3 else 1.0
+    return np.where(far < REACH**2, np.exp(-0.5 * np.minimum(far, REACH**2) ** power), 0.0)
 
 
 class History(NamedTuple):
@@ -66,8 +79,8 @@ class PossibleChange(NamedTuple):
 
     `kind` is gain (a camera), arm (its cameras together, NAME+NAME), gradient or spot (of a camera or an arm), optics,
     or `UNNAMED`; within one catalogue also x, y, time, flux and light of a camera. `place` is the direction of a
-    gradient (deg, from X towards Y), whose size is that at the edge of the field, or centre and radius (deg) and the
-    sharpness of the edge (`watch_spots`) of a spot, whose size is that at its centre.
+    gradient (deg, from X towards Y), whose size is that at the edge of the field, or centre, size (deg) and sharpness
+    of a spot (`profile`), whose size is that at its centre.
     """
 
     name: str
@@ -99,6 +112,12 @@ class PossibleChange(NamedTuple):
         """Size in standard errors."""
         return self.size / self.error
 
+    @property
+    def implausible(self) -> bool:
+        """True for a camera that would be brighter or fainter by more than cameras become."""
+        relative = self.kind in ("gain", "arm", "gradient", "x", "y", "time")
+        return self.camera and relative and abs(self.size) > LARGEST
+
     def words(self) -> str:
         """The change and its size in words."""
         if self.kind == UNNAMED:
@@ -114,8 +133,8 @@ class PossibleChange(NamedTuple):
         if self.kind == "gradient":
             where = f" at the edge of the field {round(self.place[0]) % 360}° from X towards Y"
         elif self.kind == "spot":
-            x, y, radius = (with_minus_sign(f"{value:.3f}") for value in self.place[:3])
-            where = f" in a spot at X = {x}°, Y = {y}°, within {radius}°"
+            x, y = (with_minus_sign(f"{value:.3f}") for value in self.place[:2])
+            where = f" in a spot at X = {x}°, Y = {y}°, within {2 * self.place[2]:.2g}°"
         size = with_error(100 * abs(self.size), 100 * self.error)
         return f"{name} {('brighter', 'fainter')[lower]} by {size} %{where}"
 

@@ -12,28 +12,28 @@ Of every star and camera  z = cᵀr / √(v₀ cᵀPc)  is normal with unit vari
 ψ cuts z at ±`CUT`, v = max(1, mean ψ²) of the catalogue: no star has more influence than `CUT`, so that four are
 needed, and stars that are off alone, however far, make no place. Z is normal, or has shorter tails; Bonferroni's bound
 over centres, sizes, cameras and weights keeps false alarms below `ALARM` a catalogue. A matched filter with a bounded
-score: Huber 1981, Robust Statistics, chapter 4.
+score: Huber 1981, Robust Statistics, chapter 4. The watch of many nights looks for spots by the same, with the stars of
+each group and of all that follow it.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage, optimize
 
 from walop_jax.io.text import some, with_error
-from walop_jax.science.instrument_changes import ALARM, RIVAL, chance_of
+from walop_jax.science.instrument_changes import ALARM, REACH, RIVAL, Place, chance_of, profile
 from walop_jax.science.star_residuals import StarResiduals, own_variance
 
 CUT = 3.0
 SIZES = (1 / 32, 1 / 16, 1 / 8, 1 / 4)
 """Sizes s that are looked for, as shares of the largest |X|, |Y| of the stars: 0.009 to 0.07° of a WALOP."""
 _CELLS = 3  # in a size, along a side
-_REACH = 3.0  # sizes: beyond, nothing is left of a place
 _TOGETHER = 1 / 64  # of the largest |X|, |Y|: rows of a star that lie closer are one
 _BLIND = 1e-3  # cᵀPc over cᵀc below which a star does not see a camera
 _MOST = 8  # places
@@ -62,8 +62,7 @@ class DisagreeingPlace:
 
     def profile(self, x: Float[np.ndarray, " r"], y: Float[np.ndarray, " r"]) -> Float[np.ndarray, " r"]:
         """g at field positions: 1 in the centre, 0 beyond three sizes."""
-        far = ((x - self.x) ** 2 + (y - self.y) ** 2) / self.size**2
-        return np.where(far < _REACH**2, np.exp(-0.5 * far), 0.0)
+        return profile(x, y, (self.x, self.y, self.size))
 
     def words(self) -> str:
         """The place in a sentence."""
@@ -83,8 +82,8 @@ class DisagreeingPlace:
         return about | {"alike": [camera._asdict() for camera in self.alike]}
 
 
-class _Seen(NamedTuple):
-    """Stars at places: positions, z and α of every camera; χ² and its degrees of freedom."""
+class Seen(NamedTuple):
+    """Stars at places: positions, z and α of every camera, or of cameras together; χ² and its degrees of freedom."""
 
     x: Float[np.ndarray, " s"]
     y: Float[np.ndarray, " s"]
@@ -92,6 +91,23 @@ class _Seen(NamedTuple):
     alpha: Float[np.ndarray, "s k"]
     chi2: Float[np.ndarray, " s"]
     dof: Float[np.ndarray, " s"]
+
+    def of(self, chosen: Bool[np.ndarray, " s"]) -> Seen:
+        """Some of the stars."""
+        return Seen(*(values[chosen] for values in self))
+
+    def near(self, place: Place) -> Seen:
+        """The stars that a place of several times its size may hold."""
+        return self.of(profile(self.x, self.y, (*place[:2], _WIDER * place[2])) > 0)
+
+
+class Strongest(NamedTuple):
+    """The place of the largest |Z|: its sign and size, the number of the camera, and the number of trials."""
+
+    place: Place
+    sigma: float
+    camera: int
+    trials: int
 
 
 def places_of(
@@ -106,72 +122,95 @@ def places_of(
     `cameras` are names. `residual` is that of `stars`, with or without changes, `variance` that of the
     residuals of every star over that of its noise (None: `own_variance`).
     """
-    stars_seen = _seen(
+    seen = _seen(
         stars,
         stars.residual if residual is None else residual,
         own_variance(stars) if variance is None else variance,
     )
-    extent = max(float(np.abs([stars_seen.x, stars_seen.y]).max(initial=0.0)), 1e-9)
+    extent = max(float(np.abs([seen.x, seen.y]).max(initial=0.0)), 1e-9)
     places: list[DisagreeingPlace] = []
-    remaining = np.ones(len(stars_seen.x), bool)
+    remaining = np.ones(len(seen.x), bool)
     while len(places) < _MOST and remaining.sum() > 1:
-        subset = _Seen(*(values[remaining] for values in stars_seen))
-        centre, sigma, trials = _strongest(subset, extent)
-        if trials * chance_of(sigma) >= alarm:
+        subset = seen.of(remaining)
+        largest = strongest(subset, extent)
+        if largest.trials * chance_of(largest.sigma) >= alarm:
             break
-        place = _described(subset, centre, sigma, cameras)
+        place = _described(subset, largest, cameras)
         places.append(place)
-        remaining &= place.profile(stars_seen.x, stars_seen.y) == 0.0
+        remaining &= place.profile(seen.x, seen.y) == 0.0
     return tuple(places)
+
+
+Sums = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""cᵀr, cᵀPc ahead of q and u, the root of what these take of it, and cᵀc: of rows, or summed over those of a star."""
+
+
+def _sums(
+    stars: StarResiduals, residual: Float[np.ndarray, "r k"], members: Float[np.ndarray, "k c"]
+) -> Sums:
+    """The sums of every row for cameras together: `members` are 1 for those."""
+    columns = []
+    for _, rows, part in stars.blocks():
+        free, _ = part.projected(part.model[..., None] * members)
+        half = np.linalg.cholesky(part.photon).swapaxes(1, 2)[part.star]
+        along = half @ np.einsum("rik,crk->ric", part.tangent, free, optimize=True)
+        score = (part.model * residual[rows]) @ members
+        columns.append((score, np.sum(free**2, axis=-1).T, along, part.model**2 @ members))
+    score, square, along, full = map(np.concatenate, zip(*columns, strict=True))
+    return score, square, along, full
+
+
+def _seeing(sums: Iterable[np.ndarray], spread: Float[np.ndarray, "s 1"]) -> tuple[np.ndarray, np.ndarray]:
+    """z and α of stars with these sums; `spread` is the variance of their residuals."""
+    score, square, along, full = sums
+    information = square - np.sum(along**2, axis=1)
+    sees = information > _BLIND * full
+    root = np.sqrt(np.where(sees, information, 1.0) * spread)
+    return np.where(sees, score / root, 0.0), np.where(sees, root / spread, 0.0)
 
 
 def _seen(
     stars: StarResiduals, residual: Float[np.ndarray, "r k"], variance: Float[np.ndarray, " s"]
-) -> _Seen:
+) -> Seen:
     """z and α of the stars; rows of one star at different places are stars of their own."""
-    columns = []
     extent = max(float(np.abs([stars.x, stars.y]).max(initial=0.0)), 1e-9)
     cell = np.round(np.stack([stars.x, stars.y], axis=1) / (_TOGETHER * extent)).astype(int)
-    for numbers, rows, subset in stars.blocks():
-        key = np.concatenate([subset.star[:, None], cell[rows]], axis=1)
-        _, first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
-        group = group.reshape(-1)
-        cameras = subset.model.shape[1]
-        free, _ = subset.projected(subset.model[:, :, None] * np.eye(cameras))
-        along = np.einsum("rik,crk->ric", subset.tangent, free, optimize=True)
+    key = np.column_stack([stars.star, cell])
+    _, first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
 
-        def summed(
-            values: np.ndarray, group: Int[np.ndarray, " r"] = group, first: Any = first
-        ) -> np.ndarray:
-            total = np.zeros((len(first), *values.shape[1:]))
-            np.add.at(total, group, values)
-            return total
+    def summed(values: np.ndarray) -> np.ndarray:
+        total = np.zeros((len(first), *values.shape[1:]))
+        np.add.at(total, group.reshape(-1), values)
+        return total
 
-        score = summed(np.einsum("crk,rk->rc", free, residual[rows]))
-        square, projected = summed(np.einsum("crk,crk->rc", free, free)), summed(along)
-        of_star = subset.star[first]
-        chi2 = square - np.einsum(
-            "sic,sij,sjc->sc", projected, subset.photon[of_star], projected, optimize=True
-        )
-        sees = chi2 > _BLIND * summed(subset.model**2)
-        spread = variance[numbers][of_star][:, None]
-        root = np.sqrt(np.where(sees, chi2, 1.0) * spread)
-        columns.append(
-            _Seen(
-                subset.x[first],
-                subset.y[first],
-                np.where(sees, score / root, 0.0),
-                np.where(sees, root / spread, 0.0),
-                summed(np.sum(residual[rows] ** 2, axis=1)) / spread[:, 0],
-                np.maximum(subset.dof[of_star] / np.bincount(of_star)[of_star], 0.5),
-            )
-        )
-    return _Seen(*(np.concatenate(values) for values in zip(*columns, strict=True)))
+    star = stars.star[first]
+    spread = variance[star]
+    cameras = np.eye(stars.model.shape[1])
+    z, alpha = _seeing(map(summed, _sums(stars, residual, cameras)), spread[:, None])
+    chi2 = summed(np.sum(residual**2, axis=1)) / spread
+    dof = np.maximum(stars.dof[star] / np.bincount(star)[star], 0.5)
+    return Seen(stars.x[first], stars.y[first], z, alpha, chi2, dof)
 
 
-def _strongest(seen: _Seen, extent: float) -> tuple[tuple[float, float, float], float, int]:
-    """Centre and size (deg) of the largest |Z|, with its sign, and the number of trials."""
-    centre, strongest, trials = (0.0, 0.0, 0.0), 0.0, 0
+def seen_from(
+    stars: StarResiduals,
+    group: Int[np.ndarray, " r"],
+    members: Float[np.ndarray, "k c"],
+    residual: Float[np.ndarray, "r k"],
+    variance: Float[np.ndarray, " s"],
+) -> Iterator[Seen]:
+    """The stars by their rows of each exposure group and of all that follow it; `members` as in `_sums`."""
+    first, sums = stars.first, _sums(stars, residual, members)
+    about = stars.chi2(residual) / variance, stars.dof.astype(float)
+    for start in range(int(group.max()) + 1):
+        on = (group >= start).astype(float)
+        later = (np.add.reduceat((on * values.T).T, first) for values in sums)
+        yield Seen(stars.x[first], stars.y[first], *_seeing(later, variance[:, None]), *about)
+
+
+def strongest(seen: Seen, extent: float) -> Strongest:
+    """The place of the largest |Z| of stars whose |X| and |Y| reach to `extent` (deg)."""
+    best, trials = Strongest((0.0, 0.0, 0.0), 0.0, 0, 0), 0
     cut = np.clip(seen.z, -CUT, CUT)
     sees = (seen.alpha > 0).astype(float)
     variance = max(1.0, float(np.sum(cut**2) / max(sees.sum(), 1.0)))
@@ -188,59 +227,58 @@ def _strongest(seen: _Seen, extent: float) -> tuple[tuple[float, float, float], 
                 top = _smoothed(index, weight * cut[:, k], shape, 1)[occupied]
                 bottom = _smoothed(index, weight**2, shape, 2)[occupied]
                 z = top / np.sqrt(variance * np.where(bottom > 0, bottom, np.inf))
-                best = int(np.argmax(np.abs(z)))
-                if abs(z[best]) > abs(strongest):
-                    inside = index == occupied[best]
-                    middle = seen.x[inside].mean(), seen.y[inside].mean()
-                    centre, strongest = (float(middle[0]), float(middle[1]), size), float(z[best])
+                largest = int(np.argmax(np.abs(z)))
+                if abs(z[largest]) > abs(best.sigma):
+                    inside = index == occupied[largest]
+                    centre = float(seen.x[inside].mean()), float(seen.y[inside].mean())
+                    best = Strongest((*centre, size), float(z[largest]), k, 0)
                 trials += len(occupied)
-    return centre, strongest, trials
+    return best._replace(trials=trials)
 
 
 def _smoothed(
     index: Int[np.ndarray, " s"], values: Float[np.ndarray, " s"], shape: tuple[int, ...], power: int
 ) -> Float[np.ndarray, " c"]:
     """Sums of values over cells with the weights g (`power` 1) or g² (2)."""
-    steps = np.arange(-_CELLS * int(_REACH), _CELLS * int(_REACH) + 1) / _CELLS
-    kernel = np.exp(-0.5 * power * steps**2)
+    reach = _CELLS * int(REACH)
+    kernel = np.exp(-0.5 * power * (np.arange(-reach, reach + 1) / _CELLS) ** 2)
     sums = np.bincount(index, values, minlength=int(np.prod(shape))).reshape(shape)
     for axis in (0, 1):
         sums = ndimage.correlate1d(sums, kernel, axis=axis, mode="constant")
     return sums.ravel()
 
 
-def _described(
-    seen: _Seen, centre: tuple[float, float, float], sigma: float, cameras: Sequence[str]
-) -> DisagreeingPlace:
-    """The place about a centre, with the cameras that describe its stars as well as the best one."""
-    near = (
-        DisagreeingPlace(centre[0], centre[1], _WIDER * centre[2], sigma, 0, ()).profile(seen.x, seen.y) > 0
-    )
-    subset = _Seen(*(values[near] for values in seen))
+def _described(seen: Seen, found: Strongest, cameras: Sequence[str]) -> DisagreeingPlace:
+    """The place about the strongest one, with the cameras that describe its stars as well as the best one."""
+    subset = seen.near(found.place)
     fits = []
     for k, name in enumerate(cameras):
-        x, y, size = _fitted(subset, k, centre)
-        place = DisagreeingPlace(x, y, size, sigma, 0, ())
-        share, error, gain = _share(subset, k, place.profile(subset.x, subset.y))
+        place = fitted(subset, k, found.place)
+        share, error, gain = share_of(subset, k, profile(subset.x, subset.y, place))
         fits.append((gain, place, CameraAtPlace(k, name, share, error)))
     fits.sort(key=lambda fit: -fit[0])
-    best, place = fits[0][0], fits[0][1]
+    best, place, _ = fits[0]
     scatter = (subset.chi2.sum() - best) / max(subset.dof.sum() - 4.0, 1.0)
     alike = [camera for gain, _, camera in fits if gain > best - RIVAL * max(1.0, scatter)]
-    g = place.profile(subset.x, subset.y)
-    return dataclasses.replace(place, stars=int((g > np.exp(-2.0)).sum()), alike=tuple(alike))
+    inside = profile(subset.x, subset.y, place) > np.exp(-2.0)
+    x, y, size = place
+    return DisagreeingPlace(x, y, size, found.sigma, int(inside.sum()), tuple(alike))
 
 
-def _fitted(seen: _Seen, camera: int, centre: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Centre and size of the place that describes the stars best by one camera, near those that were looked for."""
-    x, y, size = centre
+def fitted(seen: Seen, camera: int, start: Place) -> Place:
+    """The place at which a camera describes the stars best, near the one that was looked for, its edge as sharp."""
+    x, y, size, *edge = start
 
-    def place(moved: Float[np.ndarray, " 3"]) -> tuple[float, float, float]:
-        return x + size * moved[0], y + size * moved[1], size * float(np.exp(moved[2]))
+    def place(moved: Float[np.ndarray, " 3"]) -> Place:
+        return (
+            x + size * float(moved[0]),
+            y + size * float(moved[1]),
+            size * float(np.exp(moved[2])),
+            *edge,
+        )
 
     def misfit(moved: Float[np.ndarray, " 3"]) -> float:
-        g = DisagreeingPlace(*place(moved), 0.0, 0, ()).profile(seen.x, seen.y)
-        return float(moved @ moved) - _share(seen, camera, g)[2]
+        return float(moved @ moved) - share_of(seen, camera, profile(seen.x, seen.y, place(moved)))[2]
 
     bounds = [(-_WIDER, _WIDER)] * 2 + [(-1.0, np.log(_WIDER))]
     first = np.vstack([np.zeros(3), 0.5 * np.eye(3)])
@@ -249,7 +287,13 @@ def _fitted(seen: _Seen, camera: int, centre: tuple[float, float, float]) -> tup
     return place(solution.x)
 
 
-def _share(seen: _Seen, camera: int, g: Float[np.ndarray, " s"]) -> tuple[float, float, float]:
+def described(seen: Seen, camera: int, place: Place, size: float) -> Bool[np.ndarray, " s"]:
+    """Stars whose shift is that of a camera at a place, to `CUT` standard errors or to half of it: spots have edges."""
+    shift = size * seen.alpha[:, camera] * profile(seen.x, seen.y, place)
+    return (shift != 0) & (np.abs(seen.z[:, camera] - shift) < CUT + 0.5 * np.abs(shift))
+
+
+def share_of(seen: Seen, camera: int, g: Float[np.ndarray, " s"]) -> tuple[float, float, float]:
     """β of a camera, its standard error, and by how much it makes χ² smaller."""
     shape = seen.alpha[:, camera] * g
     square, score = float(shape @ shape), float(shape @ seen.z[:, camera])

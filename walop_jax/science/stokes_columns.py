@@ -1,16 +1,25 @@
-"""Additions of `walop-jax apply` to a catalogue: columns, one value per row, and the cards of the header."""
+"""Additions of `walop-jax apply` to a catalogue: columns, one value per row, cards of the header, and warnings."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from walop_jax.fit.verdict import Quality
+from walop_jax.model.instrument import Instrument
 from walop_jax.science.apply import COOL, HOT, Stars
+from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_check import CatalogueCheck
+from walop_jax.science.overlaps import extents
 from walop_jax.science.polarisation import polarisation
 
+BRIGHT = 1000.0  # electrons: their errors are a few per cent, with a read noise of 100 electrons a tenth
+FEW = 0.5  # of the rows
+QUIET = 0.02  # of the variance of photons: what a mean of fifty exposures has
+APART = 0.005  # deg: rows of one star that lie farther apart may be those of two
 Columns = dict[str, tuple[np.ndarray, str, str]]  # values, description, unit
 
 
@@ -73,3 +82,70 @@ def header(product: str, estimator: str, on_sky: float, check: CatalogueCheck) -
         "PHOTFAC1": round(float(factors[0]), 6),
         "PHOTFAC2": round(float(factors[1]), 6),
     }
+
+
+# ------------------------------------------------------------------------------------------------------- warnings
+
+
+def sentences(rows: Catalogue, stars: Stars, names: Sequence[str]) -> Iterator[str]:
+    """Warnings about a catalogue: of its stars together, of counts and errors, of stars with another's rows.
+
+    `names` are those of the cameras.
+    """
+    at_places = {place.words() for place in stars.check.places}
+    for text in stars.check.warnings():
+        yield f"{text} (FLAG {Quality.PLACE if text in at_places else Quality.CATALOGUE:d})"
+    yield from about_counts(rows.counts, rows.sigma, names)
+    if number := int(((extents(rows) > APART) & (stars.flag & Quality.DISAGREES > 0)).sum()):
+        yield f"{number} of the stars that disagree have rows at different places: is their ID that of one star?"
+
+
+def about_counts(
+    counts: Float[np.ndarray, "r k"], sigma: Float[np.ndarray, "r k"], names: Sequence[str]
+) -> Iterator[str]:
+    """Warnings about errors that are none of counts, and about cameras that are hardly used."""
+    used = np.isfinite(counts)
+    for name, of_camera in zip(names, used.T, strict=True):
+        if used.any() and of_camera.mean() < FEW:
+            what = "N is negative, flagged, saturated or NaN in the others"
+            yield f"{name} is used in {int(of_camera.sum())} of {len(counts)} rows: {what}"
+    lit = used & (counts > 0)
+    if lit.any() and (share := float(np.median(sigma[lit] ** 2 / counts[lit]))) < QUIET:
+        yield (
+            f"N_ERR is {share**-0.5:.2g} times smaller than the noise of photons: is N in electrons? Magnitudes, rates "
+            "and means of exposures are not"
+        )
+    bright = counts > BRIGHT
+    if bright.any() and (share := float(np.median(sigma[bright] / counts[bright]))) > 0.5:
+        yield f"N_ERR of bright stars is {share:.2g} times N: are these variances? Standard errors are wanted"
+
+
+def counted_flags(rows: Catalogue, instrument: Instrument) -> dict[Quality, str]:
+    """The bits of FLAG that are counted, with their warnings."""
+    alone = len(np.unique(rows.star)) == len(rows.star) and len(instrument.arms) == 1
+    settings = ": with one arm a star needs rows at several settings, of one ID" if alone else ""
+    quiet = (Quality.HIGH_CROSSTALK, Quality.CAMERA_MISSING, Quality.SATURATED, Quality.VALIDITY_FORCED)
+    return dict.fromkeys((*quiet, Quality.UNKNOWN_COLOUR), "") | {
+        Quality.NO_STOKES: f"star(s) without a result (FLAG 16384){settings}",
+        Quality.BEYOND_FIELD: "star(s) beyond the calibrated field: extrapolated, or NaN (FLAG 32)",
+        Quality.BEYOND_SETTINGS: "star(s) with a filter, temperature or TEFF beyond the calibration",
+        Quality.DISAGREES: "star(s) whose intensities disagree with the calibration (FLAG 131072, CHI2): is "
+        "the background subtracted, are the cameras in order?",
+        Quality.PLACE: "star(s) at a place of the field where stars disagree with the calibration together "
+        "(FLAG 1048576): their errors are enlarged",
+        Quality.OTHER_FRAME: "star(s) without ROTATOR, in the frame of the instrument (FLAG 2097152)",
+        Quality.REPEATED: "star(s) with the place and counts of another star or setting (FLAG 4194304)",
+    }
+
+
+def errors_in_words(columns: Mapping[str, tuple[Any, ...]]) -> str:
+    """The median error of p, and how much of it is noise of photons; empty where no star has one."""
+    error, q, u, *photons = (columns[name][0] for name in ("P_ERR", "Q_ERR", "U_ERR", "Q_PHOTON", "U_PHOTON"))
+    measured = error > 0
+    if not measured.any():
+        return ""
+    share = sum(values[measured] ** 2 for values in photons) / (q[measured] ** 2 + u[measured] ** 2)
+    return (
+        f"; error of p {100 * float(np.median(error[measured])):.2g} % (median), photons make "
+        f"{100 * float(np.median(share)):.0f} % of its variance"
+    )

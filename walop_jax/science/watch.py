@@ -14,7 +14,7 @@ once        h = 1 in a single group
 
 All cameras together are flux: no history of theirs leaves a trace. Asked are the gains of cameras and of arms (all
 cameras of one), their gradients over the field (of any direction φ: β cos φ x + β sin φ y, as χ² of two numbers), spots
-(`watch_spots`) and the numbers of the optics (thicknesses, axes of plates, …). One correction for all of it: noise
+(`places`) and the numbers of the optics (thicknesses, axes of plates, …). One correction for all of it: noise
 raises an alarm in one of 1/`ALARM` catalogues, at z₀; the size seen in 99 % is (z₀ + 2.33) σ_β. A detected change
 competes with all others of the same history: those that describe the stars as well are told together, and a camera is
 named only if no other is among them. A number of the optics that would have to change by more than `FARTHEST` widths of
@@ -47,8 +47,10 @@ from walop_jax.science.instrument_changes import (
     UNNAMED,
     History,
     PossibleChange,
+    profile,
     threshold,
 )
+from walop_jax.science.places import Seen, Strongest, described, fitted, seen_from, share_of, strongest
 from walop_jax.science.star_residuals import (
     ABOUT_GAINS,
     CROWDED,
@@ -69,7 +71,6 @@ from walop_jax.science.star_residuals import (
 )
 from walop_jax.science.watch_found import Watch, WatchedChange
 from walop_jax.science.watch_readings import Answers, Readings
-from walop_jax.science.watch_spots import SpotFound, Spots, of_stars, profile
 
 WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen to 10⁻⁵
 MOST_GROUPS = 150
@@ -86,6 +87,8 @@ RIVALS = (
     "filter_shift",
 )
 """Effects of the optics that may have changed, beside the parameters of the model."""
+EDGES = (2.0, 8.0)
+"""Sharpness of spots: a blurred one and one with an edge."""
 _CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
 _MOST_CHANGES = 4
 _ROUNDS = 6
@@ -192,13 +195,10 @@ class Watching:
         self.histories += [History("drift", g) for g in range(groups - 2)]
         self.histories += [History("once", g) for g in range(1, groups - 1)]
         self.shapes = np.stack([h.over(self.time) for h in self.histories], axis=1)
-        self.spots = Spots(stars, self.readings.edge)
         self.spoilt = np.zeros(len(stars.photon), bool)  # by spots that were found
         self.tests = len(self.histories) * self.readings.asked
         # Half of the false alarms are for spots: as many as there are would else take from all others.
         self.alarm = threshold(0.5 * ALARM / self.tests)
-        questions = groups * len(self.readings.of_cameras) * len(self.spots)
-        self.alarm_of_spots = threshold(0.5 * ALARM / max(questions, 1))
         # Stars of a single group have a scale with the others of it; those of several groups together.
         low, high = (op.reduceat(self.group, stars.first) for op in (np.minimum, np.maximum))
         self.pool = np.where(low == high, low, groups)
@@ -385,8 +385,8 @@ class Watching:
             change, residual = chosen
             changes.append(change)
             if change.best.kind == "spot":
-                x, y, radius, edge = change.best.place
-                self.spoilt |= profile(self.spots.x, self.spots.y, (x, y, 1.5 * radius, edge)) > 0
+                x, y = (values[self.stars.first] for values in (self.stars.x, self.stars.y))
+                self.spoilt |= profile(x, y, change.best.place) > 0
             weights, scale = self.weights(residual)
             matrix, score = self.scan(residual, weights)
         remarks = self.alone(residual, weights, scale)
@@ -468,22 +468,32 @@ class Watching:
         # Stars that lie off may be those of the spot.
         common = np.zeros(len(self.time) + 1)
         np.maximum.at(common, self.pool, weights.inverse * self.variance)
-        of_all, members = weights._replace(inverse=common[self.pool] / self.variance), self.readings.members
-        strongest: tuple[SpotFound, int, Any, Any] | None = None
-        for start, (z, root) in enumerate(of_stars(self.stars, self.group, members, residual, of_all)):
-            z[self.spoilt] = 0.0
-            spot = self.spots.strongest(z)
-            if spot is not None and spot.strength > max(
-                self.alarm_of_spots, strongest[0].strength if strongest else 0.0
-            ):
-                strongest = spot, start, z[:, spot.unit], root[:, spot.unit]
-        if strongest is None:
+        inverse = common[self.pool] / self.variance
+        usable = (inverse > 0) & ~self.spoilt
+        if usable.sum() < FEW:
             return None
-        spot, start, z, root = strongest
-        place, described = self.spots.refined(spot, z, root)
-        name, since = self.readings.of_cameras[spot.unit].name, History("step", start)
+        variance = 1.0 / np.where(usable, inverse, 1.0)
+        found: list[tuple[Strongest, int, Seen]] = []  # that of all rows, and the strongest
+        trials = 0
+        later = seen_from(self.stars, self.group, self.readings.members, residual, variance)
+        for start, seen in enumerate(every.of(usable) for every in later):
+            here = strongest(seen, self.readings.edge)
+            trials += here.trials
+            if start == 0 or abs(here.sigma) > abs(found[-1][0].sigma):
+                found = [*found[:1], (here, start, seen)]
+        (spot, start, seen), alarm = found[-1], threshold(0.5 * ALARM / max(trials, 1))
+        if abs(spot.sigma) < alarm:
+            return None
+        near = seen.near(spot.place)
+        ways = [fitted(near, spot.camera, (*spot.place, edge)) for edge in EDGES]
+        gains = [share_of(near, spot.camera, profile(near.x, near.y, way)) for way in ways]
+        (size, *_), place = max(zip(gains, ways, strict=True), key=lambda way: way[0][2])
+        name, since = self.readings.of_cameras[spot.camera].name, History("step", start)
         ranked = [PossibleChange(name, True, since, kind="spot", place=place)]
-        weights = weights._replace(inverse=np.where(described, of_all.inverse, weights.inverse))
+        of_spot = np.zeros(len(usable), bool)
+        for _, _, seen in found:
+            of_spot[usable] |= described(seen, spot.camera, place, size)
+        weights = weights._replace(inverse=np.where(of_spot, inverse, weights.inverse))
         for _ in range(2):  # which cameras, and from when on
             best = ranked[0]
             questions = [best._replace(name=reading.name) for reading in self.readings.of_cameras]
@@ -491,7 +501,7 @@ class Watching:
             if not (ranked := self._sized(residual, questions, weights)):
                 return None
         best = ranked[0]
-        if abs(best.sigma) < self.alarm_of_spots or not self.readings.possible(best):
+        if abs(best.sigma) < alarm or not self.readings.possible(best):
             return None
         alike = [entry for entry in ranked if entry.sigma**2 > best.sigma**2 - RIVAL]
         return self._dated(best, alike), self.without(residual, best, best.size)

@@ -16,9 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.science.instrument_changes import PossibleChange
+from walop_jax.science.instrument_changes import PossibleChange, profile
 from walop_jax.science.star_residuals import ROUNDING, StarResiduals
-from walop_jax.science.watch_spots import profile
 
 FARTHEST = 10.0
 """Widths of its prior by which a number of the optics may change: no optics moves farther, nor do first-order columns

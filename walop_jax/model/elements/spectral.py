@@ -248,6 +248,6 @@ class Mirror(WithCurves):
         s = (cos - inside) / (cos + inside)
         p = (index**2 * cos - inside) / (index**2 * cos + inside)
         nothing = jnp.zeros_like(p)
-        matrix = mueller.from_jones(mueller.Matrix2(p, nothing, nothing, s))
+        matrix = mueller.from_jones(mueller.matrix2(p, nothing, nothing, s))
         axis = jnp.deg2rad(self.axis)
         return mueller.rotation(-axis) @ (matrix / matrix[..., :1, :1]) @ mueller.rotation(axis)
