@@ -11,7 +11,6 @@ from walop_jax.plans.families import Family, Listed, even_angles, harmonics, hig
 from walop_jax.plans.optimal import (
     Experiment,
     NotEstimableError,
-    joined,
     least_budget,
     lower_bound,
     optimise,
@@ -45,22 +44,6 @@ def test_a_optimal_quadratic_regression():
     assert plan.value == pytest.approx(8.0, rel=1e-5)
     assert plan.bound <= 8.0 <= plan.value
     assert [weights_at(plan, GRID, x) for x in (-1, 0, 1)] == pytest.approx([0.25, 0.5, 0.25], abs=2e-3)
-
-
-def test_near_candidates_are_one_at_their_mean():
-    """Lines at 10, 10.001 and 11 of a list of steps: the first two are one, and count as often as both did."""
-    plan = optimise(experiment(regression(QUADRATIC), np.eye(3)[None, None]), gap=1e-3)
-    problem = experiment(regression(QUADRATIC), np.eye(3)[None, None], budget=10.0)
-    places = [np.array([0.0]), np.array([100.001]), np.array([99.999]), np.array([200.0])]
-    plan = dataclasses.replace(
-        plan, family=np.zeros(4, int), place=places, weight=np.array([3.0, 1.0, 3.0, 3.0])
-    )
-    one = joined(problem, plan, 0.01)
-    assert [float(place[0]) for place in one.place] == pytest.approx([0.0, 99.9995, 200.0], abs=1e-9)
-    assert one.weight.tolist() == [3.0, 4.0, 3.0]
-    # Trace of the inverse of Σ w f f', weights a, b, a at −1, 0, 1: 1/b + 1/(2a) + 1/b + 1/(2a).
-    assert one.value == pytest.approx(2 / 4 + 1 / 3)
-    assert joined(problem, one, 0.01) is one
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 4])

@@ -65,6 +65,7 @@ _SHARPNESS = 20  # power of the variances by which targets share the slope of an
 _BUDGETS = 8  # tried until a criterion is met
 _ENDLESS = 1e6  # times the budget: no plan reaches the criterion
 _SMALL = 1e-3  # of the budget: the prior reaches the criterion already
+_ONE_PLACE = 4e-3  # between coordinates that are one: 0.1° of half a turn, and less than a step in a list
 _TOPS = 8  # candidates of each family that may join in a round
 _PATIENCE = 4  # rounds without a better bound or value after which the search ends
 
@@ -435,7 +436,7 @@ def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | Non
 
 
 def _same(one: tuple[int, Float[np.ndarray, " _"]], other: tuple[int, Float[np.ndarray, " _"]]) -> bool:
-    return one[0] == other[0] and bool(np.allclose(one[1], other[1], atol=1e-9, rtol=0.0))
+    return one[0] == other[0] and bool(np.allclose(one[1], other[1], atol=_ONE_PLACE, rtol=0.0))
 
 
 def _plan(
@@ -530,27 +531,6 @@ def rounded(experiment: Experiment, plan: Allocation) -> Allocation:
         if not better:
             break
     return _plan(chosen, count, 0.0, chosen.value(count), plan.bound, plan.proof, plan.rounds)
-
-
-def joined(experiment: Experiment, plan: Allocation, near: float) -> Allocation:
-    """The plan with candidates of a family that differ by less than `near` in each coordinate as one, at their mean."""
-    groups: list[list[int]] = []
-    for i, (family, place) in enumerate(zip(plan.family, plan.place, strict=True)):
-        alike = (
-            g
-            for g in groups
-            if plan.family[g[0]] == family and np.all(np.abs(plan.place[g[0]] - place) < near)
-        )
-        group = next(alike, None)
-        groups.append([i]) if group is None else group.append(i)
-    if len(groups) == len(plan.place):
-        return plan
-    weight = np.array([plan.weight[g].sum() for g in groups])
-    places = (np.average([plan.place[i] for i in g], axis=0, weights=plan.weight[g]) for g in groups)
-    some = _Some(
-        experiment.reduced(), [(int(plan.family[g[0]]), p) for g, p in zip(groups, places, strict=True)]
-    )
-    return _plan(some, weight, 0.0, some.value(weight), plan.bound, plan.proof, plan.rounds)
 
 
 def worth(

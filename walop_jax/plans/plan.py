@@ -44,7 +44,6 @@ from walop_jax.plans.optimal import (
     Allocation,
     Experiment,
     NotEstimableError,
-    joined,
     least_budget,
     optimise,
     rounded,
@@ -54,7 +53,6 @@ from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.sky.directions import separation
 
 _NOTHING = 1e-6  # of the prior information: less of it makes no plan
-_ONE_ANGLE = 2e-3  # rad of phase, 0.06° of half a turn: exposures of a plan closer than that are at one angle
 _ALIKE = 3.0  # deg: angles of the plate that are taken as one
 _TRIES = 6  # budgets, until the exposures and the changes between them fit into the time
 
@@ -468,7 +466,7 @@ def _within(
             place=[weights.place[i] for i in at],
             weight=weights.weight[at] * remaining / budget,
         )
-        integer = joined(problem, rounded(problem, scaled), _ONE_ANGLE)
+        integer = rounded(problem, scaled)
         integer = dataclasses.replace(integer, family=np.array([allowed[i] for i in integer.family]))
         lines = _ordered(found, integer)
         between = sum(_changes(found, lines))
