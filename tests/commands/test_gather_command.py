@@ -69,3 +69,17 @@ def test_simulated_stars_are_those_of_the_instrument_of_the_seed(sky):
     assert len(again) == 50
     assert set(again.colnames) == set(stars.colnames)
     assert all(stars[name].description for name in stars.colnames)
+
+
+def test_catalogues_of_the_cameras_are_those_of_the_stars(call, tmp_path):
+    """Gathered, they are the catalogue: positions within the scatter of four, counts, time and pointing."""
+    stars = walop.simulate(SMALL, seed=SEED, stars=40, cameras=True, output=tmp_path / "s.fits")
+    files = [tmp_path / f"s_{name}.fits" for name in ("O1", "E1", "O2", "E2")]
+    made = walop.gather(files)
+    made.sort("SOURCE_ID")
+    np.testing.assert_array_equal(made["SOURCE_ID"], stars["SOURCE_ID"])
+    np.testing.assert_allclose(made["N"], stars["N"])
+    assert np.max(np.abs(made["X"] - stars["X"])) < 0.2 / 3600
+    assert np.max(np.abs(made["ROTATOR"] - stars["ROTATOR"])) < 1e-3
+    assert (made["MJD"][0], made["FILTER"][0]) == (stars["MJD"][0], stars["FILTER"][0])
+    assert call("simulate", "--cameras", "-o", tmp_path / "no.fits").exit_code == 2

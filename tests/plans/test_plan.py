@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import walop_jax as walop
 from walop_jax.calibration.accuracy import p_errors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import matrix_slopes
@@ -123,6 +124,26 @@ def test_targets_that_set_before_a_plan_ends_are_left_out():
     choices, notes = Available(SMALL, throughout=30.0).choices()
     assert {choice.kind for choice in choices} == {"clp", "moon", "standard"}
     assert notes == ()
+
+
+def test_a_plan_whose_targets_set_is_made_again(planned, monkeypatch):
+    """Of targets that are up for all of its minutes; where that determines nothing it stays, with its doubts."""
+    moon = tuple(Stop(None, kind="moon", number=k % 3) for k in range(150))
+    late = dataclasses.replace(
+        planned, observing_plan=dataclasses.replace(SMALL, stops=moon, patches=(), stars=())
+    )
+    asked = []
+
+    def plan(available, **options):
+        asked.append(available.throughout)
+        if available.throughout and options["draws"] == 2:
+            raise ValueError("nothing could be observed")
+        return planned if available.throughout else late
+
+    monkeypatch.setattr("walop_jax.plans.plan.plan_exposures", plan)
+    assert walop.plan(SMALL, minutes=15.0, draws=1) is planned
+    assert walop.plan(SMALL, minutes=15.0, draws=2) is late
+    assert asked == [0.0, 15.0, 0.0, 15.0]
 
 
 def test_a_schedule_is_planned_in_whole_seconds():

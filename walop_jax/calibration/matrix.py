@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -24,11 +23,11 @@ from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.fit.verdict import Structure
 from walop_jax.likelihood import limits, optics
-from walop_jax.likelihood.field_table import Vector, accurate_table
+from walop_jax.likelihood.field_table import Vector, accurate_table, in_batches
 from walop_jax.likelihood.optics import linearised, plain_positions, through_series
 from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
-from walop_jax.model.compiled import array, compiled, usual_threads
+from walop_jax.model.compiled import compiled, usual_threads
 from walop_jax.model.effects.base import Effect, with_amplitudes
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light_path import Scalar
@@ -192,7 +191,7 @@ def analysis_vectors(
     For light behind the telescope, or `from_sky`, which passes the telescope first.
     """
     plan = dataclasses.replace(plan, work=len(x))
-    vectors, telescope = in_chunks(lambda a, b: _vectors(instrument, plan, a, b), x, y)
+    vectors, telescope = _in_chunks(lambda a, b: _vectors(instrument, plan, a, b), x, y)
     return vectors @ telescope[:, None] if from_sky else vectors
 
 
@@ -202,27 +201,12 @@ sky_vectors = functools.partial(analysis_vectors, from_sky=True)
 
 def vector_slopes(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Float[np.ndarray, "p d b k 3"]:
     """Derivatives of `sky_vectors` in all parameters but the terms of the throughput, then in the throughputs there."""
-    return in_chunks(lambda a, b: _slopes(instrument, plan, a, b), x, y)[1]
+    return _in_chunks(lambda a, b: _slopes(instrument, plan, a, b), x, y)[1]
 
 
-def in_chunks(
-    function: Callable[..., tuple[Array | np.ndarray, ...]], *columns: Float[np.ndarray, " p"]
-) -> tuple[np.ndarray, ...]:
-    """Apply a compiled function to slices of the columns, padded to `limits.MATRIX_POINTS` rows."""
-    count, size = len(columns[0]), limits.MATRIX_POINTS
-
-    def solved(start: int) -> list[np.ndarray]:
-        slices = [column[start : start + size] for column in columns]
-        missing = size - len(slices[0])
-        # Padding with the last row keeps the arithmetic as tame as that of the data.
-        result = function(*(array(np.pad(rows, (0, missing), mode="edge")) for rows in slices))
-        return [np.asarray(rows)[: size - missing] for rows in result]
-
-    # The first slice compiles; a slice keeps one core busy.
-    chunks = [solved(0)]
-    with ThreadPoolExecutor(usual_threads()) as pool:
-        chunks += pool.map(solved, range(size, count, size))
-    return tuple(np.concatenate(pieces) for pieces in zip(*chunks, strict=True))
+def _in_chunks(function: Callable[..., Any], *columns: Float[np.ndarray, " p"]) -> Any:
+    """Results of a compiled function for the rows of columns; a chunk keeps one core busy."""
+    return in_batches(function, *columns, size=limits.MATRIX_POINTS, threads=usual_threads())
 
 
 # ----------------------------------------------------------------------------------------------------------- the matrix
@@ -255,10 +239,10 @@ def _matrix_and_slopes(
     plain, series = plain_positions(instrument), series_indices(instrument)
     size, pairs = values_of(instrument).size, instrument.cameras.pairs
 
-    def at(*columns: Array) -> tuple[np.ndarray, np.ndarray]:
+    def at(*columns: Vector) -> tuple[np.ndarray, np.ndarray]:
         vectors, slopes = (np.asarray(d)[..., 0, :, :] for d in _slopes(instrument, plan, *columns))
         change = np.moveaxis(of_matrix(vectors[:, None], slopes, pairs), 1, -1)
-        basis = instrument.throughput.basis(*map(np.asarray, columns[:2]))[:, None, None, None]
+        basis = instrument.throughput.basis(*columns[:2])[:, None, None, None]
         result = np.empty((*change.shape[:-1], size))
         result[..., plain] = change[..., : len(plain)]
         result[..., series] = through_series(change[..., None, len(plain) :], basis)
@@ -286,11 +270,11 @@ def matrices(
         plan = dataclasses.replace(plan_for_settings(instrument, layout, filters), work=len(x))
         exact = _matrix_and_slopes(instrument, plan)
 
-        def with_covariance(*columns: Array, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
+        def with_covariance(*columns: Vector, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
             elements, slopes = (a.reshape(len(a), size, *a.shape[3:]) for a in exact(*columns))
             return elements, slopes @ covariance @ np.swapaxes(slopes, 1, 2)
 
-        values[rows], errors[rows] = in_chunks(with_covariance, x[rows], y[rows], *_numbers(settings[rows]))
+        values[rows], errors[rows] = _in_chunks(with_covariance, x[rows], y[rows], *_numbers(settings[rows]))
     return values, errors
 
 
@@ -331,7 +315,7 @@ def matrix_slopes(
         return np.zeros((len(x), 0, 3)), np.zeros((len(x), 0, 3, values_of(instrument).size))
     plan = dataclasses.replace(plan_for_settings(instrument, setting, filters), work=len(x))
     numbers = (np.broadcast_to(number, len(x)) for number in _numbers(setting))
-    matrix, slopes = in_chunks(_matrix_and_slopes(instrument, plan), x, y, *numbers)
+    matrix, slopes = _in_chunks(_matrix_and_slopes(instrument, plan), x, y, *numbers)
     return matrix, slopes
 
 

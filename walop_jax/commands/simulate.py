@@ -23,6 +23,9 @@ PLAN = Argument("Observing plan (TOML); default: the usual one of the instrument
 STARS = Option(
     "Make a catalogue of so many stars in place of the set: of the same instrument.", "N", int, least=1
 )
+CAMERAS = Option(
+    "With --stars: catalogues of the cameras as well, as SExtractor writes them (STARS_O1.fits, …), for gather."
+)
 EFFECT = Option(
     "Effect to hide in the data; NAME=par:value,par:value for several parameters (a/b/c/d for one "
     "value per element), NAME alone where there is none to give. May be repeated.",
@@ -51,6 +54,7 @@ def simulate(
     night: Annotated[int | None, NIGHT] = None,
     truth: Annotated[PathLike | None, Option("Write the true parameters here.", "FILE.json", Path)] = None,
     stars: Annotated[int | None, STARS] = None,
+    cameras: Annotated[bool, CAMERAS] = False,
     noiseless: bool = False,
     catalogue_seed: int | None = None,
 ) -> Outcome[Simulated]:
@@ -63,8 +67,9 @@ def simulate(
     Nights of one instrument, to rehearse epoch, stack and watch on: --like TRUTH.json --night 10. Each night has
     noise and weather of its own, also with the same seed.
 
-    With `stars` it is a catalogue of the sky for `apply`, `gather` and `watch` (RA, DEC, BP_RP and all): the same plan,
-    seed and effects give the stars of the instrument that the set calibrates.
+    With `stars` it is a catalogue of the sky for `apply` and `watch` (RA, DEC, BP_RP and all): the same plan, seed and
+    effects give the stars of the instrument that the set calibrates. With `cameras` there are those of the cameras as
+    well, beside it, for `gather`.
 
     In Python: the set and the true instrument; with `stars` the catalogue, an astropy table. `effect` may be a dict,
     {"hwp1_axis": 0.3}, or `Effect` objects; with a plan, an `Instrument` as `instrument` is the true one, not drawn.
@@ -114,6 +119,9 @@ def simulate(
     drawn["catalogue"] = None if template is None else template.catalogue
     about: dict[str, Any] = {"output": output, "instrument": plan.name, "seed": job.seed, "truth": truth}
     about["effects"] = [hidden_effect.name for hidden_effect in hidden]
+    if cameras and (stars is None or output is None):
+        raise UsageError("catalogues of the cameras are those of --stars N, beside its --output", "cameras")
+    of_cameras: dict[Path, Any] = {}
     job.tell("following the light", "following")
     data: Any
     if stars is not None:
@@ -127,6 +135,14 @@ def simulate(
         which = f"seed {job.seed}" if like is None or isinstance(like, tuple) else str(like)
         text = f"{output}: {plan.name}, {stars} stars of the instrument of {which}"
         suggested, times = (f"walop-jax apply RUN {output} -o OUT.fits",), data["MJD"]
+        for number, name in enumerate(plan.design.cameras.names if cameras else ()):
+            of_cameras[_of_camera(Path(str(output)), name)] = astropy_table(
+                *field.of_camera(number, job.seed)
+            )
+        if of_cameras:
+            files = [str(path) for path in of_cameras]
+            about["cameras"], text = files, f"{text}; of the cameras: {', '.join(files)}"
+            suggested = (f"walop-jax gather {' '.join(files)} -o GATHERED.fits",)
     else:
         data = simulated(plan, job.seed, noiseless=noiseless, night=night, **drawn)
         calset, true = data
@@ -145,7 +161,10 @@ def simulate(
         if output is not None and isinstance(data, Simulated):
             write_calibration_set(output, data.calset, overwrite=job.overwrite)
         elif output is not None:
-            write_table(output, data, overwrite=job.overwrite)
+            for path in of_cameras:
+                check_output(path, overwrite=job.overwrite)
+            for path, table in {Path(output): data, **of_cameras}.items():
+                write_table(path, table, overwrite=job.overwrite)
     text += f"; {'; '.join(map(_sized, true.effects)) or 'nothing'} beyond the base model"
     if template is not None:
         mjd = float(np.nanmin(times))
@@ -158,6 +177,12 @@ def simulate(
         warnings=left_out_sentences(lost, like if isinstance(like, str | os.PathLike) else None),
         next=suggested,
     )
+
+
+def _of_camera(path: Path, camera: str) -> Path:
+    """The file of a camera beside a table."""
+    end = ".fits.gz" if path.name.lower().endswith(".fits.gz") else path.suffix
+    return path.with_name(f"{path.name[: -len(end)]}_{camera}{end}")
 
 
 def _template(like: Any, catalogue: Sequence[EffectKind]) -> Template:

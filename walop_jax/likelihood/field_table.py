@@ -17,6 +17,7 @@ Tolerance   A relative error ε of all n counts, each known to σ/N, moves a par
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self
 
 import equinox as eqx
@@ -150,14 +151,23 @@ def solved_optics(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> O
     return in_batches(lambda x, y: _solve(instrument, plan, array(x), array(y)), x, y)
 
 
-def in_batches(solve: Callable[[Vector, Vector], Any], x: Vector, y: Vector) -> Any:
-    """Results of `solve` at field positions (deg), a tree of arrays, as many at a time as it is compiled for."""
-    batches = []
-    for start in range(0, len(x), limits.BATCH):
-        # The last batch is filled up with its last place.
-        inside = np.minimum(np.arange(start, start + limits.BATCH), len(x) - 1)
-        batches.append(jax.tree.map(np.asarray, solve(x[inside], y[inside])))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(x)], *batches)
+def in_batches(
+    solve: Callable[..., Any],
+    *columns: Float[np.ndarray, " p"],
+    size: int = limits.BATCH,
+    threads: int = 1,
+) -> Any:
+    """Results of `solve` for the rows of columns, a tree of arrays, `size` rows at a time, as it is compiled for."""
+
+    def solved(start: int) -> Any:
+        # The last batch is filled up with its last row, which keeps the arithmetic as tame as that of the data.
+        rows = np.minimum(np.arange(start, start + size), len(columns[0]) - 1)
+        return jax.tree.map(np.asarray, solve(*(column[rows] for column in columns)))
+
+    batches = [solved(0)]  # compiles
+    with ThreadPoolExecutor(threads) as pool:
+        batches += pool.map(solved, range(size, len(columns[0]), size))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(columns[0])], *batches)
 
 
 def accurate_nodes(

@@ -88,7 +88,7 @@ OPTIMISED_ABOVE = 6000
 third of it."""
 OFTEN_OPTIMISED_ABOVE = 1500
 """The same for derivatives of residuals, which a fit asks for some ten times."""
-SELDOM_OPTIMISED_ABOVE = 50_000
+SELDOM_OPTIMISED_ABOVE = 20_000
 """The same for responses, which one likelihood asks for once."""
 FREE_EXPOSURES = 100
 """Exposures of a set up to which a free-form term may have a number for each camera in each of them."""

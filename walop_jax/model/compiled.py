@@ -12,14 +12,14 @@ code they are executed: the folder must be the user's own. A damaged file is wri
 On CPU the fusion emitters of XLA compute shared sub-expressions over and over when a derivative of the plates is
 compiled (measured with jax 0.10.2: a first fit takes 18 s of CPU instead of 11 s, later calls as long; plates solved
 one by one took 9.6 s a call instead of 0.08 s), so they are switched off there where XLA has the option (that of jax
-0.12 has not).
+0.12 has not). Those versions of XLA also take `mueller.computed_once` away before loops are fused, unless that pass is
+left out.
 `tests/model/test_compiled.py` guards this. Programs of one or two calls are not worth optimising.
 
 Without optimisation, these change the time of compilation by −10 to +17 %, with jax 0.10.2 and 0.12, less than single
 runs scatter, and are left as they are: `xla_cpu_opt_preset` (FAST_COMPILE), `xla_llvm_disable_expensive_passes`,
 `jax_optimization_level`; so is `xla_cpu_parallel_codegen_split_count`, which has saved up to a third of some programs
-with 0.10.2 and nothing with 0.12. Layers of a plate solved along an axis, instead of one by one, are a fifth fewer
-equations and 6 to 20 % less to compile, but 1.3 to 1.8 times (0.10.2) and 3.5 to 5 times (0.12) as long a call.
+with 0.10.2 and nothing with 0.12.
 """
 
 from __future__ import annotations
@@ -222,6 +222,7 @@ Result = TypeVar("Result")
 
 
 EMITTERS = "xla_cpu_use_fusion_emitters"
+BARRIERS = "cse_barrier_expander"  # pass that removes the barriers of `mueller.computed_once` too early
 
 
 @functools.cache
@@ -246,7 +247,9 @@ def compiled(
 
     def options(once: bool) -> dict[str, Any] | None:
         on_cpu = jax.default_backend() == "cpu"
-        chosen: dict[str, Any] = {EMITTERS: False} if on_cpu and not fuse and knows(EMITTERS) else {}
+        chosen: dict[str, Any] = {}
+        if on_cpu and knows(EMITTERS):
+            chosen = {"xla_disable_hlo_passes": BARRIERS} | ({} if fuse else {EMITTERS: False})
         if once:
             chosen["xla_backend_optimization_level"] = 0
         return chosen or None

@@ -31,8 +31,9 @@ class Sellmeier(NamedTuple):
     def refractive_index(self, wavelength: Float[Any, ...]) -> Float[Any, ...]:
         """Refractive index at `wavelength` (µm); an array of numpy stays so."""
         square = wavelength**2
-        terms = sum(b * square / (square - c) for b, c in zip(self.strength, self.pole, strict=True))
-        return (jnp if isinstance(wavelength, jax.Array) else np).sqrt(self.constant + terms)
+        strength, pole = (np.reshape(v, (-1, *(1,) * np.ndim(square))) for v in (self.strength, self.pole))
+        terms = strength * square / (square - pole)  # one division: XLA compiles each by itself
+        return (jnp if isinstance(wavelength, jax.Array) else np).sqrt(self.constant + terms.sum(axis=0))
 
 
 def _formula_1(strength: tuple[float, ...], root_of_pole: tuple[float, ...]) -> Sellmeier:

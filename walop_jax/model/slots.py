@@ -330,13 +330,11 @@ def _inserted(
     folded: list[list[tuple[Float[Array, "c n r 4"], Float[Array, "c n 4 4"]]]],
 ) -> Float[Array, "m g h b r 4"]:
     """Slopes in generators at every place, for some weights of the nodes."""
-    generators, slopes = _generators(), []
-    for place, (behind, ahead) in zip(itertools.chain(*places), itertools.chain(*folded), strict=True):
-        if place == len(slopes):
-            pairs = jnp.einsum("cnri,cnjk->ijcnrk", behind, ahead)
-            products = jnp.stack([light.integrated(plan, weights, pairs) for weights in moments])
-            slopes.append(jnp.einsum("gij,mijbrk->mgbrk", generators, products))
-    return jnp.stack(slopes, 2)
+    sides = dict(reversed([*zip(itertools.chain(*places), itertools.chain(*folded), strict=True)]))
+    behind, ahead = (jnp.stack([sides[place][side] for place in sorted(sides)]) for side in (0, 1))
+    pairs = jnp.einsum("hcnri,hcnjk->hijcnrk", behind, ahead)
+    products = jnp.stack([light.integrated(plan, weights, pairs) for weights in moments])
+    return jnp.einsum("gij,mhijbrk->mghbrk", _generators(), products)
 
 
 def _generators() -> Float[Array, "g 4 4"]:

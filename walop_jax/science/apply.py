@@ -428,26 +428,20 @@ class _Application:
         lit = np.where(fitted.flux > 0, fitted.flux, np.inf)
         place = (points.x[block.rows], points.y[block.rows], self.catalogue.time[block.rows])
 
-        def moved(camera: int, electrons: Float[np.ndarray, " r"]) -> Float[np.ndarray, "s 2"]:
-            grown = np.zeros_like(counts)
-            grown[:, camera] = electrons / lit
-            return calibration_shift(fitted.gain, grown[..., None], block.star)[..., 0]
-
         def shift(entry: PossibleChange) -> Float[np.ndarray, "s 2"]:
             if not entry.camera:
                 return block.derivative[:, :, parameters.index(entry.name)]
-            k = cameras.index(entry.name)
-            return moved(k, check.growth.electrons(entry.kind, *place, counts[:, k]))
+            grown, k = np.zeros_like(counts), cameras.index(entry.name)
+            grown[:, k] = check.growth.electrons(entry, *place, counts[:, k]) / lit
+            return calibration_shift(fitted.gain, grown[..., None], block.star)[..., 0]
 
-        causes = [[entry.size * shift(entry) for entry in change.alike] for change in check.changes]
-        spots = [spot.profile(*place[:2]) for spot in check.places]
-        for spot, g in zip(check.places, spots, strict=True):
-            causes.append([c.size * moved(c.camera, g * counts[:, c.camera]) for c in spot.alike])
-        total = np.zeros_like(block.stars.changed)
-        for shifts in causes:
-            total += np.abs(np.nan_to_num(shifts)).max(axis=0)[:, :, None] ** 2 * np.eye(2)
-        first = np.flatnonzero(np.diff(block.star, prepend=-1))
-        near = np.any([np.maximum.reduceat(g, first) > 0 for g in [np.zeros(len(counts)), *spots]], axis=0)
+        total, first = np.zeros_like(block.stars.changed), np.flatnonzero(np.diff(block.star, prepend=-1))
+        for change in (*check.changes, *check.places):
+            shifts = [np.abs(entry.size * np.nan_to_num(shift(entry))) for entry in change.alike]
+            total += np.max(shifts, axis=0)[:, :, None] ** 2 * np.eye(2)
+        near = np.zeros(len(total), bool)
+        for spot in check.places:
+            near |= np.maximum.reduceat(spot.profile(*place[:2]), first) > 0
         return total, near
 
 

@@ -32,6 +32,7 @@ from walop_jax.science.instrument_changes import (
     InstrumentChange,
     PossibleChange,
     chance_of,
+    profile,
     threshold,
 )
 from walop_jax.science.left_over_sky import LeftOverSky
@@ -76,15 +77,17 @@ class Growth(NamedTuple):
     half: float = 0.0
 
     def electrons(
-        self, kind: str, x: Vector, y: Vector, time: Vector, counts: Vector
+        self, change: PossibleChange, x: Vector, y: Vector, time: Vector, counts: Vector
     ) -> Float[np.ndarray, " r"]:
-        """Electrons that a change of one of `CAMERA_KINDS`, of unit size, adds to `counts` of its camera."""
-        if kind == "light":
+        """Electrons that a change of `CAMERA_KINDS`, or a spot, of unit size adds to `counts` of its camera."""
+        if change.kind == "light":
             return np.ones_like(counts)
-        if kind == "flux":
+        if change.kind == "flux":
             return counts**2 / _REFERENCE
+        if change.kind == "spot":
+            return counts * profile(x, y, change.place)
         since = np.nan_to_num(time - self.middle) / (self.half or 1.0)
-        return counts * {"x": x / self.edge, "y": y / self.edge, "time": since}.get(kind, 1.0)
+        return counts * {"x": x / self.edge, "y": y / self.edge, "time": since}.get(change.kind, 1.0)
 
 
 IN_UNITS = Growth()
@@ -267,10 +270,10 @@ class CatalogueSearch:
         values = np.zeros((*part.model.shape, len(self.mixing)))
         place = (part.x, part.y, part.time)
         relative = np.where(part.root > 0, part.model / np.where(part.root > 0, part.root, 1.0), 0.0)
-        for n, kind in enumerate(self.kinds):
-            for k in range(cameras):
-                grown = self.growth.electrons(kind, *place, relative[:, k])
-                values[:, k, n * cameras + k] = grown * part.root[:, k]
+        for column, change in enumerate(change for change in self.questions if change.camera):
+            k = column % cameras
+            grown = self.growth.electrons(change, *place, relative[:, k])
+            values[:, k, column] = grown * part.root[:, k]
         values[..., len(self.kinds) * cameras : -2] = part.parameters()
         values[..., -2:] = part.colour
         return values

@@ -27,7 +27,15 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage, optimize
 
 from walop_jax.io.text import some, with_error
-from walop_jax.science.instrument_changes import ALARM, REACH, RIVAL, Place, chance_of, profile
+from walop_jax.science.instrument_changes import (
+    ALARM,
+    REACH,
+    RIVAL,
+    Place,
+    PossibleChange,
+    chance_of,
+    profile,
+)
 from walop_jax.science.star_residuals import StarResiduals, own_variance
 
 CUT = 3.0
@@ -40,25 +48,20 @@ _MOST = 8  # places
 _WIDER = 2.0  # than the size that was looked for a place may be, and so far off its centre
 
 
-class CameraAtPlace(NamedTuple):
-    """A camera that may have changed at a place: by what share of its counts in the centre, with standard error."""
-
-    camera: int
-    name: str
-    size: float
-    error: float
-
-
 @dataclasses.dataclass(frozen=True)
 class DisagreeingPlace:
-    """A place where stars disagree: centre and size (deg), significance, stars, cameras that it may be (best first)."""
+    """A place where stars disagree: centre and size (deg), significance, stars, and what it may be (best first).
+
+    That are spots of cameras, whose numbers are `cameras`.
+    """
 
     x: float
     y: float
     size: float
     sigma: float
     stars: int
-    alike: tuple[CameraAtPlace, ...]
+    alike: tuple[PossibleChange, ...]
+    cameras: tuple[int, ...]
 
     def profile(self, x: Float[np.ndarray, " r"], y: Float[np.ndarray, " r"]) -> Float[np.ndarray, " r"]:
         """g at field positions: 1 in the centre, 0 beyond three sizes."""
@@ -78,8 +81,12 @@ class DisagreeingPlace:
 
     def document(self) -> dict[str, Any]:
         """The place as plain data."""
-        about = dataclasses.asdict(self)
-        return about | {"alike": [camera._asdict() for camera in self.alike]}
+        about = {name: getattr(self, name) for name in ("x", "y", "size", "sigma", "stars")}
+        alike = [
+            {"camera": k, "name": entry.name, "size": entry.size, "error": entry.error}
+            for k, entry in zip(self.cameras, self.alike, strict=True)
+        ]
+        return about | {"alike": alike}
 
 
 class Seen(NamedTuple):
@@ -251,18 +258,21 @@ def _smoothed(
 def _described(seen: Seen, found: Strongest, cameras: Sequence[str]) -> DisagreeingPlace:
     """The place about the strongest one, with the cameras that describe its stars as well as the best one."""
     subset = seen.near(found.place)
-    fits = []
-    for k, name in enumerate(cameras):
+    fits: list[tuple[tuple[float, float, float], Place, int]] = []
+    for k in range(len(cameras)):
         place = fitted(subset, k, found.place)
-        share, error, gain = share_of(subset, k, profile(subset.x, subset.y, place))
-        fits.append((gain, place, CameraAtPlace(k, name, share, error)))
-    fits.sort(key=lambda fit: -fit[0])
-    best, place, _ = fits[0]
+        fits.append((share_of(subset, k, profile(subset.x, subset.y, place)), place, k))
+    fits.sort(key=lambda fit: -fit[0][2])
+    (*_, best), place, _ = fits[0]
     scatter = (subset.chi2.sum() - best) / max(subset.dof.sum() - 4.0, 1.0)
-    alike = [camera for gain, _, camera in fits if gain > best - RIVAL * max(1.0, scatter)]
-    inside = profile(subset.x, subset.y, place) > np.exp(-2.0)
+    alike, numbers = [], []
+    for (size, error, gain), _, k in fits:
+        if gain > best - RIVAL * max(1.0, scatter):
+            alike.append(PossibleChange(cameras[k], True, size=size, error=error, kind="spot", place=place))
+            numbers.append(k)
+    stars = int((profile(subset.x, subset.y, place) > np.exp(-2.0)).sum())
     x, y, size = place
-    return DisagreeingPlace(x, y, size, found.sigma, int(inside.sum()), tuple(alike))
+    return DisagreeingPlace(x, y, size, found.sigma, stars, tuple(alike), tuple(numbers))
 
 
 def fitted(seen: Seen, camera: int, start: Place) -> Place:

@@ -29,6 +29,7 @@ _COLOUR = (0.95, 0.25)  # mean and scatter of BP − RP
 _COLOUR_ERROR = 0.01
 _SCATTER = 61.0  # K, about the relation of a star's kind
 _DEGREE = 0.05  # p is uniform up to it
+_POSITION_ERROR = 0.05  # arcsec, of a camera
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +43,28 @@ class SimulatedStars:
     def document(self) -> dict[str, Any]:
         """The truth as plain data."""
         return {"q": self.qu[:, 0].tolist(), "u": self.qu[:, 1].tolist(), "teff": self.teff.tolist()}
+
+    def of_camera(
+        self, number: int, seed: int, pointing: Pointing = POINTING
+    ) -> tuple[Columns, dict[str, Any]]:
+        """Columns of one camera, named as by SExtractor, in an order and with positions of its own; its header."""
+        columns = {name: values for name, (values, *_) in self.columns.items()}
+        draw = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5, number)))
+        rows = draw.permutation(len(self.teff))
+        off_ra, off_dec = _POSITION_ERROR / 3600.0 * draw.standard_normal((2, len(rows)))
+        header = {"RA": pointing.ra, "DEC": pointing.dec, "ROTATOR": pointing.rotator}
+        header |= {name: columns[name][0].item() for name in ("FILTER", "MJD")}
+        dec = columns["DEC"][rows]
+        made: Columns = {
+            "ALPHA_J2000": (columns["RA"][rows] + off_ra / np.cos(np.deg2rad(dec)), "deg", "right ascension"),
+            "DELTA_J2000": (dec + off_dec, "deg", "declination"),
+            "FLUX_AUTO": (columns["N"][rows, number], "electron", "flux"),
+            "FLUXERR_AUTO": (columns["N_ERR"][rows, number], "electron", "standard error of the flux"),
+            "FLAGS": (np.zeros(len(rows), np.int16), "", "flags of SExtractor"),
+        }
+        names = ("SOURCE_ID", "BP_RP", "BP_RP_ERR")
+        made |= {name: (columns[name][rows], *self.columns[name][1:]) for name in names}
+        return made, header
 
 
 def simulated_stars(

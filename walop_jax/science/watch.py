@@ -485,7 +485,9 @@ class Watching:
         if abs(spot.sigma) < alarm:
             return None
         near = seen.near(spot.place)
-        ways = [fitted(near, spot.camera, (*spot.place, edge)) for edge in EDGES]
+        x, y, size = spot.place
+        starts = [(x, y, share * size, edge) for share in (1.0, 2.0) for edge in EDGES]
+        ways = [fitted(near, spot.camera, start) for start in starts]
         gains = [share_of(near, spot.camera, profile(near.x, near.y, way)) for way in ways]
         (size, *_), place = max(zip(gains, ways, strict=True), key=lambda way: way[0][2])
         name, since = self.readings.of_cameras[spot.camera].name, History("step", start)
