@@ -195,7 +195,7 @@ MOST_LINES = {
     "science": 6420,
     "diagnosis": 8190,
     "nights": 2810,
-    "plans": 2375,
+    "plans": 2380,
     "paper": 870,
     "reports": 3125,
     "commands": 4885,

@@ -16,7 +16,7 @@ from own_instrument import OWN
 from small_run import SEED, SMALL
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.product import write_calibration
+from walop_jax.calibration.product import read_product, write_calibration
 from walop_jax.commands.plot import plot
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.write import write_calibration_set
@@ -29,6 +29,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.paper.wavelength import plate_retardances, retardance
 from walop_jax.posterior.run import Run
 from walop_jax.reports.diagnosis_figures import separation_figure
+from walop_jax.reports.figures import matrix_change_figure, planned_figure
 from walop_jax.reports.named import FIGURES, draw, possible
 from walop_jax.reports.paper_figures import retardance_figure, retardance_wavelength_figure
 from walop_jax.reports.posterior_figures import informed
@@ -88,15 +89,25 @@ def assert_fits_in_print(figure, millimetres):
             inside = [
                 text for text in side.get_majorticklabels() if low <= text.get_position()[along] <= high
             ]
-            boxes = [text.get_window_extent().padded(-1.0) for text in inside if text.get_text()]
+            boxes = [text.get_window_extent().padded(-2.0) for text in inside if text.get_text()]
             assert not any(a.overlaps(b) for a, b in itertools.pairwise(boxes)), [*map(str, inside)]
     titles = [axis.title.get_window_extent() for axis in figure.axes if axis.get_title()]
     assert not any(a.overlaps(b) for i, a in enumerate(titles) for b in titles[:i])
 
 
+def test_figures_of_other_pages_fit_into_a_column(tmp_path):
+    handmade_run.make_refit(tmp_path)
+    maps, column = read_product(tmp_path).maps, Canvas(width=89.0 / 25.4)
+    assert_fits_in_print(matrix_change_figure(maps, maps, column), 89.0)
+    x, y = (part.ravel() for part in np.meshgrid(*[np.linspace(-0.3, 0.3, 9)] * 2))
+    columns = {"x": x, "y": y, "before": 2e-3 * np.hypot(x, 0.1), "p_error": 1e-3 * np.hypot(x, 0.1)}
+    field = {name: values.tolist() for name, values in columns.items()}
+    assert_fits_in_print(planned_figure(field, column), 89.0)
+
+
 def test_twenty_effects_fit_into_a_column():
     """Each of 20 comes within 4 σ of the next, and is shown; two more are not. Names must not lie on each other."""
-    names = tuple(f"moon_multiple_scattering{k}" for k in range(22))
+    names = tuple(f"standard_outlier_{k}" for k in range(22))
     near = (np.arange(22) < 19)[:, None] & (np.eye(22, k=1) > 0)
     separation = np.where(near, 4.0, 7.0) + np.diag(np.full(22, np.nan))
     found = dataclasses.replace(handmade_run.limits(), effects=names, separation=separation)

@@ -181,7 +181,7 @@ class _Laid:
         slopes = slopes.reshape(*self.matrix.shape, -1) + self.slopes @ likeness.slopes
         between = slopes @ likeness.covariance @ np.swapaxes(slopes, 1, 2)
         between += likeness.change[:, :, None] * likeness.change[:, None, :]
-        # At another temperature stars have what is zero in the usual setting.
+        # At another temperature stars have terms that are zero in the usual setting.
         steady = [dataclasses.replace(change, factors=change.over_field) for change in changes]
         _, at_any = self.added([((1.0, change),) for change in steady])
         acting = np.abs(at_any).max(axis=(0, 1, 2)) > 0

@@ -123,7 +123,7 @@ class DetectionLimits(Displayed):
 
     `separation` (row, column) is how far (σ) the effect of the column stays from that of the row when this is just
     detected. `protection` is, by field point (`x`, `y`, degrees), the largest error of q and u that a single effect
-    can make without being detected, with a tenth on top for what is not of first order, `caused_by` the effect.
+    can make without being detected, with a margin of a tenth for higher orders, `caused_by` the effect.
     `untestable` effects leave no trace in these data. `conditions` are those stated in the set: its field, its
     filters, the colours of its light. `could_hide` are the undetectable mistakes, as in every command.
     """

@@ -65,6 +65,7 @@ _SHARPNESS = 20  # power of the variances by which targets share the slope of an
 _BUDGETS = 8  # tried until a criterion is met
 _ENDLESS = 1e6  # times the budget: no plan reaches the criterion
 _SMALL = 1e-3  # of the budget: the prior reaches the criterion already
+_ONE_PLACE = 4e-3  # between coordinates that are one: 0.1° of half a turn, and less than a step in a list
 _TOPS = 8  # candidates of each family that may join in a round
 _PATIENCE = 4  # rounds without a better bound or value after which the search ends
 
@@ -435,7 +436,7 @@ def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | Non
 
 
 def _same(one: tuple[int, Float[np.ndarray, " _"]], other: tuple[int, Float[np.ndarray, " _"]]) -> bool:
-    return one[0] == other[0] and bool(np.allclose(one[1], other[1], atol=1e-9, rtol=0.0))
+    return one[0] == other[0] and bool(np.allclose(one[1], other[1], atol=_ONE_PLACE, rtol=0.0))
 
 
 def _plan(

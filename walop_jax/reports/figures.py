@@ -238,7 +238,9 @@ def matrix_change_figure(old: MatrixMaps, new: MatrixMaps, on: Canvas = PAGE) ->
         raise ValueError("the maps of the two calibrations are of different places")
     change = 100.0 * (new.values - old.values)
     kinds = [element_kind(i, new.arms) for i in range(len(change))]
-    figure, axes = on.panels(8.6, 2.3 * new.arms, new.arms, 3, sharex=True, sharey=True, squeeze=False)
+    figure, axes = on.panels(
+        8.6, 2.3 * new.arms, new.arms, 3, turned=True, sharex=True, sharey=True, squeeze=False
+    )
     for axis, values, name, kind in zip(axes.ravel(), change, element_symbols(new.arms), kinds, strict=True):
         far = rounded_up(largest_size(change[np.equal(kinds, kind)]))
         field_axes(axis, f"change of {name}")
@@ -327,12 +329,12 @@ def planned_figure(field: Mapping[str, Sequence[float | None]], on: Canvas = PAG
     """Error of p (%) over the field before a plan and after it, from `field` of plan.json; crosses: no u there."""
     x, y, before, after = (np.array(field[k], float) for k in ("x", "y", "before", "p_error"))
     places, at = np.unique(np.stack([x, y]), axis=1, return_inverse=True)
-    maps = []
+    maps, image = [], None
     for error in (before, after):
         worst = np.full(places.shape[1], -np.inf)
         np.maximum.at(worst, at.ravel(), np.where(np.isnan(error), np.inf, 100.0 * error))
         maps.append(np.where(np.isfinite(worst), worst, np.nan))
-    figure, axes = on.panels(8.2, 3.6, 1, 2)
+    figure, axes = on.panels(8.2, 3.6, 1, 2, sharey=True)
     lowest, highest = float(0.5 * np.nanmin(maps[1])), float(2.0 * np.nanmax(maps[1]))
     highest = min(max(float(np.nanmax(maps[0])), highest), max(_RANGE[1], highest))
     for axis, values, title in zip(axes, maps, ("before", "after"), strict=True):
@@ -341,5 +343,6 @@ def planned_figure(field: Mapping[str, Sequence[float | None]], on: Canvas = PAG
         image = point_map(axis, places[0], places[1], shown, LogNorm(lowest, highest), SEQUENTIAL)
         blind = np.isnan(values)
         axis.plot(places[0, blind], places[1, blind], "x", color="0.5", ms=4)
-        colour_bar(figure, image, axis, "error of p (%)", extend="max")
+    colour_bar(figure, image, axes, "error of p (%)", extend="max", pad=0.02)
+    outer_labels(axes)
     return figure

@@ -50,7 +50,7 @@ _WIDER = 2.0  # than the size that was looked for a place may be, and so far off
 
 @dataclasses.dataclass(frozen=True)
 class DisagreeingPlace:
-    """A place where stars disagree: centre and size (deg), significance, stars, and what it may be (best first).
+    """A place where stars disagree: centre and size (deg), significance, stars, and possible causes (best first).
 
     That are spots of cameras, whose numbers are `cameras`.
     """
