@@ -132,8 +132,8 @@ ERRORS = (
     # calibration
     planted("calibration/calibration.py", "0.5 * (result.covariance + result.covariance.T)",
             "0.25 * (result.covariance + result.covariance.T)", "calibration/test_calibration.py"),
-    planted("calibration/matrix.py", "[np.asarray(rows)[: size - missing] for rows in result]",
-            "[np.asarray(rows)[missing:] for rows in result]", "calibration/test_calibration.py"),
+    planted("likelihood/field_table.py", "np.concatenate(leaves)[: len(columns[0])]",
+            "np.concatenate(leaves)[-len(columns[0]) :]", "calibration/test_calibration.py"),
     planted("calibration/calibration.py", "flags[~(condition <= HIGH_CROSSTALK)]", "flags[condition <= HIGH_CROSSTALK]",
             "calibration/test_calibration.py"),
     # posterior
@@ -175,7 +175,8 @@ ERRORS = (
     planted("diagnosis/readings.py", "sign * a + offset", "sign * a - offset", "diagnosis/test_mixups.py"),
     # paper
     planted("paper/polynomial.py", "- self.delta[:, None]", "+ self.delta[:, None]", "paper/test_polynomial.py"),
-    planted("paper/polynomial.py", "np.stack([y, x], axis=1)", "np.stack([x, y], axis=1)", "paper/test_polynomial.py"),
+    planted("paper/polynomial.py", "((self.y, y), (self.x, x))", "((self.y, x), (self.x, y))",
+            "paper/test_polynomial.py"),
     # plans
     planted("plans/optimal.py", "return self.here**2 / (self.known", "return self.here**2 / (0.0 * self.known",
             "plans/test_optimal.py"),
