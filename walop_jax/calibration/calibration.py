@@ -24,6 +24,7 @@ from walop_jax.calibration.matrix import (
     matrix_draws,
     matrix_names,
     of_structure,
+    planned_matrices,
     slopes_over_field,
 )
 from walop_jax.data.grid import Grid
@@ -50,6 +51,7 @@ from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
+from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model, Vector, effect_context
 from walop_jax.model.standards import standards_of
 
@@ -60,8 +62,8 @@ Matrix = Float[np.ndarray, "n n"]
 Columns = dict[str, tuple[np.ndarray, str]]  # values, description
 
 MAP_SIZE = 31  # pixels along each axis of the maps: 0.02° over ±0.3°
-MAP_NODES = (18, 24, 30)  # per side, for the maps
-MAP_TOLERANCE = 1e-6  # of elements, and of standard errors relative to themselves
+MAP_NODES = (18, 24, 30)  # per side, for the standard errors in the maps
+MAP_ERRORS = 1e-6  # of those, relative
 HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
 UNCHECKED = (
     "made by an earlier version, whose content hash does not cover all words of the headers: fit again"
@@ -460,7 +462,10 @@ class Calibration(Contents, Fitted):
         if self.draws is not None:
             values, covariance = self._elements(x, y, settings)
         else:
-            values, covariance, _ = self.over_field(x, y, settings[:1], MAP_NODES, MAP_TOLERANCE)
+            instrument = self.model.instrument(self.values)
+            plan = plan_for_settings(instrument, settings[:1], self.curves(settings[:1]))
+            values = planned_matrices(instrument, plan, x, y)
+            _, covariance, _ = self.over_field(x, y, settings[:1], MAP_NODES, MAP_ERRORS)
         errors = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
         planes, flat = (-1, size, size), values.reshape(size * size, -1)
         return MatrixMaps(grid, name, flat.T.reshape(planes), errors.T.reshape(planes), settings[:1].inside())
