@@ -243,10 +243,10 @@ FIGURES: Mapping[str, NamedFigure] = {
 
 def _tracks(source: FigureSource) -> AnyFigure:
     survey = source.held[SURVEY]
-    figure = survey_figures.tracks_figure(survey.tracks, survey.document())
-    if figure is None:
+    document = survey.document()
+    if not survey_figures.tracked(document):
         raise fail("no law of this survey lets a parameter change", file=source.folder, advice="plot nights")
-    return figure
+    return survey_figures.tracks_figure(survey.tracks, document)
 
 
 OF_RESULTS: Mapping[str, NamedFigure] = {

@@ -521,10 +521,10 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
     if kind == "survey":
         results = []
         try:
-            tracks = functools.partial(
-                survey_figures.tracks_figure, read_input_table(folder / TRACKS).table, document
-            )
-            results = [] if tracks(PAGE) is None else [picture("tracks", tracks)]
+            tracks = read_input_table(folder / TRACKS).table
+            if survey_figures.tracked(document):
+                draw_tracks = functools.partial(survey_figures.tracks_figure, tracks, document)
+                results = [picture("tracks", draw_tracks)]
         except DataError as error:
             missing.append(f"Parameters against time are not drawn: {error}.")
         return [*results, picture("nights", functools.partial(survey_figures.nights_figure, document))]

@@ -15,19 +15,21 @@ from walop_jax.science.watch_found import Watch
 MOST = 8  # parameters in a figure
 
 
+def tracked(document: Mapping[str, Any]) -> list[str]:
+    """Parameters of a survey that change: those with breaks, then others whose law lets them."""
+    broken = [entry["name"] for entry in document["breaks"]]
+    return [*dict.fromkeys([*broken, *document["laws"]])][:MOST]
+
+
 @styled
-def tracks_figure(tracks: Any, document: Mapping[str, Any], on: Canvas = PAGE) -> Figure | None:
-    """Parameters whose law lets them change, against time; None where there is none.
+def tracks_figure(tracks: Any, document: Mapping[str, Any], on: Canvas = PAGE) -> Figure:
+    """The parameters that change (`tracked`, one at least), against time.
 
     The band is the value under the law with its error, dots the value of each night alone. A step is a step:
     grey across is the time in which it can have been; dashed lines are other breaks of that parameter, dotted ones the
     events that the user wrote down.
     """
-    broken = document["breaks"]
-    laws = [name for name in document["laws"] if name not in {entry["name"] for entry in broken}]
-    names = [*dict.fromkeys(entry["name"] for entry in broken), *laws][:MOST]
-    if not names:
-        return None
+    broken, names = document["breaks"], tracked(document)
     count = len(names)
     figure, axes = on.panels(6.4, 0.9 + 1.25 * count, count, 1, sharex=True, squeeze=False)
     for axis, name in zip(axes[:, 0], names, strict=True):
