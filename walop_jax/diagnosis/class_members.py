@@ -25,14 +25,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
-from walop_jax.calibration.matrix import first_setting, matrix_slopes
+from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_average import distinct, moved, probabilities
 from walop_jax.diagnosis.class_product import Classes, ClassOf, Likeness, Shape, Sum
 from walop_jax.diagnosis.description_shape import shape_changes
 from walop_jax.diagnosis.exact import signature
 from walop_jax.diagnosis.examination import Examination
-from walop_jax.diagnosis.hidden_mistakes import of_matrix, usual_exposure
+from walop_jax.diagnosis.hidden_mistakes import usual_exposure
 from walop_jax.diagnosis.score import Projector, log_bayes
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.inverses import whitening
@@ -177,7 +177,7 @@ class _Laid:
         likeness = step.member("", 0.0, sums, column, square, along, widths)
         vectors, added = self.added(sums)
         pairs = self.template.cameras.pairs
-        slopes = np.stack([of_matrix(vectors, added[..., j], pairs) for j in range(len(sums))], axis=-1)
+        slopes = np.moveaxis(of_matrix(vectors[:, None], np.moveaxis(added, -1, 1), pairs), 1, -1)
         slopes = slopes.reshape(*self.matrix.shape, -1) + self.slopes @ likeness.slopes
         between = slopes @ likeness.covariance @ np.swapaxes(slopes, 1, 2)
         between += likeness.change[:, :, None] * likeness.change[:, None, :]

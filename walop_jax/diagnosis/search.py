@@ -204,11 +204,11 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
         new: list[Trial] = []
         while waiting and not (ended := judge.over(fits)):
             linear, fits = waiting.pop(0), fits + 1
-            for fitted in log.passed([judge.fitted(evidence, linear)]):
-                new.append(fitted)
-                tried = [fitted if candidate is linear else candidate for candidate in tried]
-            if new and _is_sure(new[-1], waiting):
-                break
+            if fitted := log.passed([judge.fitted(evidence, linear)]):
+                new += fitted
+                tried = [fitted[0] if candidate is linear else candidate for candidate in tried]
+                if _is_sure(fitted[0], waiting):
+                    break
         passed = [*new, *confirmed]
         # Names that came first by linear steps were refused: these steps were inaccurate.
         if not (passed or sentences_asked):
