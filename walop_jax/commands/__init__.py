@@ -57,9 +57,21 @@ def main() -> None:
         from walop_jax.commands.program import app
 
         app()
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Exception) as error:
+        if not is_interrupt(error):
+            raise
         sys.stderr.write("walop-jax: error: interrupted; nothing was left half-written\n")
         raise SystemExit(INTERRUPTED) from None
+
+
+def is_interrupt(error: BaseException) -> bool:
+    """True if an error goes back to an interrupt that was caught on the way."""
+    before: BaseException | None = error
+    for _ in range(20):
+        if before is None or isinstance(before, KeyboardInterrupt):
+            break
+        before = before.__cause__ or before.__context__
+    return isinstance(before, KeyboardInterrupt)
 
 
 def _open_streams() -> None:

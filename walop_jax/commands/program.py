@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from walop_jax.commands import COMMANDS, GROUPS, INTERRUPTED, line_of
+from walop_jax.commands import COMMANDS, GROUPS, INTERRUPTED, is_interrupt, line_of
 from walop_jax.commands.command import COMMON, Argument, Command, Job, Option, Outcome, UsageError, command_of
 from walop_jax.io.progress import interrupts_answered
 
@@ -212,7 +212,7 @@ def _guarded(command: Command[Any], given: dict[str, Any]) -> None:
         )  # fmt: skip
         raise typer.BadParameter(str(error), param_hint=option) from None
     except Exception as error:
-        if _is_interrupt(error):  # that came while a compiled library was imported
+        if is_interrupt(error):  # that came while a compiled library was imported
             raise typer.Exit(_interrupted()) from None
         if os.environ.get(DEBUG_VARIABLE) or type(error).__module__.split(".")[0] in ("typer", "click"):
             raise
@@ -294,16 +294,6 @@ def _print(text: str, markdown: bool) -> None:
             Console(width=min(console.width, WIDEST)).print(Markdown(text, hyperlinks=False))
             return
     typer.echo(text.removesuffix("\n"))
-
-
-def _is_interrupt(error: BaseException) -> bool:
-    """True if an error goes back to an interrupt that was caught on the way."""
-    before: BaseException | None = error
-    for _ in range(20):
-        if before is None or isinstance(before, KeyboardInterrupt):
-            break
-        before = before.__cause__ or before.__context__
-    return isinstance(before, KeyboardInterrupt)
 
 
 # ----------------------------------------------------------------------------------------------------- the terminal
