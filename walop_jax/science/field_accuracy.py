@@ -97,7 +97,8 @@ class FieldAccuracy:
             f"{light} times the light; walop-jax plan RUN --goal {100 * allowed:.2g} says how long that takes"
         )
         if self.without_u > 1.0 - SHARE and self.median <= allowed:
-            advice = "observe stars near the strip without u with the plate at 22.5° as well"
+            strip = f"the strip without u ({100 * self.without_u:.0f} % of the field)"
+            advice = f"observe {strip} with the plate at 22.5° as well"
         asked.append(_p_known(self.reached, allowed, self.judged, advice, needed=False))
         if self.hidden > 0:
             what = f"no error above {two_digits(100 * self.goal)} % goes undetected: {self.hidden_by}"
