@@ -245,6 +245,12 @@ def test_times_that_are_no_whole_seconds_are_told():
         (lambda one: one["polarizer"].update(angle=None), "angle = None must be a finite number"),
         (lambda one: one["polarizer"].update(angle=1e6), "angle = 1e.06 must be between 0 and 360"),
         (lambda one: one.update(hwp=None), "hwp = None must be a table"),
+        (lambda one: one.update(filter=[1]), r"filter = \[1\] must be a whole number"),
+        (lambda one: one.update(filter=True), "filter = True must be a whole number"),
+        (
+            lambda one: one.update(hwp={"engage": True, "continuous": True, "speed": 6}),
+            "speed = 6 must be at most 3 turns a minute",
+        ),
     ],
 )
 def test_what_cannot_be_read_back_is_told(tmp_path: Path, change, message):
@@ -253,6 +259,27 @@ def test_what_cannot_be_read_back_is_told(tmp_path: Path, change, message):
     (tmp_path / "s.json").write_text(json.dumps(schedule))
     if message is None:
         read_schedule(tmp_path / "s.json", FILTERS)
+        return
+    with pytest.raises(DataError, match=message):
+        read_schedule(tmp_path / "s.json", FILTERS)
+
+
+@pytest.mark.parametrize(
+    ("coordinates", "message"),
+    [
+        ({"ra": "25:00:00"}, "'25:00:00' is no angle"),
+        ({"ra": "05:75:00"}, "'05:75:00' is no angle"),
+        ({"dec": "+95:00:00"}, r"DEC: exceeds ±90"),
+        ({"ra": None}, "target 16, .*: no object with RA and DEC, where these are is not known"),
+    ],
+)
+def test_objects_without_a_place_on_the_sky_are_told(tmp_path: Path, coordinates, message):
+    schedule = written(tmp_path / "s.json", PLAN.exposures())
+    for entry in schedule["objects"]:
+        entry.update(coordinates)
+    (tmp_path / "s.json").write_text(json.dumps(schedule))
+    if coordinates == {"ra": None}:
+        assert re.search(message, "; ".join(read_schedule(tmp_path / "s.json", FILTERS)[2]))
         return
     with pytest.raises(DataError, match=message):
         read_schedule(tmp_path / "s.json", FILTERS)

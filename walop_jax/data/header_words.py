@@ -22,7 +22,7 @@ import numpy as np
 from walop_jax.data.kinds import KINDS
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, table_of, table_rules
 from walop_jax.data.table_files import read_table_file
-from walop_jax.data.units import Place, convert_unit, sexagesimal
+from walop_jax.data.units import Place, convert_unit, degrees_of, is_sexagesimal, mjd_of
 from walop_jax.io.errors import errors_naming, fail, nearest
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.io.toml import Reader
@@ -30,10 +30,19 @@ from walop_jax.io.toml import Reader
 WORD: Mapping[str, Any] = {
     "word": Any, "unit": str, "expression": str, "values": Mapping[str, Any], "value": Any, "optional": bool,
 }  # fmt: skip
-TOP: Mapping[str, Any] = {"extension": int, "rows": str, "filters": Mapping[str, int], "schedule": Any}
+TOP: Mapping[str, Any] = {
+    "extension": int,
+    "rows": str,
+    "filters": Mapping[str, int],
+    "schedule": Mapping[str, str],
+}
 """Entries of a file of words beside its columns: extension of FITS files, where the rows of a JSON file are, numbers of
 filters and facts of schedules (`data.schedule`)."""
-_SEXAGESIMAL = re.compile(r"[+-]?\d+[: ]\d+[: ]\d+(\.\d*)?")
+FACTS = ("name", "pi", "mode", "observer")
+MODES = ("manual", "auto")
+LONGEST = 100  # characters of a fact
+MJD_1970 = 40587.0
+TOLERATED = 2.0 / 86400.0  # d: times are of whole seconds
 _MOVES = re.compile(r"[A-Z][A-Z0-9_]*_(IN|ANGLE|TURN)")
 _INSIDE = dict.fromkeys(("t", "true", "1", "in"), True) | dict.fromkeys(("f", "false", "0", "out"), False)
 _OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
@@ -66,7 +75,7 @@ class Words:
     extension: int = 0
     rows: str = ""
     filters: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    schedule: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    schedule: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def read_words(path: str | os.PathLike[str]) -> Words:
@@ -98,6 +107,11 @@ def words_of(content: Mapping[str, Any]) -> Words:
                 )
         columns[name] = Word(words, **settings)
     top = read.values(TOP, {key: value for key, value in content.items() if key in TOP}, "")
+    read.known(facts := top.get("schedule", {}), FACTS, "schedule")
+    if (mode := facts.get("mode", MODES[0])) not in MODES:
+        raise read.fault("schedule", f"mode = {mode!r} is neither {' nor '.join(MODES)}")
+    if long := [key for key, text in facts.items() if len(text) > LONGEST]:
+        raise read.fault("schedule", f"{long[0]} has more than {LONGEST} characters")
     return Words(columns, **top)
 
 
@@ -135,7 +149,17 @@ def exposures_table(
     check(table, {name: rule for name, rule in rules.items() if name in table}, place)
     absent = [name for name in EXPOSURES if name not in columns and not _MOVES.fullmatch(name)]
     remarks = [f"no word for {', '.join(absent)}: taken as not known"] if absent else []
+    if early := overlapping(table["MJD"], table["EXPTIME"]):
+        what = "begin before the one ahead of them has ended: is a record there twice, or a file for each camera?"
+        remarks.append(f"{early} exposures {what} MJD is the middle, in UTC")
     return table | {"FILE": np.array([file for file, _ in records])}, remarks
+
+
+def overlapping(mjd: np.ndarray, exptime: np.ndarray) -> int:
+    """The number of exposures that begin before the one ahead of them, in time, has ended."""
+    order = np.argsort(mjd, kind="stable")
+    middle, half = mjd[order], np.nan_to_num(exptime[order]) / 2.0 / 86400.0
+    return int(np.sum((middle - half)[1:] < (middle + half)[:-1] - TOLERATED))
 
 
 def of_header(
@@ -213,9 +237,12 @@ def _found(record: Mapping[str, Any], word: str) -> Any:
     else:
         for key in word.split("."):
             value = value.get(key) if isinstance(value, Mapping) else None
-    if isinstance(value, Mapping) and len(value) == 1 and (key := next(iter(value))).startswith("$"):
-        value = value[key]  # of a document database: {"$date": …}
-    return None if isinstance(value, str) and value.strip().lower() in MISSING else value
+    while isinstance(value, Mapping) and len(value) == 1 and (key := next(iter(value))).startswith("$"):
+        value = value[key]  # of a document database: {"$date": {"$numberLong": milliseconds since 1970}}
+        if key == "$date" and not isinstance(value, str):
+            value = MJD_1970 + float(_found({"": value}, "")) / 86400e3
+    empty = isinstance(value, float) and math.isnan(value)
+    return None if empty or (isinstance(value, str) and value.strip().lower() in MISSING) else value
 
 
 # --------------------------------------------------------------------------------------------------- values of words
@@ -279,25 +306,27 @@ def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any
 
 def _number(value: Any, name: str, rule: Column, word: Word, place: Place, what: str) -> float:
     if isinstance(value, str) and rule.unit == "d" and not _is_number(value):
-        from astropy.time import Time
-
         try:
-            days: Any = Time(value.strip().rstrip("Z"), scale="utc").mjd
-            return float(days)
+            return mjd_of(value)
         except ValueError:
             raise place.fail(
                 f"{what} is no date", name, "as 2026-11-26T01:02:03, or a number of days"
             ) from None
-    if isinstance(value, str) and rule.unit in ("deg", "h") and _SEXAGESIMAL.fullmatch(value.strip()):
-        number = sexagesimal(value)
+    if is_sexagesimal(value) and rule.unit in ("deg", "h"):
+        with_unit = "h" in value or "d" in value
+        try:
+            value = float(degrees_of(value, "deg"))  # 6h30m is 97.5 deg, 6:30 is 6.5 of the word's unit
+        except ValueError:
+            raise place.fail(f"{what} is no angle", name, "as 06:30:12.5, minutes below 60") from None
+        if with_unit:
+            return value / 15.0 if rule.unit == "h" else value
         if not word.unit:
             raise place.fail(
                 f"{what} may be hours or degrees", name, 'say unit = "hourangle" or unit = "deg"'
             )
-    elif isinstance(value, bool) or not _is_number(value):
+    if isinstance(value, bool) or not _is_number(value):
         raise place.fail(f"{what} is not a number", name, "give another word, or values = { … }")
-    else:
-        number = float(value)
+    number = float(value)
     if not word.unit:
         return number
     return float(convert_unit(np.array([number]), word.unit, rule.unit, name, place)[0])

@@ -18,11 +18,13 @@ from typing import Any
 
 import numpy as np
 
+from walop_jax.data.header_words import overlapping
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.data.records import Exposures, Position, Site
-from walop_jax.data.units import sexagesimal
+from walop_jax.data.schema import EXPOSURES, check
+from walop_jax.data.units import Place, degrees_of, mjd_of
 from walop_jax.io.errors import fail
-from walop_jax.io.text import read_text
+from walop_jax.io.text import read_text, some
 from walop_jax.io.toml import Reader
 
 TYPES: Mapping[str, str] = {"clp": "CAL-CAL", "lamp": "CAL-CAL", "moon": "CAL-MOO"}
@@ -39,9 +41,9 @@ FASTEST = 3.0  # turns per minute
 MOST_FILTERS = 4
 MOST_EXPOSURES = 10_000
 """Of an acquisition."""
-TOLERATED = 2.0 / 86400.0  # d: times are of whole seconds
 SLACK = 30.0  # minutes that a window is longer than its exposures, on both sides
 ALIKE = 180.0  # deg after which a wave plate is the same again
+CHECKED = ("MJD", "RA", "DEC")
 ELEMENTS = {CALIBRATION_PLATE: "hwp", POLARISER: "polarizer"}
 
 
@@ -130,13 +132,24 @@ def read_schedule(
         raise fail("has no exposures", file=path, advice="nothing to be read")
     if unknown := sum(not math.isfinite(row["mjd"]) for row in rows):
         remarks.append(f"{path}: {unknown} exposures without `executed`: their time is not known")
-    begin, end = (np.array([row["mjd"] + k * row["exptime"] / 2 / 86400.0 for row in rows]) for k in (-1, 1))
-    if early := int(np.sum(begin[1:] < end[:-1] - TOLERATED)):
-        what = "begin before the one ahead of them has ended"
-        remarks.append(f"{path}: {early} exposures {what}: are `executed` their begins, in UTC?")
     columns = {
         name: np.array([row[name] for row in rows]) for name in rows[0] if name not in ("positions", "target")
     }
+    check(
+        {name: columns[name.lower()] for name in CHECKED},
+        {name: EXPOSURES[name] for name in CHECKED},
+        Place(path, ""),
+    )
+    unplaced = {
+        row["target"]: None for row in rows if row["kind"] in ("moon", "standard") and math.isnan(row["ra"])
+    }
+    if unplaced:
+        remarks.append(
+            f"{path}: {some(list(unplaced), 5)}: no object with RA and DEC, where these are is not known"
+        )
+    if early := overlapping(columns["mjd"], columns["exptime"]):
+        what = "begin before the one ahead of them has ended"
+        remarks.append(f"{path}: {early} exposures {what}: are `executed` their begins, in UTC?")
     nothing = np.full(len(rows), np.nan)
     places = {}
     for prefix in ELEMENTS:
@@ -256,7 +269,8 @@ def _read(
                 exposure, plate, polariser = (
                     read.table(acquisition[key], "", f"{key} = ") for key in ("exposure", "hwp", "polarizer")
                 )
-                count, time, number_of_filter = exposure["multiples"], exposure["T"], acquisition["filter"]
+                count, time = exposure["multiples"], exposure["T"]
+                number_of_filter = read.whole(acquisition["filter"], "filter", "")
                 inside = read.flag(polariser["engage"], "engage", "polarizer")
                 positions = {CALIBRATION_PLATE: plate, POLARISER: polariser}
                 seconds = read.positive(time, "T", "exposure")
@@ -280,8 +294,8 @@ def _read(
                     "mjd": _mjd(began[k], place) + seconds / 2 / 86400.0 if began else math.nan,
                     "exptime": seconds,
                     "filter": name_of[number_of_filter],
-                    "ra": 15.0 * _angle(coordinates.get("ra"), name, path),
-                    "dec": _angle(coordinates.get("dec"), name, path),
+                    "ra": _angle(coordinates.get("ra"), "hourangle", name, path),
+                    "dec": _angle(coordinates.get("dec"), "deg", name, path),
                     "positions": settings,
                 }
 
@@ -292,9 +306,9 @@ def _tables(value: Any, path: Any, what: str) -> list[Mapping[str, Any]]:
     return value
 
 
-def _angle(text: Any, name: str, path: Any) -> float:
+def _angle(text: Any, unit: str, name: str, path: Any) -> float:
     try:
-        return sexagesimal(text)
+        return math.nan if text is None else float(degrees_of(text.strip(), unit))
     except (ValueError, AttributeError):
         raise fail(f"object {name}: {text!r} is no angle", file=path, advice="as 06:30:12.5") from None
 
@@ -311,7 +325,9 @@ def _position(
         if not 0.0 <= (angle := read.number(state["angle"], "angle", word)) <= 360.0:
             raise read.fault(word, f"angle = {angle:g} must be between 0 and 360 degrees")
         return True, angle, 0.0
-    turn = 6.0 * read.positive(state.get("speed"), "speed", word) * seconds
+    if (speed := read.positive(state.get("speed"), "speed", word)) > FASTEST:
+        raise read.fault(word, f"speed = {speed:g} must be at most {FASTEST:g} turns a minute")
+    turn = 6.0 * speed * seconds
     if prefix == POLARISER:
         raise fail(
             "turns during the exposure",
@@ -325,8 +341,6 @@ def _position(
 
 def _mjd(text: Any, place: str) -> float:
     try:
-        began = datetime.datetime.fromisoformat(str(text).replace("Z", "+00:00"))
+        return mjd_of(str(text))
     except ValueError:
         raise fail(f"executed: {text!r} is no time", file=place, advice="as 2026-11-26T01:02:03Z") from None
-    began = began.astimezone(datetime.UTC).replace(tzinfo=None) if began.tzinfo else began
-    return (began - datetime.datetime(1858, 11, 17)) / datetime.timedelta(days=1)

@@ -12,7 +12,15 @@ from jaxtyping import Bool, Float, Int
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, plain_column
 from walop_jax.data.table_intensities import equal_rows
 from walop_jax.data.units import Place
-from walop_jax.data.user_tables import OF_STARS, InputTable, numeric_column, refuse_rounded, vector_columns
+from walop_jax.data.user_tables import (
+    OF_STARS,
+    InputTable,
+    numeric_column,
+    refuse_rounded,
+    sky_positions,
+    spellings,
+    vector_columns,
+)
 from walop_jax.io.errors import rows_text
 from walop_jax.model.instrument import Instrument
 from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
@@ -106,7 +114,9 @@ def read_catalogue(
         missing = rows_text(np.flatnonzero(~on_sky))
         source.remarks.append(f"ROTATOR is missing in {missing}: these are in the frame of the instrument")
     sky = None
-    if {"SKY", "SKY0", "SKY_0"} & set(source.names):
+    if {name for form in spellings("SKY", cameras, instrument.cameras.names) for name in form} & set(
+        source.names
+    ):
         (sky,) = vector_columns(source, ("SKY",), rule, instrument.cameras.names)
         place.refuse(sky < 0, "is below 0", "SKY", "the level of the sky that was subtracted, in electrons")
     copy, repeated = _copies(source, points, counts, sigma, rotator, star)
@@ -136,6 +146,7 @@ def _with_colours(
 ) -> tuple[FieldPoints, Float[np.ndarray, " n"]]:
     """Field points with the temperatures that BP_RP gives where there is no TEFF, and the errors of all of them (K)."""
     source.used.update(set(CARRIED) & set(source.names))
+    source.lacking.update({"SOURCE_ID"} - set(source.names))
     columns = {name: Column("float", unit, missing=np.nan) for name, (unit, _) in OF_STARS.items()}
 
     def numbers(name: str) -> Float[np.ndarray, " n"]:
@@ -259,10 +270,8 @@ def _numbered(
 
 def _by_position(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n"]:
     """Numbers of stars by RA and DEC: rows within `SAME_PLACE` that are not of one exposure are one star."""
-    ra, dec, time = (
-        numeric_column(source, name, Column("float", unit, missing=np.nan))
-        for name, unit in (("RA", "deg"), ("DEC", "deg"), ("MJD", "d"))
-    )
+    ra, dec = sky_positions(source)
+    time = numeric_column(source, "MJD", Column("float", "d", missing=np.nan))
     located = np.isfinite(ra) & np.isfinite(dec)
     name = np.zeros(len(ra), int)
     name[located] = same_stars(ra[located], dec[located], SAME_PLACE)

@@ -16,14 +16,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.camera_catalogues import CameraCatalogue, sky_positions
+from walop_jax.data.camera_catalogues import CameraCatalogue
 from walop_jax.data.schema import Column
 from walop_jax.data.user_tables import (
     OF_STARS,
     column_of_stars,
+    hints,
     in_memory,
     numeric_column,
     read_input_table,
+    sky_positions,
 )
 from walop_jax.io.errors import fail
 from walop_jax.sky.directions import (
@@ -141,6 +143,11 @@ def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
             values[stars] = column_of_stars(source, name)[near][rows]
             columns[name] = (_whole(values) if texts else values, unit, about)
     remarks = [f"{len(stars)} of {len(place)} stars are in {source.path}"]
+    if replaced := [name for name in OF_STARS if name in source.names and name in made.columns]:
+        remarks.append(f"{', '.join(replaced)} of the cameras: replaced by those of {source.path}")
+    lacking = {"SOURCE_ID", "TEFF"} - set(columns) - ({"TEFF"} if "BP_RP" in columns else set())
+    unused = [name for name in source.names if name not in source.used]
+    remarks += [f"{source.path}: {hint}" for hint in hints(unused, lacking, unsure=False)]
     if np.hypot(*move.shift) > 0.5 * tolerance:
         shift = f"{move.shift[0]:+.1f} and {move.shift[1]:+.1f} arcsec along X and Y"
         remarks.append(f"all cameras are shifted by {shift} against {source.path}: is their WCS right?")
