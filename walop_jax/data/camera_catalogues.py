@@ -31,12 +31,11 @@ from walop_jax.data.user_tables import (
     InputTable,
     column_of_stars,
     empty_cells,
-    hints,
     in_memory,
     numeric_column,
     sky_positions,
 )
-from walop_jax.io.errors import DataError, rows_text
+from walop_jax.io.errors import DataError, errors_naming, rows_text
 from walop_jax.io.fits_reading import open_fits
 from walop_jax.io.text import parse_toml, read_text, some
 from walop_jax.io.toml import Reader
@@ -51,8 +50,8 @@ OF_EXPOSURES = ("FILTER", "MJD", "TEMP", "HA", "CHWP_ANGLE", "CHWP_IN", "CHWP_TU
 _LDAC, _HEADER = "LDAC_OBJECTS", "LDAC_IMHEAD"
 _FAINTEST_MAGNITUDE = 40.0
 _NEGATIVE = 5.0  # standard errors
-_COUNTS = ("ct", "count", "counts", "adu", "dn")
-_ELECTRONS = ("electron", "electrons", "e-", "e")
+_UNITS = dict.fromkeys(("ct", "count", "counts", "adu", "dn"), "ct")
+_UNITS |= dict.fromkeys(("electron", "electrons", "e-", "e"), "electron")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,27 +110,21 @@ def read_map(source: str | os.PathLike[str]) -> ColumnMap:
     """
     shipped = str(source) in SHIPPED
     text = (files("walop_jax.data") / f"{source}.toml").read_text("utf-8") if shipped else read_text(source)
-    reader = Reader(str(source))
-    try:
-        table = parse_toml(text)
-    except ValueError as error:
-        raise DataError(f"{source}: {error}") from None
-    values = reader.values(typing.get_type_hints(ColumnMap), table, "")
-    for key in ("program", "flux"):
-        if not values.get(key):
-            raise reader.fault(
-                "", f"{key} is missing: it names {'the program' if key == 'program' else 'columns'}"
-            )
-    for bit, meaning in values.get("bits", {}).items():
-        if not bit.isdigit() or int(bit).bit_count() != 1:
-            raise reader.fault("bits", f"{bit!r} is no single bit: 1, 2, 4, 8, …")
-        if meaning != 0 and meaning not in BITS:
-            raise reader.fault(
-                "bits", f"{bit} = {meaning}: give a bit of FLAG ({', '.join(map(str, BITS))}), or 0"
-            )
-    for pair in values.get("sky", ()):
-        if len(pair) > 2:
-            raise reader.fault("", f"sky = {list(pair)} must be two columns, or one of coordinates")
+    with errors_naming(source):
+        reader, table = Reader(""), parse_toml(text)
+        values = reader.values(typing.get_type_hints(ColumnMap), table, "")
+        for key, what in (("program", "the program"), ("flux", "columns")):
+            if not values.get(key):
+                raise reader.fault("", f"{key} is missing: it names {what}")
+        for bit, meaning in values.get("bits", {}).items():
+            if not bit.isdigit() or int(bit).bit_count() != 1:
+                raise reader.fault("bits", f"{bit!r} is no single bit: 1, 2, 4, 8, …")
+            if meaning not in (0, *BITS):
+                listed = ", ".join(map(str, BITS))
+                raise reader.fault("bits", f"{bit} = {meaning}: give a bit of FLAG ({listed}), or 0")
+        for pair in values.get("sky", ()):
+            if len(pair) > 2:
+                raise reader.fault("", f"sky = {list(pair)} must be two columns, or one of coordinates")
     return ColumnMap(**values)
 
 
@@ -162,12 +155,9 @@ def read_camera_catalogue(
     flux, error, factor = _fluxes(source, column_map, gain, place)
     level = next((name.upper() for name in column_map.level if name.upper() in source.names), None)
     ra, dec = _positions(source, column_map, header, place)
-    flag, remark = _flags(source, column_map, place)
+    flag = _flags(source, column_map, place)
     bad = ~(np.isfinite(flux) & np.isfinite(error) & (error > 0))
-    of_stars = {}
-    for name in OF_STARS:
-        if name in source.names:
-            of_stars[name] = column_of_stars(source, name)
+    of_stars = {name: column_of_stars(source, name) for name in OF_STARS if name in source.names}
     of_exposure = {
         name: value for name in OF_EXPOSURES if (value := _of_all(source, stated, name, place)) is not None
     }
@@ -179,10 +169,6 @@ def read_camera_catalogue(
     rows = np.sort(np.unique(np.stack([ra, dec, flux, error]), axis=1, return_index=True)[1])
     if copies := len(ra) - len(rows):
         source.remarks.append(f"{copies} of {len(ra)} rows are copies of another row: left out")
-    unused = [name for name in source.names if name not in source.used]
-    lacking = {"SOURCE_ID", "TEFF", "N_FLAG"} - set(of_stars)
-    if "BP_RP" in of_stars:
-        lacking.discard("TEFF")
     return CameraCatalogue(
         path=source.path,
         ra=ra[rows],
@@ -196,14 +182,13 @@ def read_camera_catalogue(
         of_exposure=of_exposure,
         pointing={name: stated.get(name) for name in POINTING},
         header=header,
-        remarks=(*source.remarks, *remark, *hints(unused, lacking, unsure=False)),
+        remarks=(*source.remarks, *source.hints({"TEFF", "SOURCE_ID", "N_FLAG"})),
     )
 
 
 def _table(path: Path) -> tuple[InputTable, Any]:
     """The table of a file, and the header of the image that it was made from, or of the table."""
     header: Any = {}
-    remarks: list[str] = []
     try:
         with open_fits(path) as opened:
             names = [hdu.name for hdu in opened.hdus]
@@ -218,9 +203,8 @@ def _table(path: Path) -> tuple[InputTable, Any]:
         if path.suffix.lower() in (".fits", ".fit", ".ldac"):
             raise
     table_path, table, how = read_table_file(path, ())
-    remarks.extend(how)
     read = in_memory(table, str(table_path))
-    read.remarks.extend(remarks)
+    read.remarks.extend(how)
     return read, header or {str(key).upper(): value for key, value in read.table.meta.items()}
 
 
@@ -277,25 +261,21 @@ def _fluxes(
     unused = [pair[0] for pair in column_map.flux if pair != names and pair[0].upper() in source.names]
     stated = [unit_of(_one(source, name, place)).strip() for name in names]
     given = [unit or next(filter(None, stated), column_map.unit) for unit in stated]
-    targets = ["electron" if unit.lower() in _ELECTRONS else "ct" for unit in given]
-    if targets[0] != targets[1]:
+    plain = [_UNITS.get(unit.lower(), unit) for unit in given]
+    counts, of_error = (unit != "electron" for unit in plain)
+    if counts != of_error:
         what = f"is in {given[1]}, {names[0]} in {given[0]}"
         raise place.fail(what, _plain(names[1])[0], "give both in counts, or both in electrons")
     flux, error = (
         convert_unit(
-            _plain_numbers(source, name, place),
-            target if unit.lower() in (*_ELECTRONS, *_COUNTS) else unit,
-            target,
-            _plain(name)[0],
-            place,
+            _plain_numbers(source, name, place), unit, "ct" if counts else "electron", _plain(name)[0], place
         )
-        for name, unit, target in zip(names, given, targets, strict=True)
+        for name, unit in zip(names, plain, strict=True)
     )
     measured = np.isfinite(flux) & np.isfinite(error) & (error > 0)
     if not measured.any():
-        raise place.fail(
-            "has no flux with an error above 0", _plain(names[1])[0], "give standard errors of the fluxes"
-        )
+        what, advice = "has no flux with an error above 0", "give standard errors of the fluxes"
+        raise place.fail(what, _plain(names[1])[0], advice)
     if (
         np.abs(flux[measured]).max() < _FAINTEST_MAGNITUDE
         and np.median(error[measured] - 0.1 * np.abs(flux[measured])) < 0.0
@@ -303,11 +283,9 @@ def _fluxes(
         low, high, typical = flux[measured].min(), flux[measured].max(), np.median(error[measured])
         what = f"lies between {low:.3g} and {high:.3g} with errors of {typical:.2g}: these are magnitudes"
         raise place.fail(what, _plain(names[0])[0], "name a column of fluxes")
-    counts = targets[0] == "ct"
     if counts and gain is None:
-        source.remarks.append(
-            f"{names[0]} is in counts: taken as electrons; --gain gives electrons per count"
-        )
+        what = "is in counts: taken as electrons; --gain gives electrons per count"
+        source.remarks.append(f"{names[0]} {what}")
     if not counts and gain is not None:
         source.remarks.append(f"{names[0]} is in electrons: the gain is not used")
     if unused:
@@ -327,50 +305,48 @@ def _positions(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Right ascension and declination (deg): from the sky, or from pixels by the WCS of the header."""
     names = _pair(source, (*column_map.sky, ("RA", "DEC")))
+    pixels = _pair(source, column_map.pixel)
     if len(names) == 1:
         directions = source.column(_plain(names[0])[0])
-        if hasattr(directions, "icrs"):
-            return np.asarray(directions.icrs.ra.deg, float), np.asarray(directions.icrs.dec.deg, float)
-        raise place.fail("holds no coordinates of astropy", names[0], "name two columns, in degrees")
-    if names:
+        if not hasattr(directions, "icrs"):
+            raise place.fail("holds no coordinates of astropy", names[0], "name two columns, in degrees")
+        ra, dec = (np.asarray(angle.deg, float) for angle in (directions.icrs.ra, directions.icrs.dec))
+    elif names:
         ra, dec = sky_positions(source, [_plain(name)[0] for name in names])
-        place.refuse(
-            ~(np.isfinite(ra) & np.isfinite(dec)), "is not finite", ", ".join(names), "remove these rows"
-        )
-        return ra, dec
-    pixels = _pair(source, column_map.pixel)
-    if not pixels or "CRVAL1" not in header:
+    elif pixels and "CRVAL1" in header:
+        plane = WCS(fits.Header(header) if not isinstance(header, fits.Header) else header)
+        x, y = (numeric_column(source, _plain(name)[0], Column("float", missing=np.nan)) for name in pixels)
+        ra, dec = plane.celestial.all_pix2world(x, y, column_map.first_pixel)
+        ra, dec = np.mod(np.asarray(ra, float), 360.0), np.asarray(dec, float)
+    else:
         expected = column_map.sky[0] if column_map.sky else ("RA", "DEC")
         what = f"has neither {' and '.join(expected)} nor pixels with the WCS of their image"
         advice = "write these, or a catalogue with the header (FITS_LDAC); other names go into a TOML file (--columns)"
         raise place.fail(f"{what}; it has {some(list(source.names), 8)}", "", advice)
-    plane = WCS(fits.Header(header) if not isinstance(header, fits.Header) else header)
-    x, y = (numeric_column(source, _plain(name)[0], Column("float", missing=np.nan)) for name in pixels)
-    ra, dec = plane.celestial.all_pix2world(x, y, column_map.first_pixel)
-    return np.mod(np.asarray(ra, float), 360.0), np.asarray(dec, float)
+    unknown = ~(np.isfinite(ra) & np.isfinite(dec))
+    place.refuse(unknown, "is not finite", ", ".join(names or pixels), "remove these rows")
+    return ra, dec
 
 
-def _flags(
-    source: InputTable, column_map: ColumnMap, place: Place
-) -> tuple[Int[np.ndarray, " n"], tuple[str, ...]]:
-    """Bits of FLAG, and remarks."""
+def _flags(source: InputTable, column_map: ColumnMap, place: Place) -> Int[np.ndarray, " n"]:
+    """Bits of FLAG."""
     name = next((name.upper() for name in column_map.flag if name.upper() in source.names), None)
-    flag = np.zeros(source.rows, np.int64)
+    flag, rule = np.zeros(source.rows, np.int64), Column("int", missing=0)
     if name is None:
-        return flag, ("no flags of the stars: blends and saturated ones are not known",)
-    values = numeric_column(source, name, Column("int", missing=0)).astype(np.int64)
-    empty = int(empty_cells(source, name, Column("int", missing=0)).sum())
-    undefined = values.copy()
+        source.remarks.append("no flags of the stars: blends and saturated ones are not known")
+        return flag
+    values = undefined = numeric_column(source, name, rule).astype(np.int64)
     for bit, meaning in column_map.bits.items():
         flag |= np.where(values & int(bit) > 0, meaning, 0)
-        undefined &= ~int(bit)
+        undefined = undefined & ~int(bit)
     odd = np.flatnonzero((undefined != 0) | (values < 0))
     if odd.size:
         what = f"is {values[odd[0]]} in {rows_text(odd)}, which is no flag of {column_map.program}"
-        raise place.fail(
-            what, name, "say what its bits mean in a map of columns: --columns FILE.toml, table [bits]"
-        )
-    return flag, (f"{name} is empty in {empty} rows: taken as good",) if empty else ()
+        advice = "say what its bits mean in a map of columns: --columns FILE.toml, table [bits]"
+        raise place.fail(what, name, advice)
+    if empty := int(empty_cells(source, name, rule).sum()):
+        source.remarks.append(f"{name} is empty in {empty} rows: taken as good")
+    return flag
 
 
 def _of_all(source: InputTable, header: Mapping[str, Any], name: str, place: Place) -> Any:

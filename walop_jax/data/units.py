@@ -54,6 +54,15 @@ def degrees_of(text: str | Sequence[str], unit: str) -> Any:
     return Angle(text, unit=unit).deg
 
 
+def sexagesimal(degrees: float, unit: str) -> str:
+    """An angle (deg) as hh:mm:ss.ss, or ±dd:mm:ss.ss where `unit` is deg."""
+    from astropy.coordinates import Angle
+
+    hours = unit == "hourangle"
+    turned = round(degrees * 24000.0) / 24000.0 % 360.0 if hours else degrees  # hundredths of seconds
+    return str(Angle(turned, "deg").to_string(unit, sep=":", precision=2, pad=True, alwayssign=not hours))
+
+
 def mjd_of(text: str) -> float:
     """The MJD (UTC, d) of a text of ISO 8601, with the offset of its zone if it has one; ValueError for others."""
     time = datetime.datetime.fromisoformat(text.strip().replace("Z", "+00:00"))

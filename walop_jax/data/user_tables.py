@@ -10,7 +10,7 @@ import dataclasses
 import difflib
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -84,10 +84,23 @@ class InputTable:
         if gone := [name for name in replaced if name not in self.used]:
             sentences.append(f"{_columns(gone)} replaced by the result")
         if unused:
-            lacking = self.lacking - {"TEFF"} if "BP_RP" in self.used else self.lacking
-            about = some(hints(unused, lacking), 3, "; ")
+            about = some(self.hints(self.lacking, unused), 3, "; ")
             sentences.append(f"{_columns(unused)} not used{f' ({about})' if about else ''}")
         return tuple(sentences)
+
+    def hints(self, lacking: Set[str], names: Collection[str] | None = None) -> list[str]:
+        """Names, of those `lacking`, that unused columns may have been meant to have; of `names` those alike as well."""
+        sure, alike = [], []
+        for name in [n for n in self.names if n not in self.used] if names is None else names:
+            if {"TEFF", "BP_RP"}.isdisjoint(self.used) and "TEFF" in lacking and _COLOUR.search(name):
+                sure.append(f"{name}: the colour of a star is read from TEFF (K) or BP_RP (mag, of Gaia)")
+            elif "SOURCE_ID" in lacking - self.used and _IDENTITY.search(name):
+                sure.append(f"{name}: the identity of a star is read from SOURCE_ID")
+            elif "FLAG" in name and "N_FLAG" in lacking:
+                alike.append(f"{name}: flags are read from N_FLAG or FLAG, any bit means not used")
+            elif names is not None and (like := difflib.get_close_matches(name, sorted(lacking), 1, _LIKE)):
+                alike.append(f"{name}: did you mean {like[0]}?")
+        return [*sure, *alike]
 
     def new_name(self, name: str) -> str:
         """The name of a column of the user's that is used and has the name of one that is added."""
@@ -99,21 +112,6 @@ class InputTable:
 
 def _columns(names: Sequence[str]) -> str:
     return f"column{'s' if len(names) > 1 else ''} {', '.join(names)} {'are' if len(names) > 1 else 'is'}"
-
-
-def hints(names: Sequence[str], lacking: Collection[str], *, unsure: bool = True) -> list[str]:
-    """Names that unused columns may have been meant to have: colours, identities, flags, and (`unsure`) those alike."""
-    colours, flags = [], []
-    for name in names:
-        if "TEFF" in lacking and _COLOUR.search(name):
-            colours.append(f"{name}: the colour of a star is read from TEFF (K) or BP_RP (mag, of Gaia)")
-        elif "SOURCE_ID" in lacking and _IDENTITY.search(name):
-            colours.append(f"{name}: the identity of a star is read from SOURCE_ID")
-        elif "FLAG" in name and "N_FLAG" in lacking:
-            flags.append(f"{name}: flags are read from N_FLAG or FLAG, any bit means not used")
-        elif unsure and (like := difflib.get_close_matches(name, sorted(lacking), n=1, cutoff=_LIKE)):
-            flags.append(f"{name}: did you mean {like[0]}?")
-    return [*colours, *flags]
 
 
 def read_input_table(path: str | os.PathLike[str], needed: Collection[str] = ("X", "Y")) -> InputTable:
