@@ -50,8 +50,11 @@ OF_EXPOSURES = ("FILTER", "MJD", "TEMP", "HA", "CHWP_ANGLE", "CHWP_IN", "CHWP_TU
 _LDAC, _HEADER = "LDAC_OBJECTS", "LDAC_IMHEAD"
 _FAINTEST_MAGNITUDE = 40.0
 _NEGATIVE = 5.0  # standard errors
-_UNITS = dict.fromkeys(("ct", "count", "counts", "adu", "dn"), "ct")
-_UNITS |= dict.fromkeys(("electron", "electrons", "e-", "e"), "electron")
+_UNITS: Mapping[str, str] = {
+    "ct": "ct", "count": "ct", "counts": "ct", "adu": "ct", "dn": "ct",
+    "electron": "electron", "electrons": "electron", "e-": "electron", "e": "electron",
+}  # fmt: skip
+"""Units of fluxes by their names in catalogues."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -89,7 +89,7 @@ class InputTable:
         return tuple(sentences)
 
     def hints(self, lacking: Set[str], names: Collection[str] | None = None) -> list[str]:
-        """Names, of those `lacking`, that unused columns may have been meant to have; of `names` those alike as well."""
+        """Names of `lacking` that unused columns may have been meant to have; of `names` those alike as well."""
         sure, alike = [], []
         for name in [n for n in self.names if n not in self.used] if names is None else names:
             if {"TEFF", "BP_RP"}.isdisjoint(self.used) and "TEFF" in lacking and _COLOUR.search(name):
@@ -199,21 +199,18 @@ def sky_positions(
     place = Place(source.path, "")
     place.refuse(np.abs(ra) > 360.0, "is beyond ±360°", names[0], "right ascensions in degrees are needed")
     place.refuse(np.abs(dec) > 90.0, "is beyond ±90°", names[1], "declinations in degrees are needed")
-    column, finite = source.column(names[0]), np.isfinite(ra)
-    if unit_of(column) or column.dtype.kind not in "fiu" or not finite.any():
+    column, stated = source.column(names[0]), ra[np.isfinite(ra)]
+    with_unit = unit_of(column) or column.dtype.kind not in "fiu"
+    if with_unit or not stated.size or np.abs(stated - 12.0).max() > 12.0:
         return ra, dec
-    low, high = float(ra[finite].min()), float(ra[finite].max())
-    if low >= 0.0 and high <= 24.0:
-        from_first = np.mod(ra[finite] - low + 12.0, 24.0)  # a field about 0 h is no wider than others
-        width = np.std(from_first) * np.cos(np.deg2rad(np.nanmedian(dec)))
-        if len(ra) < _FEWEST_STARS:
-            source.remarks.append(
-                f"{names[0]} has no unit: taken as degrees; hours need the unit hourangle, or texts hh:mm:ss"
-            )
-        elif width < _FLAT * np.nanstd(dec):
-            what = f"lies between {low:.4g} and {high:.4g}, has no unit, and looks like hours"
-            advice = "degrees are needed: multiply by 15, or give the unit hourangle"
-            raise place.fail(what, names[0], advice)
+    from_first = np.mod(stated - stated.min() + 12.0, 24.0)  # a field about 0 h is no wider than others
+    width = np.std(from_first) * np.cos(np.deg2rad(np.nanmedian(dec)))
+    if len(ra) < _FEWEST_STARS:
+        what = "has no unit: taken as degrees; hours need the unit hourangle, or texts hh:mm:ss"
+        source.remarks.append(f"{names[0]} {what}")
+    elif width < _FLAT * np.nanstd(dec):
+        what = f"lies between {stated.min():.4g} and {stated.max():.4g}, has no unit, and looks like hours"
+        raise place.fail(what, names[0], "degrees are needed: multiply by 15, or give the unit hourangle")
     return ra, dec
 
 

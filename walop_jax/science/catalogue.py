@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Collection, Sequence
 
@@ -15,6 +16,7 @@ from walop_jax.data.units import Place
 from walop_jax.data.user_tables import (
     OF_STARS,
     InputTable,
+    column_of_stars,
     numeric_column,
     refuse_rounded,
     sky_positions,
@@ -114,9 +116,8 @@ def read_catalogue(
         missing = rows_text(np.flatnonzero(~on_sky))
         source.remarks.append(f"ROTATOR is missing in {missing}: these are in the frame of the instrument")
     sky = None
-    if {name for form in spellings("SKY", cameras, instrument.cameras.names) for name in form} & set(
-        source.names
-    ):
+    of_sky = itertools.chain(*spellings("SKY", cameras, instrument.cameras.names))
+    if not set(source.names).isdisjoint(of_sky):
         (sky,) = vector_columns(source, ("SKY",), rule, instrument.cameras.names)
         place.refuse(sky < 0, "is below 0", "SKY", "the level of the sky that was subtracted, in electrons")
     copy, repeated = _copies(source, points, counts, sigma, rotator, star)
@@ -147,23 +148,14 @@ def _with_colours(
     """Field points with the temperatures that BP_RP gives where there is no TEFF, and the errors of all of them (K)."""
     source.used.update(set(CARRIED) & set(source.names))
     source.lacking.update({"SOURCE_ID"} - set(source.names))
-    columns = {name: Column("float", unit, missing=np.nan) for name, (unit, _) in OF_STARS.items()}
-
-    def numbers(name: str) -> Float[np.ndarray, " n"]:
-        return (
-            numeric_column(source, name, columns[name])
-            if name in source.names
-            else np.full(source.rows, np.nan)
-        )
-
-    teff, error = points.settings.teff, np.nan_to_num(numbers("TEFF_ERR"))
+    teff, error = points.settings.teff, np.nan_to_num(column_of_stars(source, "TEFF_ERR"))
     place.refuse(error < 0, "is below 0", "TEFF_ERR", "standard errors in K")
     error = np.where(np.isnan(teff), 0.0, error)
-    colour = numbers("BP_RP")
-    from_colour = np.isnan(teff) & np.isfinite(colour)
+    colour = np.where(np.isnan(teff), column_of_stars(source, "BP_RP"), np.nan)
+    from_colour = np.isfinite(colour)
     if not from_colour.any():
         return points, error
-    temperature, off = temperature_of(np.where(from_colour, colour, np.nan), numbers("BP_RP_ERR"))
+    temperature, off = temperature_of(colour, column_of_stars(source, "BP_RP_ERR"))
     within = np.isfinite(temperature)
     source.remarks.append(f"TEFF of {int(within.sum())} rows is made of BP_RP ({SOURCE})")
     if beyond := int(np.sum(from_colour & ~within)):

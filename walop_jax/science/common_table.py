@@ -103,16 +103,10 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
     Raises `DataError` where RA, DEC or a column of `apply` is missing.
     """
     present = source.names
-    for name, why in (("RA", "the sky"), ("DEC", "the sky"), ("QU_PHOTON", "walop-jax apply")):
+    of_sky = "give RA and DEC of the stars to apply (walop-jax gather does)"
+    for name, advice in (("RA", of_sky), ("DEC", of_sky), ("QU_PHOTON", "it comes from walop-jax apply")):
         if name not in present:
-            advice = (
-                "give RA and DEC of the stars to apply (walop-jax gather does)"
-                if why == "the sky"
-                else "apply anew"
-            )
-            raise fail(
-                "the column is missing: it comes from " + why, file=source.path, column=name, advice=advice
-            )
+            raise fail("the column is missing", file=source.path, column=name, advice=advice)
 
     def number(name: str) -> np.ndarray:
         return numeric_column(source, name, Column("float", UNITS.get(name, ""), missing=np.nan))
@@ -131,7 +125,8 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
     keep = np.sort(first[(good & sky & placed)[first]])
     remarks = []
     if not keep.size:
-        raise fail("has no star with a result on the sky", file=source.path, advice="give ROTATOR to apply")
+        what, advice = "has no star with a result on the sky", "give ROTATOR, RA and DEC to apply"
+        raise fail(what, file=source.path, advice=advice)
     if lost := int(np.sum(~good)):
         remarks.append(f"{lost} rows without a result are left out")
     if unplaced := int(np.sum(good & ~placed)):
@@ -160,8 +155,7 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
         cells[f"q{end}"], cells[f"u{end}"] = pair.T
     for name, entry in COLUMNS.items():
         if name == "Filter":
-            rule = Column("str", missing="SDSS-r")
-            cells[name] = numeric_column(source, entry.of, rule)[keep]
+            cells[name] = numeric_column(source, entry.of, Column("str", missing="SDSS-r"))[keep]
         elif name == "GaiaID" and entry.of in present:
             identity = np.ma.asarray(source.table.columns[present.index(entry.of)])[keep]
             cells[name] = np.ma.filled(identity, -1 if identity.dtype.kind in "iu" else "")
