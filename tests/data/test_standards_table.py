@@ -19,11 +19,11 @@ def row(name, band):
 
 
 def test_every_value_has_a_source_and_a_date():
-    assert TABLE.meta["version"] == 1
-    assert TABLE.meta["date"] == "2026-11-26"
+    assert TABLE.meta["version"] == 2
+    assert TABLE.meta["date"] == "2026-11-27"
     assert all(str(one["REFERENCE"]) and one["P_ERR"] > 0 for one in TABLE)
     assert set(TABLE["FILTER"]) <= {"B", "V", "R"}
-    assert set(np.asarray(TABLE["EPOCH"])) <= {0, 1982, 1990, 1992, 2023}
+    assert set(np.asarray(TABLE["EPOCH"])) <= {0, 1982, 1990, 1992, 2007, 2023}
 
 
 def test_rows_go_into_sources_as_they_are():
@@ -51,6 +51,15 @@ def test_stokes_parameters_worked_out_by_hand():
     faint = row("HD 14069", "V")
     assert float(faint["Q_ERR"]) == pytest.approx(1.9e-4)
     assert float(faint["U_ERR"]) == pytest.approx(1.9e-4)
+
+
+def test_a_polarised_standard_of_the_south():
+    """Hiltner 652 (CD−28 13479): 17:43:19.6 −28:40:33, 6.07 % at 179.39° in R, so that U is −0.13 %."""
+    star = row("Hiltner 652", "R")
+    assert float(star["RA"].value) == pytest.approx(15 * (17 + 43 / 60 + 19.6 / 3600), abs=1e-3)
+    assert float(star["DEC"].value) == pytest.approx(-(28 + 40 / 60 + 33 / 3600), abs=1e-3)
+    assert (float(star["Q"]), float(star["U"])) == pytest.approx((0.0607, -0.0013), abs=1e-4)
+    assert "Hiltner 652" in walop.standards(near=(266.0, -29.0))["NAME"][:2]
 
 
 def test_a_star_that_varies_has_the_larger_error():

@@ -131,6 +131,19 @@ def test_a_share_of_the_sky_that_is_left_is_told_with_its_size():
     assert examined(sound).trusted
 
 
+@pytest.mark.long
+def test_sky_left_over_in_twenty_sets_and_in_no_sound_one():
+    """1 % of the level in each, told ahead of all else with its size."""
+    pulls = []
+    for seed in range(100, 120):
+        plain = simulate(SMALL, seed=seed).calset
+        assert examined(refit(under_sky(plain, 0.0))).trusted
+        first = examined(refit(under_sky(plain, 0.01))).verdict.doubts[0]
+        value, error = re.search(r"residuals ask for .* units of SKY, ([\d.]+) ± ([\d.]+)", first).groups()  # type: ignore[union-attr]
+        pulls.append((float(value) - 0.01) / float(error))
+    assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.4
+
+
 @pytest.mark.parametrize(
     ("change", "what", "size"),
     [
