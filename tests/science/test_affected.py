@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -64,6 +65,28 @@ def test_the_same_calibration_changes_nothing(old, table):
     assert [night.largest for night in found.nights] == [0.0, 0.0]
     assert [night.stars for night in found.nights] == [30, 30]
     assert [night.night for night in found.nights] == [61220.0, 61221.0]
+
+
+def test_a_star_of_two_nights_is_one_of_each(old, table):
+    """Ten stars with rows of both nights, ten of the first alone, ten of the second without a time in one row."""
+    rows = table[np.repeat(np.arange(30), 2)]
+    rows["MJD"] = np.concatenate(
+        [np.tile([61220.9, 61221.9], 10), np.full(20, 61220.9), np.tile([np.nan, 61221.9], 10)]
+    )
+    found = walop.affected(old, old, rows)
+    assert [(night.night, night.stars) for night in found.nights] == [(61220.0, 20), (61221.0, 20)]
+
+
+def test_calibrations_and_catalogues_of_other_instruments_are_told(old, table, monkeypatch):
+    other = table.copy()
+    other.meta["INSTRUME"] = "WALOP-NORTH"
+    (warning,) = walop.affected(old, old, other).warnings
+    assert "INSTRUME of the table is WALOP-NORTH, the calibration is one of WALOP-SOUTH" in warning
+    new = dataclasses.replace(old, path=Path("NEW"))
+    names = property(lambda it: "WALOP-NORTH" if it.path == new.path else "WALOP-SOUTH")
+    monkeypatch.setattr(Calibration, "instrument", names)
+    with pytest.raises(ValueError, match="OLD is a calibration of WALOP-SOUTH, NEW one of WALOP-NORTH"):
+        walop.affected(old, new, table)
 
 
 def test_what_must_be_made_again_is_named(old, table):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from astropy.table import Table
+from astropy.table import Column, Table
 from small_run import small_fit
 
 import walop_jax as walop
@@ -103,6 +103,47 @@ def test_nights_are_added_once_and_replaced(row, tmp_path: Path):
     assert table["RUN"].tolist() == ["N1", "B", "N3"]
     assert remarks == ["B: takes the place of N2 in night 61222.0"]
     assert Table.read(file)["ANGLE"].unit == "deg"
+
+
+@pytest.mark.parametrize("end", ["ecsv", "csv", "fits", "vot"])
+def test_a_table_of_any_format_is_added_to(row, tmp_path: Path, end):
+    """Truth values, names and numbers of a text are what they were; nights without a time take no other's place."""
+    file, limits = tmp_path / f"q.{end}", read_limits()
+    append(file, table_of_nights([night(row, 2, ANGLE=0.0, FILTERS="NB-580,SDSS-r")]), limits)
+    append(file, table_of_nights([night(row, 1, ANGLE=0.0, TRUSTED=False)]), limits)
+    for number in (3, 4):
+        table, remarks = append(file, table_of_nights([night(row, number, ANGLE=0.0, NIGHT=np.nan)]), limits)
+        assert remarks == []
+    assert table["RUN"].tolist() == ["N1", "N2", "N3", "N4"]
+    assert table["TRUSTED"].tolist() == [False, True, True, True]
+    assert table["FILTERS"].tolist()[1] == "NB-580,SDSS-r"
+    assert table["OUTSIDE"].tolist() == ["TRUSTED", "", "", ""]
+    assert append(file, table_of_nights([night(row, 4)]), limits)[1] == [
+        "N4: this calibration is in the table already"
+    ]
+
+
+def test_a_table_in_other_units_is_converted(row, tmp_path: Path):
+    file, limits = tmp_path / "q.ecsv", read_limits()
+    append(file, table_of_nights([night(row, 1, ANGLE=0.01, ANGLE_ERR=0.001)]), limits)
+    table = Table.read(file)
+    for name in ("ANGLE", "ANGLE_ERR"):
+        table[name] = Column(60.0 * table[name].data, unit="arcmin")
+    table["COMMENT"] = "wind"
+    table.write(file, overwrite=True)
+    table, _ = append(file, table_of_nights([night(row, 2, ANGLE=0.02)]), limits)
+    assert table["ANGLE"].tolist() == pytest.approx([0.01, 0.02])
+    assert table["ANGLE"].unit == "deg"
+    assert table["COMMENT"].tolist() == ["wind", None]
+
+
+def test_gains_are_held_against_those_of_their_instrument_and_filters(row):
+    rows = [
+        night(row, n, INSTRUME=name, GAIN_O1=gain, ANGLE=0.0)
+        for n, (name, gain) in enumerate([("A", 1.0), ("B", 1.3), ("A", 1.0), ("B", 1.3), ("A", 1.1)])
+    ]
+    found = judge(table_of_nights(rows), read_limits())["OUTSIDE"].tolist()
+    assert found == ["", "", "", "", "GAIN_O1"]
 
 
 def test_two_processes_do_not_lose_a_night(row, tmp_path: Path):

@@ -56,11 +56,15 @@ def affected(
     job.begin("reading")
     for name, table in named_tables(catalogues):
         before, after = (calibration_for(product, table, effects, force=True) for product in (old, new))
+        if before.instrument != after.instrument:
+            what = f"OLD is a calibration of {before.instrument}, NEW one of {after.instrument}"
+            raise UsageError(f"{what}: give two of one instrument", "new")
         replaced.append(before.content_hash())
         replacing.append(after.content_hash())
         rows = read_catalogue(
             table, before.model.template.patched(), always_in=before.always_in, never_in=before.never_in
         )
+        warnings += [f"{name}: {remark}" for remark in rows.remarks if remark.startswith("INSTRUME")]
         made_with = str(table.table.meta.get("CALHASH", ""))
         if made_with == replacing[-1] != replaced[-1]:
             warnings.append(f"{name}: was made with the new calibration already")

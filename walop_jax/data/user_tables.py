@@ -259,12 +259,10 @@ def _what_is_there(source: InputTable) -> str:
 def vector_columns(
     source: InputTable, names: Sequence[str], rule: Column, cameras: Sequence[str]
 ) -> list[np.ndarray]:
-    """Columns with `rule.width` numbers in a row, or that many columns side by side, which text formats need.
+    """Columns with `rule.width` numbers in a row, or that many side by side (`spellings`), which text formats need.
 
-    Those of N and N_ERR are N0, N1, … and N0_ERR, N1_ERR, … (or N_ERR0, …), or go by the names of the `cameras`: O1,
-    E1, … and O1_ERR, E1_ERR, …; those of another column, such as SKY, are SKY0, … or O1_SKY, E1_SKY, … Raises
-    `DataError` as `numeric_column` does, for a row of another width, and where only some of them have a unit that is
-    converted.
+    Raises `DataError` as `numeric_column` does, for a row of another width, and where only some of them have a unit
+    that is converted.
     """
     single = dataclasses.replace(rule, width=1)
     columns_of = {name: _side_by_side(source, name, rule.width or 1, cameras) for name in names}
@@ -293,7 +291,7 @@ def _side_by_side(source: InputTable, name: str, width: int, cameras: Sequence[s
 
 
 def spellings(name: str, width: int, cameras: Sequence[str]) -> list[list[str]]:
-    """The forms in which a column with `width` numbers in a row may be there: whole, or a column for each number."""
+    """Forms of a column with `width` numbers: N_ERR; N0_ERR …; by cameras O1_ERR … (of SKY O1_SKY …); N_ERR0 …"""
     head, _, tail = name.partition("_")
     end = f"_{tail}" if tail else ""
     of_camera = end if head == "N" else f"_{name}"

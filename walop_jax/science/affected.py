@@ -110,16 +110,20 @@ class Affected(Displayed):
 def affected(
     old: Calibration, new: Calibration, catalogue: Catalogue, name: str, limit: float = LIMIT
 ) -> Iterator[NightShift]:
-    """The nights of a catalogue, called `name`, with the shift of its stars when `new` takes the place of `old`."""
+    """The nights of a catalogue, called `name`, with the shift of its stars when `new` takes the place of `old`.
+
+    A star with rows of several nights, which are one result, is one of each of them.
+    """
     before, after = results_of(old, catalogue), results_of(new, catalogue)
     beyond = np.zeros(len(before.qu), bool)
     beyond[catalogue.star[new.beyond_settings(catalogue.points.settings)]] = True
-    time = np.full(len(before.qu), np.nan)
-    np.fmin.at(time, catalogue.star, catalogue.time)
-    evening = night_of(time, old.site.longitude)
+    evening, star = night_of(catalogue.time, old.site.longitude), catalogue.star
+    dated = np.isin(star, star[np.isfinite(evening)])
     for night in np.unique(evening):
-        of_night = evening == night if np.isfinite(night) else np.isnan(evening)
-        yield _night(before, after, of_night, beyond, (name, float(night)), limit)
+        rows = evening == night if np.isfinite(night) else ~dated
+        if rows.any():
+            of_night = np.isin(np.arange(len(before.qu)), star[rows])
+            yield _night(before, after, of_night, beyond, (name, float(night)), limit)
 
 
 def _night(

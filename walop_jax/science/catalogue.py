@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import re
 from collections.abc import Collection, Sequence
 
@@ -116,10 +115,13 @@ def read_catalogue(
         missing = rows_text(np.flatnonzero(~on_sky))
         source.remarks.append(f"ROTATOR is missing in {missing}: these are in the frame of the instrument")
     sky = None
-    of_sky = itertools.chain(*spellings("SKY", cameras, instrument.cameras.names))
-    if not set(source.names).isdisjoint(of_sky):
+    if any({*form} & {*source.names} for form in spellings("SKY", cameras, instrument.cameras.names)):
         (sky,) = vector_columns(source, ("SKY",), rule, instrument.cameras.names)
         place.refuse(sky < 0, "is below 0", "SKY", "the level of the sky that was subtracted, in electrons")
+    stated = str(source.table.meta.get("INSTRUME", instrument.name))
+    if stated.upper() != instrument.name.upper():
+        what = f"INSTRUME of the table is {stated}, the calibration is one of {instrument.name}"
+        source.remarks.append(what)
     copy, repeated = _copies(source, points, counts, sigma, rotator, star)
     bad |= copy[:, None]
     return Catalogue(

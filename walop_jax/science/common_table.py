@@ -234,14 +234,13 @@ def _wrong_numbers(table: Any) -> tuple[str, ...]:
         for name in COLUMNS
         if name in table.colnames and name not in texts
     }
-    beyond = ~((np.abs(c["RAJ2000"]) <= 360.0) & (np.abs(c["DEJ2000"]) <= 90.0))
-    if beyond.any():
-        return (f"RAJ2000, DEJ2000: no direction in degrees{_counted(beyond)}",)
     qu, p = np.stack([c["q"], c["u"]], axis=1), np.hypot(c["q"], c["u"])
-    longitude, latitude, north = galactic(c["RAJ2000"], c["DEJ2000"])
+    ra, dec = c["RAJ2000"], c["DEJ2000"]
+    longitude, latitude, north = galactic(ra, np.clip(dec, -90.0, 90.0))
     turned, _ = to_galactic(qu, np.zeros((len(qu), 2, 2)), north)
     polarised, margin = p > _SAME, 1.0 + _SAME
     wrong = {
+        "RAJ2000, DEJ2000: no direction": ~(np.maximum(np.abs(ra) / 4.0, np.abs(dec)) <= 90.0),
         "q, u: not finite": ~np.isfinite(p),
         "q, u: polarised by more than 1: in per cent?": p > 1.0 + 5.0 * np.hypot(c["e_q"], c["e_u"]),
         "e_q, e_u: not above 0": ~((c["e_q"] > 0) & (c["e_u"] > 0)),
@@ -260,11 +259,11 @@ def _wrong_numbers(table: Any) -> tuple[str, ...]:
         + np.abs(c["GLAT"] - latitude)
         > _SAME_ANGLE,
     }
-    return tuple(f"{what}{_counted(rows)}" for what, rows in wrong.items() if rows.any())
-
-
-def _counted(rows: np.ndarray) -> str:
-    return f" ({int(rows.sum())} rows, the first {int(np.argmax(rows))}, counted from 0)"
+    return tuple(
+        f"{what} ({int(rows.sum())} rows, the first {int(np.argmax(rows))}, counted from 0)"
+        for what, rows in wrong.items()
+        if rows.any()
+    )
 
 
 def _apart(one: np.ndarray, other: np.ndarray, turn: float = 180.0) -> np.ndarray:

@@ -35,6 +35,7 @@ from walop_jax.sky.directions import (
     Registration,
     mutual,
     registered,
+    separation,
 )
 
 BLEND = 8  # bit of N_FLAG
@@ -124,7 +125,7 @@ def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
     if not set(OF_STARS) & set(source.names):
         raise fail(f"has none of {', '.join(OF_STARS)}", file=source.path, advice="name its columns so")
     ra, dec = sky_positions(source)
-    near = made.pointing.separation(ra, dec) < FARTHEST
+    near = separation(made.pointing.ra, made.pointing.dec, ra, dec) < FARTHEST
     reference = np.stack(made.pointing.field_of(ra[near], dec[near]), axis=1)
     place = np.stack([made.columns[name][0] for name in "XY"], axis=1)
     bright = np.nan_to_num(np.nansum(made.columns["N"][0], axis=1))
@@ -153,7 +154,7 @@ def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
 
 def _place(catalogue: CameraCatalogue, pointing: Pointing) -> Float[np.ndarray, "n 2"]:
     """Positions on the tangent plane (deg). Refuses a catalogue of another field."""
-    away = pointing.separation(catalogue.ra, catalogue.dec)
+    away = separation(pointing.ra, pointing.dec, catalogue.ra, catalogue.dec)
     if (typical := float(np.median(away))) > FARTHEST:
         raise fail(
             f"its stars lie {typical:.3g} deg from the field centre RA {pointing.ra:.5g}, DEC {pointing.dec:.5g} deg",

@@ -21,7 +21,8 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data.table_files import read_table_file
+from walop_jax.data.schema import Column
+from walop_jax.data.user_tables import numeric_column, read_input_table
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.folder import locked
@@ -197,43 +198,46 @@ def _limits(text: str) -> dict[str, tuple[float, float]]:
     return content
 
 
+COLUMNS: Mapping[str, tuple[str, str]] = {
+    "NIGHT": ("d", "MJD of the evening"),
+    "MJD_BEG": ("d", "first exposure"),
+    "MJD_END": ("d", "last exposure"),
+    "NIGHTS": ("", "nights in the run"),
+    "INSTRUME": ("", "instrument"),
+    "FILTERS": ("", "filters"),
+    "RUN": ("", "folder or file of the calibration"),
+    "CALHASH": ("", "content hash of the calibration"),
+    "TRUSTED": ("", "verdict on the fit"),
+    **NUMBERS,
+}
+OF_CAMERA = ("", "throughput of a camera over the mean of all")
+RULES = dict.fromkeys(("INSTRUME", "FILTERS", "RUN", "CALHASH"), Column("str", missing=""))
+RULES |= {"NIGHTS": Column("int", missing=0), "TRUSTED": Column("bool", missing=False)}
+
+
 def table_of_nights(rows: Sequence[Mapping[str, Any]]) -> Any:
     """Rows as an astropy table with units and descriptions."""
-    plain = {
-        "NIGHT": ("d", "MJD of the evening"),
-        "MJD_BEG": ("d", "first exposure"),
-        "MJD_END": ("d", "last exposure"),
-        "NIGHTS": ("", "nights in the run"),
-        "INSTRUME": ("", "instrument"),
-        "FILTERS": ("", "filters"),
-        "RUN": ("", "folder or file of the calibration"),
-        "CALHASH": ("", "content hash of the calibration"),
-        "TRUSTED": ("", "verdict on the fit"),
-        **NUMBERS,
-    }
     names = list(dict.fromkeys(name for row in rows for name in row))
-    of_camera = ("", "throughput of a camera over the mean of all")
-    return astropy_table(
-        {
-            name: (np.array([row.get(name, np.nan) for row in rows]), *plain.get(name, of_camera))
-            for name in names
-        }
-    )
+    values = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
+    return astropy_table({name: (values[name], *COLUMNS.get(name, OF_CAMERA)) for name in names})
 
 
 def read_nights(path: Path) -> Any:
-    """The table of nights in a file; `DataError` for one that is none."""
-    _, table, _ = read_table_file(path, (*SAME, "CALHASH"))
+    """The table of nights in a file, in the units of `COLUMNS`; `DataError` for one that is none."""
+    source = read_input_table(path, (*SAME, "CALHASH"))
+    table = source.table
     for name in (*SAME, "CALHASH"):
         if name not in table.colnames:
+            what = "the column is missing: this is no table of quality numbers"
             advice = "name the table that walop-jax quality has made, or a new one"
-            raise fail(
-                "the column is missing: this is no table of quality numbers",
-                file=path,
-                column=name,
-                advice=advice,
-            )
-    return table
+            raise fail(what, file=path, column=name, advice=advice)
+    stated = [name for name in table.colnames if name in COLUMNS or name.startswith(f"{GAIN}_")]
+    about = {name: COLUMNS.get(name, OF_CAMERA) for name in stated}
+    rules = {name: RULES.get(name, Column("float", about[name][0], missing=np.nan)) for name in stated}
+    nights = astropy_table({n: (numeric_column(source, n, rules[n]), *about[n]) for n in stated})
+    for name in (other for other in table.colnames if other not in stated):
+        nights[name] = table[name]
+    return nights
 
 
 def joined(old: Any, new: Any) -> tuple[Any, list[str]]:
@@ -243,6 +247,8 @@ def joined(old: Any, new: Any) -> tuple[Any, list[str]]:
     hashes, remarks = set[str](), []
     for number, row in enumerate(rows):
         key, content = tuple(str(row[name]) for name in SAME), str(row["CALHASH"])
+        if not np.isfinite(float(np.ma.filled(row["NIGHT"], np.nan))):
+            key = (*key, content)  # of no night: in the place of none
         if content in hashes:
             remarks.append(f"{row['RUN']}: this calibration is in the table already")
             continue
@@ -265,7 +271,7 @@ def judge(table: Any, limits: Limits) -> Any:
             continue
         values, error = _plain(table[name]), _plain(table[ERRORS[name]]) if name in ERRORS else 0.0
         if camera:
-            values = values / _medians_before(values)
+            values = values / _medians_before(values, [(row["INSTRUME"], row["FILTERS"]) for row in table])
         beyond = np.maximum(low - values, values - high) > BEYOND * np.nan_to_num(error)
         for row in np.flatnonzero(beyond):
             outside[row].append(name)
@@ -280,9 +286,13 @@ def _plain(column: Any) -> Float[np.ndarray, " n"]:
     return np.ma.filled(np.ma.asarray(column, float), np.nan)
 
 
-def _medians_before(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Median of all earlier rows; of the first one itself."""
-    return np.array([np.nanmedian(values[: max(n, 1)]) for n in range(len(values))])
+def _medians_before(values: Float[np.ndarray, " n"], alike: Sequence[object]) -> Float[np.ndarray, " n"]:
+    """Median of all earlier rows of the same instrument and filters; of the first one itself."""
+    medians = np.empty(len(values))
+    for n, kind in enumerate(alike):
+        earlier = [values[k] for k in range(n) if alike[k] == kind and np.isfinite(values[k])]
+        medians[n] = np.median(earlier) if earlier else values[n]
+    return medians
 
 
 def append(path: str | os.PathLike[str], new: Any, limits: Limits) -> tuple[Any, list[str]]:

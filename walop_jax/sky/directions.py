@@ -57,12 +57,6 @@ class Pointing:
         ra, dec = self._plane().wcs_pix2world(x, y, 1)
         return np.mod(np.asarray(ra, float), 360.0), np.asarray(dec, float)
 
-    def separation(
-        self, ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, " n"]:
-        """Distance of directions from the field centre (deg)."""
-        return separation(self.ra, self.dec, ra, dec)
-
     def rotator_at(
         self, ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
@@ -70,7 +64,9 @@ class Pointing:
         centre, stars = _directions(self.ra, self.dec), _directions(ra, dec)
         outward = np.asarray(centre.position_angle(stars).deg)
         back = np.asarray(stars.position_angle(centre).deg) + 180.0
-        return np.mod(self.rotator + np.where(self.separation(ra, dec) > 0.0, back - outward, 0.0), 360.0)
+        return np.mod(
+            self.rotator + np.where(separation(self.ra, self.dec, ra, dec) > 0.0, back - outward, 0.0), 360.0
+        )
 
 
 def separation(ra: Any, dec: Any, other_ra: Any, other_dec: Any) -> Float[np.ndarray, "*n"]:
