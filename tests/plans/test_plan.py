@@ -322,7 +322,7 @@ def test_the_distance_of_two_effects_is_that_of_a_fit():
     rival = with_effects(base_model(calset, throughput_degree=2), pair[1:], context)
     # Priors are centred on the design, the truth is not: what they cost is taken out by a fit of the truth's own model.
     own = with_effects(base_model(calset, throughput_degree=2), (effect.name,), context)
-    chi2 = [fit.posterior.objective for fit in (refit(calset, rival), refit(calset, own))]
+    chi2 = [fit.expansion.objective for fit in (refit(calset, rival), refit(calset, own))]
     assert np.sqrt(chi2[0] - chi2[1]) == pytest.approx(plan.value, rel=0.05)
 
 

@@ -246,7 +246,7 @@ class Calibration(Contents, Fitted):
             sources=calset.sources,
             site=calset.site,
             origin=calset.origin,
-            field=result.posterior.census.field,
+            field=result.expansion.census.field,
             inputs=calset.inputs,
             residuals=residuals,
             hidden=result.hidden,

@@ -132,9 +132,9 @@ def _compressed(result: FitResult) -> CalibrationSet:
     from walop_jax.diagnosis.trust import pixel_structure
     from walop_jax.fit.stand_in import with_pixel_structure
     from walop_jax.likelihood.compressed import compressed
-    from walop_jax.likelihood.frames import PixelPosterior
+    from walop_jax.likelihood.frames import PixelExpansion
 
-    if not isinstance(result.posterior, PixelPosterior):
+    if not isinstance(result.expansion, PixelExpansion):
         raise fail(
             "cannot be compressed",
             file=result.calset.inputs[0].path if result.calset.inputs else IN_MEMORY,
@@ -143,7 +143,7 @@ def _compressed(result: FitResult) -> CalibrationSet:
         )
     if not result.converged:
         raise ValueError(f"the fit of the frames did not converge ({result.minimum.message})")
-    return with_pixel_structure(compressed(result.posterior), pixel_structure(result))
+    return with_pixel_structure(compressed(result.expansion), pixel_structure(result))
 
 
 def next_steps(trusted: bool, output: PathLike | None, data: Sets, **options: object) -> tuple[str, ...]:

@@ -67,7 +67,7 @@ def instead_of_names(before: FitResult, after: FitResult) -> str:
                 break
             current = rescored[stated.what]
         score, square = current.score, current.square
-        worth = 0.5 * (before.posterior.objective - result.posterior.objective)
+        worth = 0.5 * (before.expansion.objective - result.expansion.objective)
         worth -= 0.5 * float(np.log1p(square * stated.width**2))
         explained = result.explains_data or result.nearly_explains_data
         if result.converged and abs(size) < stated.width and worth > least and (added or explained):

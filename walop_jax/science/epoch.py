@@ -251,7 +251,7 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
         directions=measured.directions,
         largest=largest,
         visible=_visible(dataclasses.replace(new, covariance=of_all)),
-        chi2_old=result.likelihood.expand(values[fitted], near=result.posterior).chi2,
+        chi2_old=result.likelihood.expand(values[fitted], near=result.expansion).chi2,
         chi2_new=result.chi2,
         dof=result.dof,
         moved=tuple(sorted(moved, key=lambda entry: -abs(entry.z))),
