@@ -23,6 +23,14 @@ def test_a_run_answers_like_its_fit(fitted):
     assert "walop_jax" in type(run.plot("modulation")).__module__
 
 
+def test_only_draws_are_called_a_posterior(fitted):
+    run = walop.read(fitted.run)
+    fit = run.fit()
+    assert not hasattr(fit, "posterior")
+    assert fit.expansion.chi2 == fit.chi2
+    assert run.posterior is None  # nothing has been drawn
+
+
 def test_a_model_shows_its_parameters(fitted):
     model = walop.base_model(walop.read(fitted.calset)).change("half1.wedge", free=False)
     table = model.to_table()
