@@ -325,6 +325,7 @@ def calendar(axis: Axes, mjd: Any) -> bool:
     locator = AutoDateLocator(minticks=3, maxticks=7)
     axis.xaxis.set_major_locator(locator)
     axis.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+    axis.xaxis.get_offset_text().set_fontsize(FONT)
     axis.set_xlabel("date (UTC)", fontsize=FONT)
     return True
 

@@ -177,7 +177,10 @@ class Watch(Displayed):
                 ("exposure groups", f"{len(self.time)}"),
                 ("sensitivity", f"a {smallest} % step in one camera would be detected (99 % probability)"),
             ),
-            head=("time", ">stars", ">χ²/dof", *(f">{name} %" for name in self.cameras), ">seen %"),
+            head=(
+                "MJD" if np.min(self.time) > FIRST_DATE else "group",
+                *(">stars", ">χ²/dof", *(f">{name} %" for name in self.cameras), ">sensitivity %"),
+            ),
             rows=rows,
             notes=self.warnings,
         )
