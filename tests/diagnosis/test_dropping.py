@@ -12,6 +12,7 @@ from scenes import PLAN
 from walop_jax.diagnosis import leftover, thresholds
 from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.figure_data import figure_data
+from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.diagnosis.refits import Refits
 from walop_jax.diagnosis.search import State
 from walop_jax.diagnosis.workflow import diagnose
@@ -94,7 +95,7 @@ def test_what_has_no_name_is_asked_of_the_model_without_needless_names(monkeypat
 
 
 def test_when_time_or_fits_are_over_nothing_further_is_tried():
-    how = (Context(), (), (), (), (), np.random.default_rng(0), lambda text: None)
+    how = (Context(), Hypotheses(), np.random.default_rng(0), lambda text: None)
     assert Refits(*how, minutes=0.0).over(0) == "0 minutes"
     assert Refits(*how).over(thresholds.MOST_FITS) == f"{thresholds.MOST_FITS} fits"
     assert Refits(*how).over(0) == ""

@@ -255,7 +255,6 @@ class _Step:
         along = design.products(state.columns, basis)
         gram, scores = state.bare.gram + along @ along.T, design.products(state.columns, self.left)
         places, scored = state.bare.places(), []
-        number = {name: i for i, name in enumerate(state.bare.names)}
         for probe in (*state.probes, *state.sentences, *(probe for probe, _ in state.parts)):
             at = places[probe.name]
             evidence = log_bayes(gram[at, at], scores[at], probe.widths) / state.floor**2
@@ -275,7 +274,7 @@ class _Step:
                 chosen.append((probe, evidence, sums, square, along_residual))
         self.laid.added([total for _, _, sums, *_ in chosen for total in sums])  # all of them in one go
         for probe, evidence, sums, square, along_residual in chosen:
-            column = design.stacked([state.columns[number[probe.name]]])
+            column = design.stacked([state.candidates[probe.name].columns])
             yield self.member(probe.name, evidence, sums, column, square, along_residual, probe.widths)
 
     def in_other_kinds(self, member: Likeness) -> Likeness | None:

@@ -305,7 +305,7 @@ def detection_limits(
     result = sampled(on_field_points(result), most_points(calset, template, listed.amplitudes))
     tell(Stage("differentiating every effect", "differentiating"))
     rng = np.random.default_rng(seed)
-    examination = examine(result, listed.names, rng, sentences=listed.sentences, parts=listed.parts)
+    examination = examine(result, listed, rng)
     p = examination.table.local(thresholds.ALARM)
     tell(Stage("comparing the effects", "comparing"))
     rivals = examination.bare.subset([probe.name for probe in examination.probes])
@@ -389,7 +389,8 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     if not looked_at:
         return errors
     raw = [
-        examination.named[c.probe.name].columns[:, c.number, None] for c in (columns[i] for i in looked_at)
+        examination.candidates[c.probe.name].columns[:, c.number, None]
+        for c in (columns[i] for i in looked_at)
     ]
     along = design.products(raw, design.projector.basis).T
     for i, taken_up in zip(looked_at, design.taken_up(along).T, strict=True):

@@ -29,7 +29,8 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
 from walop_jax.diagnosis.examination import Examination, most_points
 from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained, describe, told
-from walop_jax.diagnosis.grammar import Hypotheses, hypotheses
+from walop_jax.diagnosis.grammar import hypotheses
+from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.diagnosis.leftover import back_to, concluded
 from walop_jax.diagnosis.readings import mixups_of, refusal
 from walop_jax.diagnosis.refits import Refits
@@ -86,10 +87,7 @@ def diagnose(
         raise refusal(before, readings)
     judge = Refits(
         context=context,
-        catalogue=candidates.effects,
-        wanted=candidates.names,
-        sentences=candidates.sentences,
-        parts=candidates.parts,
+        hypotheses=candidates,
         rng=np.random.default_rng(seed),
         tell=tell,
         minutes=np.inf if minutes is None else minutes,
