@@ -63,7 +63,6 @@ MANY_SHAPES = 8
 """Shapes of an effect above which one of them, of the median size, stands for all in what it does to the matrix."""
 
 SECOND_ORDER = 1.1
-_ABSORBED = 1e-9  # share of the square of a column that a rival leaves below which the two are the same
 
 NO_LEVEL = "q and u cannot both be measured with one exposure"
 HEAD = ("amplitude", ">detected", ">named", "unit", ">error of q, u (%)", "can be mistaken for")
@@ -350,7 +349,7 @@ def _columns(examination: Examination, rivals: ScoreSpace, probe: Probe, p: floa
         del apart[probe.effect.name]
         nearest = min(apart.values(), default=np.inf)
         named = detected
-        if nearest <= np.sqrt(_ABSORBED * square):
+        if nearest <= np.sqrt(thresholds.ROUNDING * square):
             named = np.inf
         elif np.isfinite(nearest):
             surely = special.ndtri(thresholds.PROBABILITY) / np.sqrt(square)

@@ -61,7 +61,7 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
         mean = float(np.logaddexp.reduce([s.log_bayes for _, s in alive]) - np.log(len(shapes)))
         alternatives = [
             item
-            for item in alive[1 : thresholds.MOST_SHAPES]
+            for item in alive[1 : thresholds.MOST_FITTED]
             if item[1].log_bayes > best - max(thresholds.WITHIN, 0.2 * best)
         ]
         ranked.append(Ranked(effect, probe, score, mean, tuple(alternatives)))

@@ -196,7 +196,7 @@ def without(result: FitResult, name: str, remaining: Collection[str]) -> FitResu
 def contradicting(before: Design, after: Design) -> str:
     """KINDs of exposures that all others predict worse with the additions of a fit; empty: none."""
     gains = gains_by_kind(before, after)
-    return ", ".join(f"KIND {kind}" for kind, gain in gains.items() if gain < -thresholds.CONTRADICTED)
+    return ", ".join(f"KIND {kind}" for kind, gain in gains.items() if gain < -thresholds.EVEN_ODDS)
 
 
 def refitted_in_order(steps: Sequence[Trial], start: Design, end: Design) -> list[Trial]:

@@ -11,7 +11,7 @@ from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import log_evidence_ratio
 from walop_jax.diagnosis.score import corrected_p, local_p
-from walop_jax.diagnosis.stated_conditions import ALIKE, SHOWN, condition_in_words, condition_scores
+from walop_jax.diagnosis.stated_conditions import ALIKE, condition_in_words, condition_scores
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.io.text import with_error
 from walop_jax.likelihood.likelihood import Likelihood
@@ -35,7 +35,9 @@ def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
     ]
     if alike:
         alike.sort(key=lambda pair: -pair[0])
-        causes = "; or ".join(condition_in_words(item.stated, item.score) for _, item in alike[:SHOWN])
+        causes = "; or ".join(
+            condition_in_words(item.stated, item.score) for _, item in alike[: thresholds.SHOWN]
+        )
         yield f"what was found explains no more than one number that the set states would, if it were {causes}"
 
 

@@ -43,10 +43,8 @@ from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import effect_context
 
-SHOWN = 4  # alternatives that are told in words
 ALIKE = 25.0  # in χ², within which conditions are told together
 _PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
-MOST_OF_ELEMENT = 4  # numbers of an element whose priors may be wrong together
 _ASKED_OTHERWISE = (*thresholds.ASKED_BY_CAMERA, "standard_outlier")  # camera by camera, and as priors
 _LEVELS = "exposures at a second light level"
 _DARK = "bias and dark frames"
@@ -178,8 +176,8 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     likely = [item for item in likely if not any(_holds(item, rival) for rival in likely)]
     likely.sort(key=lambda item: (item.rank, item.log_p))  # a mistake of one number before sixteen
     wordings = {item.candidate.name: item.said for item in rivals}
-    causes = "; or for ".join(wordings[score.name](score) for score in likely[:SHOWN])
-    further = f"; or for {len(likely) - SHOWN} others" if len(likely) > SHOWN else ""
+    causes = "; or for ".join(wordings[score.name](score) for score in likely[: thresholds.SHOWN])
+    further = f"; or for {len(likely) - thresholds.SHOWN} others" if len(likely) > thresholds.SHOWN else ""
     p = corrected_p(best.log_p, len(scores))
     yield f"the residuals ask for {causes}{further} (p = {p:.2g}, limit {thresholds.ALARM:g})"
 
@@ -219,7 +217,7 @@ def _priors(design: Design) -> Iterator[_Single]:
     together: dict[str, list[int]] = {}
     for i in constrained:
         together.setdefault(parameters[rows.index[i]].name.rpartition(".")[0], []).append(i)
-    elements = {k: v for k, v in together.items() if k and 1 < len(v) <= MOST_OF_ELEMENT} | names
+    elements = {k: v for k, v in together.items() if k and 1 < len(v) <= thresholds.MOST_TOGETHER} | names
 
     def wording(score: Score) -> str:
         texts = []
@@ -300,7 +298,7 @@ def _of_catalogue(design: Design, effects: Sequence[Probe]) -> Iterator[_Single]
 
 def _effect_in_words(probe: Probe, score: Score, cameras: Sequence[str]) -> str:
     effect, declared = probe.effect.combine(probe.group, score.amplitudes), probe.effect.numbers()
-    if len(score.amplitudes) > MOST_OF_ELEMENT:
+    if len(score.amplitudes) > thresholds.MOST_TOGETHER:
         return f"{effect.name}, {len(score.amplitudes)} numbers"
     choices = effect.choices()
     texts = [f"{n} {cameras[value] if n == 'camera' else value}" for n, value in choices.items()]
