@@ -64,10 +64,10 @@ def instead_of_names(before: FitResult, after: FitResult) -> str:
                 break
             likelihood = Likelihood.of(stated.changed(size), before.model)
             result = fit(likelihood, start=result.values, noise_scale=before.noise_scale)
-            rescored = {c.stated.what: c for c in condition_scores(Design.of(result))}
-            if not result.converged or stated.what not in rescored:
+            rescored = condition_scores(Design.of(result), stated.what) if result.converged else []
+            if not rescored:
                 break
-            current = rescored[stated.what]
+            (current,) = rescored
         score, square = current.score, current.square
         worth = 0.5 * (before.posterior.objective - result.posterior.objective)
         worth -= 0.5 * float(np.log1p(square * stated.width**2))

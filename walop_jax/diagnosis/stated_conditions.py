@@ -189,9 +189,9 @@ def _holds(score: Score, rival: Score) -> bool:
     return score.name.startswith(f"{rival.name}.") and rival.log_p < score.log_p
 
 
-def _conditions(design: Design) -> Iterator[_Single]:
-    """The numbers that the set states and that are used."""
-    statements = list(_stated(design.fit.calset))
+def _conditions(design: Design, what: str = "") -> Iterator[_Single]:
+    """The numbers that the set states and that are used, or the one that is `what`."""
+    statements = [item for item in _stated(design.fit.calset) if what in ("", item.what)]
     columns = [design.stacked([column[:, None]]) for column in _columns(design, statements)]
     for item, column in zip(statements, columns, strict=True):
         if not column.any():  # a number may be stated and not used
@@ -325,9 +325,9 @@ def condition_in_words(stated: _Stated, score: Score) -> str:
     return f"{text}, not {stated.value:g} ({stated.remedy})"
 
 
-def condition_scores(design: Design) -> list[_Scored]:
-    """The numbers that a set states, each with the score of changing it."""
-    singles = scored(design, tuple(_conditions(design)))
+def condition_scores(design: Design, what: str = "") -> list[_Scored]:
+    """The numbers that a set states, or the one that is `what`, each with the score of changing it."""
+    singles = scored(design, tuple(_conditions(design, what)))
     return [
         _Scored(r.stated, singles.table[r.candidate.name], r.candidate.columns[:, 0], float(info))
         for r, info in zip(singles.rivals, singles.left, strict=True)
@@ -337,9 +337,9 @@ def condition_scores(design: Design) -> list[_Scored]:
 
 def _columns(design: Design, statements: Sequence[_Stated]) -> Iterator[Float[np.ndarray, " _"]]:
     of_field = [item for item in statements if item.along is not None]
-    by_place = [_column(design, item) for item in of_field[:2]]  # X and Y come first
+    by_place = [_column(design, item) for item in of_field[:2] if len(of_field) > 2]  # X and Y come first
     for item in statements:
-        if item.along is None:
+        if item.along is None or not by_place:
             yield _column(design, item)
         else:
             (in_x, in_y), (by_x, by_y) = item.along, by_place
