@@ -103,7 +103,7 @@ def simulate(
         if like is not None:
             if instrument is not None or catalogue_seed is not None:
                 raise ValueError(
-                    "like says which instrument and catalogue: leave out instrument and catalogue_seed"
+                    "like gives instrument and catalogue: leave out instrument and catalogue_seed"
                 )
             template = _template(like, catalogue)
             plan = template.planned(plan)

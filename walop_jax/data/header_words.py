@@ -130,7 +130,7 @@ def exposures_table(
                 table["KIND"] == kind,
                 f"{kind!r} is not a kind,",
                 "KIND",
-                f"say it in values; {nearest(kind, KINDS)}",
+                f"list it in values; {nearest(kind, KINDS)}",
             )
     check(table, {name: rule for name, rule in rules.items() if name in table}, place)
     absent = [name for name in EXPOSURES if name not in columns and not _MOVES.fullmatch(name)]
@@ -197,7 +197,7 @@ def _of_json(path: Path, rows: str) -> Iterator[Mapping[str, Any]]:
             )
         content = content[key]
     if not isinstance(content, list) or not all(isinstance(record, Mapping) for record in content):
-        raise fail("holds no list of records", file=path, advice='say where it is: rows = "data.exposures"')
+        raise fail("holds no list of records", file=path, advice='give its place: rows = "data.exposures"')
     yield from content
 
 
@@ -292,7 +292,7 @@ def _number(value: Any, name: str, rule: Column, word: Word, place: Place, what:
         number = sexagesimal(value)
         if not word.unit:
             raise place.fail(
-                f"{what} may be hours or degrees", name, 'say unit = "hourangle" or unit = "deg"'
+                f"{what} may be hours or degrees", name, 'give unit = "hourangle" or unit = "deg"'
             )
     elif isinstance(value, bool) or not _is_number(value):
         raise place.fail(f"{what} is not a number", name, "give another word, or values = { … }")
