@@ -41,7 +41,7 @@ LIKE = Option(
 NIGHT = Option("Number of the night: days after the date of the plan.", "N", int, least=0)
 
 
-@command(stages=("following", "writing"), writes="file", random=True)
+@command(stages=("following", "writing"), writes=(), random=True)
 def simulate(
     job: Job,
     plan: Annotated[ObservingPlan | PathLike | None, PLAN] = None,
@@ -113,8 +113,9 @@ def simulate(
             true, lost = template.instrument_of(plan, hidden)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    if truth is not None:
-        check_output(truth, overwrite=job.overwrite)
+    for path in (output, truth):
+        if path is not None:
+            check_output(path, overwrite=job.overwrite)
     drawn: dict[str, Any] = {"instrument": true, "effects": hidden, "catalogue_seed": catalogue_seed}
     drawn["catalogue"] = None if template is None else template.catalogue
     about: dict[str, Any] = {"output": output, "instrument": plan.name, "seed": job.seed, "truth": truth}
