@@ -42,6 +42,12 @@ def test_a_model_shows_its_parameters(fitted):
     assert "<table>" in model._repr_html_()
 
 
+def test_intensities_print_as_a_line(fitted):
+    intensities = walop.read(fitted.calset).intensities
+    assert repr(intensities).startswith(f"{intensities.rows} rows of ")
+    assert len(repr(intensities)) < 100
+
+
 def test_a_set_becomes_arrays_and_comes_back(fitted):
     calset = walop.read(fitted.calset)
     arrays = calset.to_arrays()

@@ -166,9 +166,9 @@ def test_exposures_that_are_not_there(changes, message):
 
 
 def test_exposures_that_say_nothing_of_what_is_wanted(small):
-    """The polariser is indoors: what it sees says nothing of the sky."""
+    """The polariser is indoors: its light has nothing of the sky."""
     indoors = dataclasses.replace(small, choices=small.choices[:1], families=small.families[:1])
-    with pytest.raises(ValueError, match=r"sky.depolarisation: nothing that could .* no moon or standard"):
+    with pytest.raises(ValueError, match=r"sky.depolarisation: no possible exposure .* no moon or standard"):
         plan_from(indoors, 15.0, criterion_by_name(indoors, None, "sky.depolarisation"))
 
 

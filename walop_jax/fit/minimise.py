@@ -10,8 +10,8 @@ Stop        `TOLERANCE`: the scaled gradient d = ‖(JᵀJ)^(−½) Jᵀr‖, th
             (d₋₁: the distance at the place before).
             `ROUGH`: a model that is far from the data (`far_off`) has errors made from its residuals anyway, and is
             near enough with d below this, at the second such place in a row if it may look at another.
-            `ROUNDING`: a step that did not lower the objective is the last where the next could not be told from it.
-            `MAXIMUM_STEPS`: places looked at.
+            `ROUNDING`: a step that did not lower the objective is the last where the next could not be separated from
+            it. `MAXIMUM_STEPS`: places looked at.
 Source      `SOURCE`: the method and its trust region.
 """
 

@@ -197,12 +197,6 @@ class Verdict:
         return tuple(doubt.sentence for doubt in self.against if doubt.sentence)
 
     @property
-    def reason(self) -> str:
-        """The first doubt that forbids the use of a fit, in a sentence; empty of one that is trusted."""
-        blocking = [doubt.sentence for doubt in self.against if doubt.blocking and doubt.sentence]
-        return "" if self.trusted else next(iter([*blocking, *self.warnings]), "not trusted")
-
-    @property
     def doubts(self) -> tuple[str, ...]:
         """The sentences about the residuals alone (`Quality.DOUBTED`)."""
         return tuple(

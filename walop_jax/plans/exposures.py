@@ -51,7 +51,7 @@ from walop_jax.simulation.simulate import (
 
 NODES, NODES_OF_EFFECTS, NODES_OF_PLATE = 7, 13, 25
 """Angles of the polariser at which counts are computed: a series of degree 3 in 2θ, one more than it needs.
-Effects that are to be told apart may depend on θ itself, which takes a whole turn. Beams that cross the plate at an
+Effects that are to be separated may depend on θ itself, which takes a whole turn. Beams that cross the plate at an
 angle make series of degree 12 in 2α."""
 ANGLES = 361
 """Angles over half a turn at which the gain of an exposure is known, as a Fourier series in 2θ.
@@ -74,8 +74,8 @@ class Candidates:
     `families` go with `choices`, their information scaled to the field points of the plan. `values` (draw, parameter)
     are all parameters of the instruments that were drawn, `prior` the information on the free ones beforehand, `names`
     of these. `truncation` is the largest error of the information between the angles that were computed, in units of
-    the mean diagonal of each parameter; `notes` say what had to be left out. `effects` are those that are to be told
-    apart, parameters of the model as well, with whether their size is known.
+    the mean diagonal of each parameter; `notes` say what had to be left out. `effects` are those that are to be
+    separated, parameters of the model as well, with whether their size is known.
     """
 
     available: Available

@@ -23,6 +23,7 @@ def requirements(
 
     The accuracy of a fit that is not trusted is not known: nothing is required of it.
     """
+    blocking = [doubt.sentence for doubt in verdict.against if doubt.blocking and doubt.sentence]
     checks = [
         Requirement(
             "the fit has reached its minimum", verdict.converged, message or "converged",
@@ -30,7 +31,7 @@ def requirements(
         ),
         Requirement(
             "the model explains the data", verdict.trusted,
-            verdict.reason or "trusted",
+            "trusted" if verdict.trusted else [*blocking, *verdict.warnings, "not trusted"][0],
             "walop-jax diagnose looks for missing effects",
         ),
     ]  # fmt: skip

@@ -53,7 +53,7 @@ class WatchedChange(InstrumentChange):
         if not self.rivals:
             return f"{self.best.words()} {when} {significance}"
         either = some([entry.words() for entry in (self.best, *self.rivals)], 5, " or ")
-        return f"{when} {significance}, one of these, which the stars cannot tell apart: {either}"
+        return f"{when} {significance}, one of these, which the stars cannot separate: {either}"
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
