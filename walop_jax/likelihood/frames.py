@@ -262,7 +262,7 @@ def unit_slopes_at(
     likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector
 ) -> Float[np.ndarray, "p e k a"]:
     """Derivatives of the counts for light of unit flux with respect to all parameters, at field positions (deg)."""
-    return _at(_slopes, likelihood, instrument, x, y)
+    return _at(_slopes, likelihood, instrument, x, y)[1]
 
 
 def _at(solve: Any, likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector) -> Any:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
@@ -34,8 +34,6 @@ from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind, effect_by_name
-from walop_jax.model.instrument import Instrument
-from walop_jax.model.plan import Plan
 from walop_jax.model.specification import Model, effect_context, with_effects
 from walop_jax.plans.available import PLATE_TURN, Available, CandidateExposure
 from walop_jax.plans.families import Family, Listed, even_angles, harmonics, highest, spread_angles
@@ -241,11 +239,7 @@ def drawn(model: Model, draws: int, seed: int, around: Calibration | None) -> Fl
     return np.stack(samples)
 
 
-def _unit(instrument: Instrument, plan: Plan, point: engine.PointData) -> tuple[Array, Array]:
-    return engine.point_prediction(instrument, plan, point), engine.unit_slopes(instrument, plan, point)
-
-
-_unit_at = compiled(jax.vmap(_unit, (None, None, 0)), kept_as="unit_counts")
+_unit_at = compiled(jax.vmap(engine.unit_slopes, (None, None, 0)), kept_as="unit_counts")
 
 
 def _responses(
