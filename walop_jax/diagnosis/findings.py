@@ -242,6 +242,11 @@ class Choice:
     left: float
     better_by: float = float("nan")
 
+    @property
+    def gains(self) -> bool:
+        """True if residuals are smaller with the change, by the linear step or by the fit."""
+        return self.left < 1.0 or self.better_by > 0.0
+
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Diagnosis(Drawn):

@@ -115,7 +115,12 @@ class Refits:
                 self.tell(f"trying {effect.name}")
                 trials.append(try_effect(result, effect.neutral(self.context), self.context))
         described, compared = other_descriptions(
-            result, self.context, allowed, self.tell, all_of_them=state.evidence.poor
+            result,
+            self.context,
+            allowed,
+            self.tell,
+            all_of_them=state.evidence.poor,
+            earlier=state.choices,
         )
         return [*trials, *described], {**state.choices, **compared}
 
