@@ -185,6 +185,6 @@ def fringes_of(change: Change) -> Iterator[Sentence]:
     return (sentence for _, sentence in change if sentence.kind == "fringes")
 
 
-def said_by(probe: Probe) -> tuple[str, ...]:
+def sentences_of(probe: Probe) -> tuple[str, ...]:
     """The sentences of a group."""
     return tuple(text for member in probe.group for text in member.sentences)  # type: ignore[attr-defined]

@@ -94,7 +94,7 @@ class _Single(NamedTuple):
     """
 
     candidate: Candidate
-    said: Callable[[Score], str]
+    worded: Callable[[Score], str]
     plausible: float | Float[np.ndarray, " _"] = 0.0
     unit: str = ""
     shown_by: str = ""
@@ -172,7 +172,7 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     # Of an element and one of its numbers alone, the shorter statement if it explains as much.
     likely = [item for item in likely if not any(_holds(item, rival) for rival in likely)]
     likely.sort(key=lambda item: (item.rank, item.log_p))  # a mistake of one number before sixteen
-    wordings = {item.candidate.name: item.said for item in rivals}
+    wordings = {item.candidate.name: item.worded for item in rivals}
     causes = "; or for ".join(wordings[score.name](score) for score in likely[: thresholds.SHOWN])
     further = f"; or for {len(likely) - thresholds.SHOWN} others" if len(likely) > thresholds.SHOWN else ""
     p = corrected_p(best.log_p, len(scores))
