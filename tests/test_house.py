@@ -193,7 +193,7 @@ MOST_LINES = {
     "calibration": 2845,
     "posterior": 2380,
     "science": 6420,
-    "diagnosis": 8190,
+    "diagnosis": 8110,
     "nights": 2810,
     "plans": 2380,
     "paper": 870,

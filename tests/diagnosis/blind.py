@@ -29,7 +29,7 @@ from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.examination import Evidence, Examination, common_mode, examine
-from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, probes, said_by
+from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, probes, sentences_of
 from walop_jax.diagnosis.score import ScoreSpace, separations
 from walop_jax.diagnosis.search import State, search
 from walop_jax.fit.base_model import base_model
@@ -201,7 +201,7 @@ class Blind:
         self.sentences = examination.sentences
         self.probes = list(examination.probes)
         self.in_sentences = {p.name: set(p.group[0].in_sentences(model.template)) for p in self.probes}
-        texts = [text for probe in self.sentences for text in said_by(probe)]
+        texts = [text for probe in self.sentences for text in sentences_of(probe)]
         self.in_sentences |= {name: truth_of(name, texts) for name in OUTSIDE}
         self.effect_of = {p.name: p.effect.name for p in self.probes}
         self.space = examination.bare
@@ -213,7 +213,9 @@ class Blind:
         self.said = {
             text: column
             for probe in self.sentences
-            for text, column in zip(said_by(probe), examination.candidates[probe.name].columns.T, strict=True)
+            for text, column in zip(
+                sentences_of(probe), examination.candidates[probe.name].columns.T, strict=True
+            )
         }
         for name, shape in outside(examination.design.measured, self.said):
             column = examination.design.projector(examination.design.stacked([shape[:, None]])[:, 0])

@@ -12,7 +12,7 @@ from scipy import stats
 from walop_jax.data.records import Position
 from walop_jax.diagnosis import dependences, grammar, thresholds
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.hypotheses import all_candidates, applicable, probes, said_by
+from walop_jax.diagnosis.hypotheses import all_candidates, applicable, probes, sentences_of
 from walop_jax.diagnosis.score import ScoreSpace, ScoreTable
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
@@ -177,7 +177,7 @@ def test_every_description_can_be_made(name):
     exposures = dataclasses.replace(TURNING, instrument=name).exposures()
     every = grammar.sentences(instrument, exposures, 20)
     for probe in every:
-        for text in said_by(probe):
+        for text in sentences_of(probe):
             Change.parsed(text).check_factors(instrument)
     assert {*COMBINED, *ALSO} <= {probe.name for probe in every}
 

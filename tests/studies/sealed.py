@@ -438,7 +438,8 @@ def outcome(number: int, options: argparse.Namespace) -> Outcome:
     trusted = found.after.trusted and found.verdict != "unexplained"
     after = judged(found.calibration(), trusted, one)
     names = ", ".join(
-        step.effect if not step.told else "; ".join(c.text for c, *_ in step.told) for step in found.steps
+        step.effect if not step.descriptions else "; ".join(c.text for c, *_ in step.descriptions)
+        for step in found.steps
     )
     verdict = f"{found.verdict} {names}".strip()
     return Outcome(

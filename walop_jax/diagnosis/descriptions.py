@@ -7,13 +7,15 @@
 2. The few that leave least are fitted, all parameters with them, and other curves of dispersion in any case: plates
    grow to make up for those, by more than one step can tell. Their evidence against the description given is half
    the gain in χ² less the logarithm of the number of changes that were looked at.
+3. A change that gained nothing is not compared again once names have joined the model: these explain a part of the
+   misfit, and leave less for it to explain.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -52,16 +54,25 @@ def other_descriptions(
     tell: Callable[[str], None],
     *,
     all_of_them: bool = True,
+    earlier: Mapping[str, Choice] | None = None,
 ) -> tuple[list[Trial], dict[str, Choice]]:
-    """Changes of the description of a fit, by name: all are compared, the best of them fitted while `fits` allows."""
-    template = dataclasses.replace(result.model.template, effects=())
+    """Changes of the description of a fit, by name: all are compared, the best of them fitted while `fits` allows.
+
+    `earlier` are those that were compared before the last names joined the model.
+    """
+    template, hopeless = dataclasses.replace(result.model.template, effects=()), set[str]()
     if OtherDescription.name in result.model.effect_names:
         template = result.model.template.effect(OtherDescription.name).patch(template)
+    else:
+        hopeless = {choice.change for choice in (earlier or {}).values() if not choice.gains}
     curves = other_curves(template)
     # What is turned, exchanged or left out changes the light by per cents: nothing of that kind is a small misfit.
     sentences = tuple(alternatives(template)) if all_of_them else curves
-    tell(f"comparing {len(sentences)} other descriptions")
-    candidates = itertools.takewhile(lambda _: fits(), sentences)
+    asked = [sentence for sentence in sentences if sentence not in hopeless]
+    if not asked:
+        return [], {}
+    tell(f"comparing {len(asked)} other descriptions")
+    candidates = itertools.takewhile(lambda _: fits(), asked)
     screened = sorted(_screened(result, candidates, context), key=lambda item: item[0].left)
     compared, trials = {choice.change: choice for choice, _, _ in screened}, []
     best = [item for item in screened if item[1] > thresholds.LEAST_GAIN][: thresholds.MOST_FITTED]

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.hypotheses import Ranked, said_by
+from walop_jax.diagnosis.hypotheses import Ranked, sentences_of
 from walop_jax.diagnosis.score import SCALES, log_bayes
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
@@ -33,7 +33,7 @@ class Trial:
     evidence, or of which a part would do, `nameless` sentences that are not improbable beside it. `predicts` is False
     where its linear step does not predict held-out data, `compared` holds the comparison of two fits
     (`predictions.before_and_after`), `against` the KINDs of exposures that contradict it, `refused` the reason for
-    which it was not added, `said` the groups of sentences that were added one after the other.
+    which it was not added, `groups` the groups of sentences that were added one after the other.
     """
 
     effect: EffectKind
@@ -50,7 +50,7 @@ class Trial:
     compared: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     against: str = ""
     refused: str = ""
-    said: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -73,7 +73,7 @@ class Trial:
         if self.effect is not Described:
             return ()
         if self.fit is None:
-            return () if self.item is None else said_by(self.item.probe)
+            return () if self.item is None else sentences_of(self.item.probe)
         return self.instance.sentences  # type: ignore[attr-defined]
 
 

@@ -25,7 +25,7 @@ from scipy import special
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Design, number_of_columns, strata
-from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, all_candidates, said_by
+from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, all_candidates, sentences_of
 from walop_jax.diagnosis.score import (
     Candidate,
     Score,
@@ -137,7 +137,7 @@ class Evidence:
         return rank(self.table, self.probes)
 
     @cached_property
-    def told(self) -> list[Ranked]:
+    def ranked_sentences(self) -> list[Ranked]:
         """Sentences in order of evidence, each less the logarithm of their number."""
         price = float(np.log(max(len(self.sentences), 1)))  # all of them share the prior of one name
         scored = [(probe, self.table[probe.name]) for probe in self.sentences]
@@ -154,7 +154,7 @@ class Evidence:
     @cached_property
     def significant_sentences(self) -> list[Ranked]:
         """Sentences that are significant by themselves, best evidence first."""
-        return [r for r in self.told if self.table.corrected(r.score) < thresholds.ALARM]
+        return [r for r in self.ranked_sentences if self.table.corrected(r.score) < thresholds.ALARM]
 
     @property
     def alarm(self) -> bool:
@@ -289,8 +289,10 @@ class Evidence:
         least, apart = max(0.0, item.log_bayes - thresholds.IMPROBABLE), self.apart(item)
         length, limit = len(item.score.amplitudes), thresholds.SEPARATION * self.floor
         alike = {p.name for p in self.sentences if len(p.widths) <= length and apart[p.name] < limit}
-        rivals = [r for r in self.told if r.log_bayes > least or r.probe.name in alike]
-        rivals = [r for r in rivals if r.probe is not item.probe and not set(own) & set(said_by(r.probe))]
+        rivals = [r for r in self.ranked_sentences if r.log_bayes > least or r.probe.name in alike]
+        rivals = [
+            r for r in rivals if r.probe is not item.probe and not set(own) & set(sentences_of(r.probe))
+        ]
         return tuple(r.probe.name for r in rivals[: thresholds.MOST_CLASSES])
 
     def held_in_part(self, item: Ranked) -> tuple[str, ...]:

@@ -170,8 +170,8 @@ class Step:
     effect that explain the data as well. `equivalent` are the effects indistinguishable from it in this data set,
     `separation` is the distance (σ) of each rival from it. `residual_before` and `residual_after` are the residuals
     (data − model, in standard deviations as given; point, exposure, camera) without and with the effect at the time it
-    was added; where another name has been dropped since, they and χ² are of fits without that name. `told` are the
-    sentences of an effect without a name (`described`) with amplitude and error, `nameless` those that are not
+    was added; where another name has been dropped since, they and χ² are of fits without that name. `descriptions` are
+    the sentences of an effect without a name (`described`) with amplitude and error, `nameless` those that are not
     improbable in addition to what was found.
     """
 
@@ -195,7 +195,7 @@ class Step:
     separation: dict[str, float] = dataclasses.field(default_factory=dict)
     separated_by: str = ""
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
-    told: tuple[tuple[Change, float, float], ...] = ()
+    descriptions: tuple[tuple[Change, float, float], ...] = ()
     nameless: tuple[str, ...] = ()
     residual_before: Cube = dataclasses.field(default_factory=_no_cube)
     residual_after: Cube = dataclasses.field(default_factory=_no_cube)
@@ -241,6 +241,11 @@ class Choice:
     change: str
     left: float
     better_by: float = float("nan")
+
+    @property
+    def gains(self) -> bool:
+        """True if residuals are smaller with the change, by the linear step or by the fit."""
+        return self.left < 1.0 or self.better_by > 0.0
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -372,10 +377,10 @@ class Diagnosis(Drawn):
         )
 
 
-# --------------------------------------------------------------------------------- sentences, told to people
+# --------------------------------------------------------------------------------- descriptions
 
 
-def told(result: FitResult) -> tuple[tuple[Change, float, float], ...]:
+def descriptions_of(result: FitResult) -> tuple[tuple[Change, float, float], ...]:
     """The sentences of a fitted model, each with its amplitude and standard error."""
     if Described.name not in result.model.effect_names:
         return ()
@@ -422,7 +427,7 @@ def _step(step: Step) -> dict[str, Any]:
     near = sorted(step.separation.items(), key=lambda s: s[1])
     return {name: getattr(step, name) for name in _AS_THEY_ARE} | {
         "parameters": {n: {"value": v, "sigma": s, "unit": unit} for n, (v, s, unit) in entries.items()},
-        "sentences": [_sentence(*entry) for entry in step.told],
+        "sentences": [_sentence(*entry) for entry in step.descriptions],
         "change_of_qu": step.change_of_qu,
         "robust_error_ratio": step.robust_ratio,
         "separation_sigma": {name: value for name, value in near if math.isfinite(value)},

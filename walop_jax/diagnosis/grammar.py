@@ -34,7 +34,7 @@ from walop_jax.diagnosis.dependences import (
     starts_of_steps,
     varies,
 )
-from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, applicable, probes, said_by
+from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, applicable, probes, sentences_of
 from walop_jax.model.effects import Context, Described, EffectKind
 from walop_jax.model.effects.change import BAND, KINDS, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
@@ -94,7 +94,7 @@ def beside_names(
                 effects_as_sentences.append((texts, effect))
     alone, partial = [], []
     for probe in all_probes:
-        texts_of_probe = frozenset(said_by(probe))
+        texts_of_probe = frozenset(sentences_of(probe))
         holders = frozenset(effect for texts, effect in effects_as_sentences if texts > texts_of_probe)
         if any(texts == texts_of_probe for texts, _ in effects_as_sentences):
             continue

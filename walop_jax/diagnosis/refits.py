@@ -21,7 +21,7 @@ from walop_jax.diagnosis.exact import (
 )
 from walop_jax.diagnosis.examination import Examination, examine, shortest
 from walop_jax.diagnosis.findings import Choice
-from walop_jax.diagnosis.hypotheses import Hypotheses, Ranked, said_by
+from walop_jax.diagnosis.hypotheses import Hypotheses, Ranked, sentences_of
 from walop_jax.diagnosis.predictions import before_and_after, gains_by_kind, predicts_unseen
 from walop_jax.diagnosis.search import State, names_first
 from walop_jax.fit.refit import FitResult, fit
@@ -84,9 +84,9 @@ class Refits:
             refitted = try_shapes(evidence.result, item, self.context, shapes)
         return dataclasses.replace(refitted, item=item, linear=trial.linear)
 
-    def _with_best_times(self, evidence: Examination, said: Described) -> Described:
+    def _with_best_times(self, evidence: Examination, description: Described) -> Described:
         """A description that starts or stops in time, where it explains most by linear steps; any other as it is."""
-        ((change, amplitude), *further) = said.terms()
+        ((change, amplitude), *further) = description.terms()
         result = evidence.result
         for end in (0, 1) if not further else ():
             if times := grammar.retimed(change, result.calset.exposures, end):
@@ -95,11 +95,11 @@ class Refits:
                 along, square = c.T @ evidence.design.residual, np.sum(c**2, axis=0)
                 best = int(np.argmax(along**2 / np.where(square > 0, square, np.inf)))
                 change, amplitude = times[best], -along[best] / square[best]
-        return said if further else Described.saying([change.text], [float(amplitude)])
+        return description if further else Described.saying([change.text], [float(amplitude)])
 
     def _hopeful(self, evidence: Examination, item: Ranked) -> bool:
         """True if a sentence predicts held-out data by its linear step: it has no name that would support it."""
-        single = any("exposure" in text for text in said_by(item.probe))
+        single = any("exposure" in text for text in sentences_of(item.probe))
         column = [evidence.candidates[item.probe.name]]
         return predicts_unseen(evidence.design, column, thresholds.HOPEFUL, of_states=not single)
 
@@ -115,7 +115,12 @@ class Refits:
                 self.tell(f"trying {effect.name}")
                 trials.append(try_effect(result, effect.neutral(self.context), self.context))
         described, compared = other_descriptions(
-            result, self.context, allowed, self.tell, all_of_them=state.evidence.poor
+            result,
+            self.context,
+            allowed,
+            self.tell,
+            all_of_them=state.evidence.poor,
+            earlier=state.choices,
         )
         return [*trials, *described], {**state.choices, **compared}
 
@@ -170,8 +175,8 @@ class Refits:
             compared |= {
                 key: earlier.compared[key] for key in ("chi2_before", "heldout_before", "residual_before")
             }
-            groups = (*earlier.said, *groups)
-        step = dataclasses.replace(trial, compared=compared, said=groups)
+            groups = (*earlier.groups, *groups)
+        step = dataclasses.replace(trial, compared=compared, groups=groups)
         self.tell(f"added {name}; scoring the residuals")
         return self.adopt(state, result, [*steps, step])
 

@@ -31,15 +31,15 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
     state, remainder = _leftover(first, prune(first, state, judge), judge)
     if state.steps and (worse := _worse(first.evidence, state.evidence)):
         return _not_adopted(first, state, worse)
-    said = _descriptions(state)
+    added = _descriptions(state)
     if remainder is not None:
-        against = tuple(text for name, text in _contradicted(state).items() if name not in said)
+        against = tuple(text for name, text in _contradicted(state).items() if name not in added)
         return state, dataclasses.replace(remainder, parts=(*remainder.parts, *against))
-    if len(said) <= thresholds.MOST_SENTENCES:
+    if len(added) <= thresholds.MOST_SENTENCES:
         return state, None
-    text = f"{len(said)} descriptions were needed: they show its place, no single one its nature"
-    remainder = Unexplained(state.evidence.table.p_global, f"{text} ({' | '.join(said)})", ())
-    columns = [first.evidence.candidates[name] for name in said]
+    text = f"{len(added)} descriptions were needed: they show its place, no single one its nature"
+    remainder = Unexplained(state.evidence.table.p_global, f"{text} ({' | '.join(added)})", ())
+    columns = [first.evidence.candidates[name] for name in added]
     if predicts_unseen(first.evidence.design, columns, thresholds.USEFUL):
         return state, remainder
     state = _without(first, state, [Described.name], judge)
@@ -227,7 +227,7 @@ def _contradicted(state: State) -> dict[str, str]:
 
 def _descriptions(state: State) -> tuple[str, ...]:
     """Names of the added groups of sentences."""
-    return tuple(name for step in state.steps for name in step.said)
+    return tuple(name for step in state.steps for name in step.groups)
 
 
 _LEFT_OUT = (

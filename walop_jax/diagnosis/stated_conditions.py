@@ -50,10 +50,7 @@ _LEVELS = "exposures at a second light level"
 _DARK = "bias and dark frames"
 _ONE_STAR = "a bright star in one beam: its light in the other cameras"
 _PLACES = {"x", "gap"}  # shapes of which there are so many that an effect is as good as a pattern
-_PRECESSION = (
-    46.124 / 3600.0,
-    20.043 / 3600.0,
-)  # deg a year: m, n, Capitaine et al. 2003, A&A 412, 567, J2000
+_PRECESSION = 46.124 / 3600.0, 20.043 / 3600.0  # deg a year, m, n, J2000: Capitaine et al. 2003, A&A 412, 567
 STEP = 1e-4  # of the width: the error of the derivative is its square
 
 
@@ -97,7 +94,7 @@ class _Single(NamedTuple):
     """
 
     candidate: Candidate
-    said: Callable[[Score], str]
+    worded: Callable[[Score], str]
     plausible: float | Float[np.ndarray, " _"] = 0.0
     unit: str = ""
     shown_by: str = ""
@@ -175,7 +172,7 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     # Of an element and one of its numbers alone, the shorter statement if it explains as much.
     likely = [item for item in likely if not any(_holds(item, rival) for rival in likely)]
     likely.sort(key=lambda item: (item.rank, item.log_p))  # a mistake of one number before sixteen
-    wordings = {item.candidate.name: item.said for item in rivals}
+    wordings = {item.candidate.name: item.worded for item in rivals}
     causes = "; or for ".join(wordings[score.name](score) for score in likely[: thresholds.SHOWN])
     further = f"; or for {len(likely) - thresholds.SHOWN} others" if len(likely) > thresholds.SHOWN else ""
     p = corrected_p(best.log_p, len(scores))
@@ -382,11 +379,8 @@ def _stated(calset: CalibrationSet) -> Iterator[_Stated]:
             counts = table.counts - share * sky
             return dataclasses.replace(calset, intensities=dataclasses.replace(table, counts=counts))
 
-        what, shown_by = (
-            "the light of the sky that is left, in units of SKY,",
-            "the same stars under another sky",
-        )
-        yield _Stated(what, "", "subtract the sky anew", shown_by, 0.1, less, 0.0)
+        what, remedy = "the light of the sky that is left, in units of SKY,", "subtract the sky anew"
+        yield _Stated(what, "", remedy, "the same stars under another sky", 0.1, less, 0.0)
 
 
 def _moved(
@@ -424,26 +418,22 @@ def _of_sky(calset: CalibrationSet) -> Iterator[_Stated]:
             moved = functools.partial(_moved, calset, moon, name.lower(), 1.0)
             yield _Stated(f"{name} of sky exposures", unit, remedy, shown_by, width, moved)
         for name, width in (("longitude", 180.0), ("latitude", 90.0)):
-            coordinate = float(getattr(site, name))
-
-            def elsewhere(step: float, name: str = name, coordinate: float = coordinate) -> CalibrationSet:
-                moved = (
-                    float(np.clip(coordinate + step, -90.0, 90.0))
-                    if name == "latitude"
-                    else coordinate + step
-                )
-                return dataclasses.replace(calset, site=dataclasses.replace(site, **{name: moved}))
-
+            elsewhere = functools.partial(_at_site, calset, name)
             remedy, shown_by = "check the site in the header", "the position of the telescope on a map"
-            yield _Stated(f"the {name} of the site", "deg", remedy, shown_by, width, elsewhere, coordinate)
+            value = float(getattr(site, name))
+            yield _Stated(f"the {name} of the site", "deg", remedy, shown_by, width, elsewhere, value)
     for kind in np.unique(e.kind[np.isfinite(e.rotator)]):
         remedy = "check its zero and its sense (docs: conventions)"
         moved = functools.partial(_moved, calset, e.kind == kind, "rotator", 1.0)
-        what, shown_by = (
-            f"ROTATOR of exposures of kind {kind}",
-            "polarised standards at several ROTATOR angles",
-        )
-        yield _Stated(what, "deg", remedy, shown_by, 45.0, moved)
+        shown_by = "polarised standards at several ROTATOR angles"
+        yield _Stated(f"ROTATOR of exposures of kind {kind}", "deg", remedy, shown_by, 45.0, moved)
+
+
+def _at_site(calset: CalibrationSet, name: str, step: float) -> CalibrationSet:
+    """The set with a site farther in longitude or latitude, up to the pole."""
+    value, limit = float(getattr(calset.site, name)) + step, 90.0 if name == "latitude" else np.inf
+    site = dataclasses.replace(calset.site, **{name: float(np.clip(value, -limit, limit))})
+    return dataclasses.replace(calset, site=site)
 
 
 def _of_field(calset: CalibrationSet) -> Iterator[_Stated]:

@@ -28,7 +28,15 @@ from walop_jax.diagnosis.class_product import only_a_class, with_average
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
 from walop_jax.diagnosis.examination import Examination, most_points
-from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained, describe, told
+from walop_jax.diagnosis.findings import (
+    Choice,
+    Diagnosis,
+    Outcome,
+    Step,
+    Unexplained,
+    describe,
+    descriptions_of,
+)
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.diagnosis.readings import mixups_of, refusal
@@ -113,7 +121,7 @@ def diagnose(
     verdict: Outcome = "unexplained" if remainder else "effect_found" if steps else "consistent"
     tell("examining the residuals")
     alike = {name for step in steps for name in (*step.equivalent, *step.nameless)} - {Described.name}
-    groups = [name for step in state.steps for name in step.said]
+    groups = [name for step in state.steps for name in step.groups]
     diagnosis = Diagnosis(
         verdict=verdict,
         steps=steps,
@@ -209,7 +217,7 @@ def _finished(trial: Trial, evidence: Examination, context: Context, added: Sequ
         nameless=trial.nameless,
         alternatives=trial.alternatives,
         **trial.compared,
-        told=told(result) if name == Described.name else (),
+        descriptions=descriptions_of(result) if name == Described.name else (),
         far=beyond_prior(result, name),
         choices=spoken_choices(effect),
         robust_ratio=evidence.design.robust_ratio(name),

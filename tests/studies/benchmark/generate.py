@@ -35,7 +35,7 @@ from walop_jax.data.records import Block, CalibrationSet, Points  # noqa: E402
 from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
 from walop_jax.diagnosis.design import Measured, strata  # noqa: E402
 from walop_jax.diagnosis.examination import Examination, examine  # noqa: E402
-from walop_jax.diagnosis.hypotheses import Hypotheses, all_candidates, said_by  # noqa: E402
+from walop_jax.diagnosis.hypotheses import Hypotheses, all_candidates, sentences_of  # noqa: E402
 from walop_jax.diagnosis.score import ABSORBED, FAINTEST  # noqa: E402
 from walop_jax.fit.refit import FitResult  # noqa: E402
 from walop_jax.likelihood.columns import Columns  # noqa: E402
@@ -155,7 +155,7 @@ def hidden(
     single = {
         text: column
         for probe in blind.sentences
-        for text, column in zip(said_by(probe), named[probe.name].T, strict=True)
+        for text, column in zip(sentences_of(probe), named[probe.name].T, strict=True)
     }
     nothing = np.zeros(len(layout.design.residual)), np.zeros(int((~layout.inside).sum()))
     for _ in range(nulls):
