@@ -137,15 +137,21 @@ def comparison(effect: str, size: float = 6.0) -> ResidualComparison:
         effect=effect,
         combination="cos(3 theta - 57 deg), theta the polariser angle",
         harmonic=3,
-        before=before,
-        after=after,
-        mean_before=0.1 * before,
-        mean_after=0.1 * after,
-        rms_before=np.abs(before) + 0.9,
-        rms_after=np.full((9, 4), 0.9),
-        curve_before=wave,
-        curve_error=np.full((8, 4), 0.05),
-        curve_after=np.zeros((8, 4)),
+        field={
+            "BEFORE": before,
+            "AFTER": after,
+            "EXPLAINED": before - after,
+            "MEAN_BEFORE": 0.1 * before,
+            "MEAN_AFTER": 0.1 * after,
+            "RMS_BEFORE": np.abs(before) + 0.9,
+            "RMS_AFTER": np.full((9, 4), 0.9),
+        },
+        curves={
+            "BEFORE": wave,
+            "ERROR": np.full((8, 4), 0.05),
+            "AFTER": np.zeros((8, 4)),
+            "EXPLAINED": wave,
+        },
     )
 
 

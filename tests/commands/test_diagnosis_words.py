@@ -33,7 +33,7 @@ def found() -> Diagnosis:
         equivalent=("clp_zero",),
         separated_by="a polarised standard",
         where={"kind": "clp 100%"},
-        told=((Change.parsed("turn of polariser * x"), 0.1, 0.01),),
+        descriptions=((Change.parsed("turn of polariser * x"), 0.1, 0.01),),
         nameless=("a step of the polariser in exposure 4",),
         alternatives=("camera = 2",),
     )

@@ -72,7 +72,7 @@ def scene(hiding: Hiding, name: str, ratio: float) -> dict[str, object] | None:
         "effect": name,
         "verdict": found.verdict,
         "steps": [s.effect for s in found.steps],
-        "said": [change.text for s in found.steps for change, _, _ in s.told],
+        "said": [change.text for s in found.steps for change, _, _ in s.descriptions],
         "without": without**0.5,
         "told": told**0.5,
         "known": known**0.5,

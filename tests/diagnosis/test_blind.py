@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.linalg import orth
 
-from walop_jax.diagnosis.hypotheses import said_by
+from walop_jax.diagnosis.hypotheses import sentences_of
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -25,10 +25,10 @@ def test_shapes_are_what_their_sentences_say(blind):
     for name, shape in suite.outside(design.measured, said):
         column = design.projector(design.stacked([shape[:, None]])[:, 0])
         texts = suite.truth_of(name, said)
-        groups = [probe.name for probe in blind.sentences if texts & set(said_by(probe))]
+        groups = [probe.name for probe in blind.sentences if texts & set(sentences_of(probe))]
         whole = [said[text][:, None] for text in suite.OUTSIDE[name] if text in said]
         some = [
-            *(blind.evidence.said[group].columns for group in groups),
+            *(blind.evidence.candidates[group].columns for group in groups),
             *([np.hstack(whole)] if whole else []),
         ]
         held = [

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import PLAN
+from small_run import small_fit
 
 from walop_jax.diagnosis.descriptions import other_descriptions
 from walop_jax.diagnosis.findings import Choice, document
@@ -69,6 +70,19 @@ def test_a_turned_wedge_bends_light_to_where_it_points(south, turn):
 def test_a_sentence_that_the_instrument_has_no_place_for_names_the_nearest(south):
     with pytest.raises(ValueError, match=r"half1\.wedge turned by 90 deg"):
         changed(south, "half1.wedge turned by 91 deg")
+
+
+def test_a_change_that_gained_nothing_is_not_compared_again():
+    """Once names have joined the model; one that did gain is, whatever its linear step leaves."""
+    result = small_fit()
+    context, told = effect_context(result.model.template, result.calset.exposures), []
+    earlier = {change: Choice(change, 2.0, -5.0) for change in alternatives(result.model.template)}
+    asked = result, context, lambda: False, told.append
+    assert other_descriptions(*asked, earlier=earlier) == ([], {})
+    assert not told
+    earlier |= {TURNED: Choice(TURNED, 2.0, 30.0), REVERSED: Choice(REVERSED, 0.5)}
+    other_descriptions(*asked, earlier=earlier)
+    assert told == ["comparing 2 other descriptions"]
 
 
 def test_it_is_an_effect_like_any_other_once_it_is_in_a_model(south):

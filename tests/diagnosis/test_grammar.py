@@ -12,7 +12,7 @@ from scipy import stats
 from walop_jax.data.records import Position
 from walop_jax.diagnosis import dependences, grammar, thresholds
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.hypotheses import all_candidates, applicable, probes, said_by
+from walop_jax.diagnosis.hypotheses import all_candidates, applicable, probes, sentences_of
 from walop_jax.diagnosis.score import ScoreSpace, ScoreTable
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
@@ -177,7 +177,7 @@ def test_every_description_can_be_made(name):
     exposures = dataclasses.replace(TURNING, instrument=name).exposures()
     every = grammar.sentences(instrument, exposures, 20)
     for probe in every:
-        for text in said_by(probe):
+        for text in sentences_of(probe):
             Change.parsed(text).check_factors(instrument)
     assert {*COMBINED, *ALSO} <= {probe.name for probe in every}
 
@@ -211,6 +211,21 @@ def test_a_pattern_that_grows_is_found(turning, hidden):
     assert table[hidden].log_bayes > best.log_bayes - thresholds.IMPROBABLE
     error = table[hidden].amplitudes + amplitudes  # those of the residuals, with the other sign
     assert error @ space.gram[at, at] @ error < stats.chi2.isf(1e-6, len(error))
+
+
+@pytest.mark.parametrize(("second", "asked"), [(3.0, False), (24.0, True)])
+def test_the_time_since_the_beginning_of_a_night_is_asked_of_several_nights(second, asked):
+    exposures = builders.exposures(
+        *(
+            {"kind": "moon", "mjd": 61000.0 + (begin + hour) / 24.0}
+            for begin in (0.0, second)
+            for hour in (0, 1, 2)
+        )
+    )
+    said = [
+        p.group[0].sentences[0] for p in grammar.sentences(nominal_instrument("WALOP-SOUTH"), exposures, 25)
+    ]
+    assert ("added polarisation q ahead of polariser * night hours" in said) == asked
 
 
 def test_steps_part_the_exposures_evenly_and_are_dated_between():

@@ -103,7 +103,7 @@ def test_a_plate_that_slips_is_told_with_its_time():
     """Half-wave plates turn polarisation by twice what they turn: a polariser turned the other way does the same."""
     found = diagnosed(bench(slip=0.3))
     (step,) = found.steps
-    ((change, value, sigma),) = step.told
+    ((change, value, sigma),) = step.descriptions
     start = float(re.fullmatch(r"hours (\S+) to \S+", change.factors[0])[1])
     assert start == pytest.approx((SLIPPED - 0.5) * MINUTES / 60.0, abs=1e-3)
     others = " ".join((change.text, *step.nameless))
@@ -125,7 +125,7 @@ def test_a_balance_that_differs_between_filters_is_told_at_a_single_field_point(
     """Gains of the two beams that change with wavelength are a diattenuation ahead of the analyser."""
     found = diagnosed(bench(1, balance={"B": 1.01, "V": 1.02, "R": 1.03}), degree=0)
     (step,) = found.steps
-    ((change, value, sigma),) = step.told
+    ((change, value, sigma),) = step.descriptions
     assert change.text == "diattenuation q behind hwp * colour"
     assert value == pytest.approx(0.02 / 2.0 / ((0.65 - 0.44) / 0.62), abs=4.0 * sigma)
     assert found.verdict == "effect_found"

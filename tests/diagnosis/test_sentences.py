@@ -58,7 +58,7 @@ def test_a_film_whose_axis_turns_over_the_field():
     result = found([Described.saying(["turn of polariser * x"], [0.05])])
     assert result.verdict == "effect_found"
     assert [step.effect for step in result.steps] == ["described"]
-    ((change, value, sigma),) = result.steps[0].told
+    ((change, value, sigma),) = result.steps[0].descriptions
     assert (change.kind, change.where, change.place) == ("turn", "of", "polariser")
     assert change.text == "turn of polariser * x"
     assert value == pytest.approx(0.05, abs=4 * sigma)
@@ -70,7 +70,7 @@ def test_an_encoder_error_twice_per_turn():
     """Its mimic to first order is polarisation of the telescope: told apart, or told as a class."""
     result = found([Described.saying(["turn of polariser * sin 2 CLP"], [0.08])])
     step = result.steps[0]
-    said = {change.text for change, _, _ in step.told} | {
+    said = {change.text for change, _, _ in step.descriptions} | {
         t for text in step.nameless for t in text.split("; ")
     }
     assert "turn of polariser * sin 2 CLP" in said
@@ -82,7 +82,7 @@ def test_halves_that_are_vignetted_differently():
     result = found([Vignetting()])
     names = {step.effect for step in result.steps}
     assert names <= {"described"}
-    places = {f"{change.where} {change.place}" for step in result.steps for change, _, _ in step.told}
+    places = {f"{change.where} {change.place}" for step in result.steps for change, _, _ in step.descriptions}
     assert result.verdict == "unexplained" or places == {"of half1"} or places == {"of half2"}
 
 

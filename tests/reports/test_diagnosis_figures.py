@@ -20,14 +20,16 @@ def tiles(figure) -> list[PatchCollection]:
 def test_residual_maps_share_one_symmetric_scale():
     data = handmade_run.figure_data()
     one = data.comparisons[1]
-    figure = figures.residual_maps(data.points, {"before": one.before, "after": one.after}, data.cameras)
+    figure = figures.residual_maps(
+        data.points, {"before": one.field["BEFORE"], "after": one.field["AFTER"]}, data.cameras
+    )
     maps = tiles(figure)
     assert len(maps) == 8
     # The largest residual by hand: −6 in camera E2, without the effect.
     assert {shown.get_clim() for shown in maps} == {(-6.0, 6.0)}
     for k in range(4):
-        np.testing.assert_array_equal(maps[k].get_array(), one.before[:, k])
-        np.testing.assert_array_equal(maps[4 + k].get_array(), one.after[:, k])
+        np.testing.assert_array_equal(maps[k].get_array(), one.field["BEFORE"][:, k])
+        np.testing.assert_array_equal(maps[4 + k].get_array(), one.field["AFTER"][:, k])
     signs = [
         [text.get_text() for text in axis.texts if len(text.get_text()) == 1] for axis in figure.axes[:8]
     ]
@@ -36,7 +38,7 @@ def test_residual_maps_share_one_symmetric_scale():
 
 def test_points_without_data_are_left_out():
     data = handmade_run.figure_data()
-    before = data.comparisons[1].before.copy()
+    before = data.comparisons[1].field["BEFORE"].copy()
     before[4] = np.nan
     shown = tiles(figures.residual_maps(data.points, {"": before}, data.cameras))[0]
     assert len(shown.get_array()) == 8
@@ -54,9 +56,9 @@ def test_signature_lies_beside_the_data(harmonic, abscissa):
     assert figure.axes[4].get_xlabel() == abscissa
     for k, axis in enumerate(figure.axes[:4]):
         effect = next(line for line in axis.lines if line.get_label() == "effect")
-        np.testing.assert_allclose(effect.get_ydata(), one.curve_explained[:, k])
+        np.testing.assert_allclose(effect.get_ydata(), one.curves["EXPLAINED"][:, k])
         dots = axis.containers[0].lines[0]
-        np.testing.assert_allclose(dots.get_ydata(), one.curve_before[:, k])
+        np.testing.assert_allclose(dots.get_ydata(), one.curves["BEFORE"][:, k])
         x = 22.5 * np.arange(8) if harmonic > 0 else 0.24 * np.arange(8)
         np.testing.assert_allclose(dots.get_xdata(), x, atol=1e-6)
 
@@ -69,14 +71,16 @@ def test_exposures_at_one_angle_are_averaged():
     )
     dots = figure.axes[0].containers[0].lines[0]
     np.testing.assert_allclose(
-        dots.get_ydata(), data.comparisons[1].curve_before[:, 0].reshape(4, 2).mean(axis=1)
+        dots.get_ydata(), data.comparisons[1].curves["BEFORE"][:, 0].reshape(4, 2).mean(axis=1)
     )
 
 
 def test_two_cameras_fill_two_columns():
     data = handmade_run.figure_data()
     one = data.comparisons[1]
-    figure = figures.residual_maps(data.points, {"before": one.before[:, :2]}, ("ordinary", "extraordinary"))
+    figure = figures.residual_maps(
+        data.points, {"before": one.field["BEFORE"][:, :2]}, ("ordinary", "extraordinary")
+    )
     assert [axis.get_title() for axis in figure.axes[:2]] == ["ordinary", "extraordinary"]
     assert len(tiles(figure)) == 2
     assert len(figures.signature_figure(one, data.exposures, data.cameras[:2]).axes) == 4

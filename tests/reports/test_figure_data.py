@@ -66,9 +66,9 @@ def test_a_pattern_that_changes_sign_over_the_field_does_not_average_out():
     rms = np.sqrt(np.mean(FIELD**2))
     # Camera by camera the weights have rms 1 and the sign of the pattern: the mean of 5 · FIELD is 5 · rms.
     expected = 5.0 * rms * wave[:, None] * np.abs(CAMERAS[:3])
-    np.testing.assert_allclose(np.abs(one.curve_explained[:, :3]), np.abs(expected), atol=1e-9)
-    assert np.median(one.curve_error) == pytest.approx(1 / 5, rel=0.2)  # 25 points of unit noise
-    np.testing.assert_allclose(one.rms_after, np.sqrt((noise**2).mean(axis=1)))
+    np.testing.assert_allclose(np.abs(one.curves["EXPLAINED"][:, :3]), np.abs(expected), atol=1e-9)
+    assert np.median(one.curves["ERROR"]) == pytest.approx(1 / 5, rel=0.2)  # 25 points of unit noise
+    np.testing.assert_allclose(one.field["RMS_AFTER"], np.sqrt((noise**2).mean(axis=1)))
 
 
 def test_points_without_the_exposures_are_not_shown():
@@ -77,8 +77,8 @@ def test_points_without_the_exposures_are_not_shown():
     wave = np.append(np.cos(2 * np.deg2rad(ANGLES)), np.zeros(4))
     before = np.where(used[..., None], cube(wave), 0.0)
     one = compare_residuals("", before, 0.0 * before, used, SEQUENCE)
-    assert np.flatnonzero(np.isnan(one.before).any(axis=1)).tolist() == [3]
-    assert np.isfinite(one.mean_before).all()
+    assert np.flatnonzero(np.isnan(one.field["BEFORE"]).any(axis=1)).tolist() == [3]
+    assert np.isfinite(one.field["MEAN_BEFORE"]).all()
 
 
 def test_the_ladder_has_the_degrees_of_freedom_of_every_fit():

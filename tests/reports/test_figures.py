@@ -136,7 +136,7 @@ def test_figures_of_a_diagnosis_hold_its_residuals(fitted):
     assert made.ladder["CHI2"].tolist() == [result.chi2]
     (whole,) = made.comparisons
     rows = likelihood.used.sum(axis=1)[:, None]
-    np.testing.assert_allclose(whole.rms_after**2 * rows, (after**2).sum(axis=1), rtol=1e-9)
+    np.testing.assert_allclose(whole.field["RMS_AFTER"] ** 2 * rows, (after**2).sum(axis=1), rtol=1e-9)
     assert drawn(signature_figure(whole, made.exposures, made.cameras)).startswith(b"\x89PNG")
 
 

@@ -245,7 +245,7 @@ def test_a_map_of_ones_own_with_an_aperture_of_several(tmp_path):
     )
     columns["QUALITY"] = columns.pop("FLAGS") + 2
     file = ldac(tmp_path / "a.fits", columns)
-    with pytest.raises(DataError, match=r"FLUX_APER: has 2 apertures; say which .*FLUX_APER\[1\]"):
+    with pytest.raises(DataError, match=r"FLUX_APER: has 2 apertures; name it .*FLUX_APER\[1\]"):
         read_camera_catalogue(file)
     own = tmp_path / "own.toml"
     own.write_text(

@@ -157,7 +157,7 @@ def right_of(one: Sealed, diagnosis: Diagnosis) -> str:
 
     told, classes = [], []
     for step in diagnosis.steps:
-        told += [change.text for change, *_ in step.told] if step.told else [step.effect]
+        told += [change.text for change, *_ in step.descriptions] if step.descriptions else [step.effect]
         classes += [*step.equivalent, *step.nameless]
     if homes(told) <= one.homes:
         return "right"

@@ -27,7 +27,7 @@ def exposures(
 ) -> Outcome[Any]:
     """Make the table EXPOSURES of a calibration set from the records of an observatory.
 
-    WORDS.toml says which header word (or key of a log, or column of a table) is which column, in which unit, and what
+    WORDS.toml assigns header words (keys of a log, columns of a table) to columns, in which unit, and what
     is made of it (walop-jax docs files). Words that are missing, units that do not fit and values that cannot be meant
     are errors, with file and word. An executed schedule (format v4) needs the numbers of its filters alone.
 
@@ -41,7 +41,7 @@ def exposures(
     from walop_jax.io.plain_tables import astropy_table, write_table
 
     if words is None:
-        raise UsageError("give the file that says which word is which column", "words")
+        raise UsageError("give the file that assigns words to columns", "words")
     paths = several(files)
     rules = read_words(words)
     if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json" and is_schedule(json_content(paths[0])):

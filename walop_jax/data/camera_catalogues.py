@@ -230,7 +230,7 @@ def _one(source: InputTable, name: str, place: Place) -> Any:
     values = getattr(column, "shape", (0,))[1:]
     if values and values != (1,):
         if not 1 <= number <= values[0]:
-            advice = f"say which in a map of columns (--columns): {plain}[1] … {plain}[{values[0]}]"
+            advice = f"name it in a map of columns (--columns): {plain}[1] … {plain}[{values[0]}]"
             raise place.fail(f"has {values[0]} apertures", plain, advice)
         return column[:, number - 1]
     return column
@@ -345,7 +345,7 @@ def _flags(source: InputTable, column_map: ColumnMap, place: Place) -> Int[np.nd
     odd = np.flatnonzero((undefined != 0) | (values < 0))
     if odd.size:
         what = f"is {values[odd[0]]} in {rows_text(odd)}, which is no flag of {column_map.program}"
-        advice = "say what its bits mean in a map of columns: --columns FILE.toml, table [bits]"
+        advice = "give the meaning of its bits in a map of columns: --columns FILE.toml, table [bits]"
         raise place.fail(what, name, advice)
     if empty := int(empty_cells(source, name, rule).sum()):
         source.remarks.append(f"{name} is empty in {empty} rows: taken as good")

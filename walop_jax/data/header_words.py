@@ -142,7 +142,7 @@ def columns_of(rows: Sequence[Mapping[str, Any]], file: str) -> dict[str, np.nda
     for kind in np.unique(table["KIND"]).tolist():
         if kind not in KINDS:
             what = f"{kind!r} is not a kind,"
-            place.refuse(table["KIND"] == kind, what, "KIND", f"say it in values; {nearest(kind, KINDS)}")
+            place.refuse(table["KIND"] == kind, what, "KIND", f"list it in values; {nearest(kind, KINDS)}")
     check(table, {name: rule for name, rule in rules.items() if name in table}, place)
     return table
 
@@ -213,7 +213,7 @@ def _of_json(path: Path, rows: str) -> Iterator[Mapping[str, Any]]:
             raise fail(f"rows = {rows!r}: there is no {key!r}", file=path, advice=advice)
         content = content[key]
     if not isinstance(content, list) or not all(isinstance(record, Mapping) for record in content):
-        raise fail("holds no list of records", file=path, advice='say where it is: rows = "data.exposures"')
+        raise fail("holds no list of records", file=path, advice='give its place: rows = "data.exposures"')
     yield from content
 
 
@@ -304,7 +304,7 @@ def _number(value: Any, name: str, rule: Column, word: Word, place: Place, what:
         if with_unit:
             return value / 15.0 if rule.unit == "h" else value
         if not word.unit:
-            advice = 'say unit = "hourangle" or unit = "deg"'
+            advice = 'give unit = "hourangle" or unit = "deg"'
             raise place.fail(f"{what} may be hours or degrees", name, advice)
     if isinstance(value, bool) or not _is_number(value):
         raise place.fail(f"{what} is not a number", name, "give another word, or values = { … }")

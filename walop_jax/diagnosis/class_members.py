@@ -23,13 +23,15 @@ from collections.abc import Collection, Iterator, Sequence
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from scipy import special
 
 from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_average import distinct, moved, probabilities
+from walop_jax.diagnosis.class_average import distinct
 from walop_jax.diagnosis.class_product import Classes, ClassOf, Likeness, Shape, Sum
 from walop_jax.diagnosis.description_shape import shape_changes
+from walop_jax.diagnosis.design import taken_up
 from walop_jax.diagnosis.exact import signature
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.hidden_mistakes import usual_exposure
@@ -46,23 +48,23 @@ Matrix = Float[np.ndarray, "_ _"]
 ALIKE = 0.5  # of the errors of the matrix: members that differ by less count as one
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
 LINEAR = 0.01  # relative error of the evidence of a linear step
-LEAST_PROBABLE, PLAUSIBLE = 1e-3, 0.02  # of members in the average, and in the check of the farthest
+PLAUSIBLE = 0.02  # probability of members in the check of the farthest
 
 
 def classes_of(
     state: Examination,
     context: Context,
     names: Collection[str],
-    said: Sequence[str],
+    groups: Sequence[str],
     alike: Collection[str] = (),
 ) -> Classes:
     """The classes of the effects of a model that have some names, and deviations from the shapes of its descriptions.
 
-    Without classes of a single member. `said` are the names of the added groups of sentences, `alike` the effects and
+    Without classes of a single member. `groups` are the names of the added groups of sentences, `alike` the effects and
     groups reported as indistinguishable: with large residuals, where one linear step is inaccurate, they count as
     probable.
     """
-    additions = list(_additions(state.result, context, names, said))
+    additions = list(_additions(state.result, context, names, groups))
     if not additions or not state.result.model.template.cameras.pairs:
         return Classes()
     laid = _Laid(state, alike)
@@ -71,7 +73,7 @@ def classes_of(
 
 
 def _additions(
-    fit: FitResult, context: Context, names: Collection[str], said: Sequence[str]
+    fit: FitResult, context: Context, names: Collection[str], groups: Sequence[str]
 ) -> Iterator[tuple[str, Int[np.ndarray, " a"], Vector, tuple[Sum, ...]]]:
     """Name, positions among the free parameters, change of the data rows without it, its amplitudes in sentences."""
     model = fit.model
@@ -86,7 +88,7 @@ def _additions(
                 change = signature(fit, effect.name, context)
                 yield effect.name, np.array(at), change, tuple(map(tuple, effect.first_order(model.template)))
             continue
-        for group in _groups(effect, said):
+        for group in _groups(effect, groups):
             indices = [model.index(f"{Described.name}.{Sentence.parsed(text).label}") for text in group]
             at = [place[i] for i in indices if i in place]
             if not at:
@@ -96,10 +98,10 @@ def _additions(
             yield "; ".join(group), np.array(at), change, tuple(((1.0, Sentence.parsed(t)),) for t in group)
 
 
-def _groups(effect: Described, said: Sequence[str]) -> Iterator[tuple[str, ...]]:
+def _groups(effect: Described, groups: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Sentences of a model in the groups of their addition; each ungrouped sentence is a group of its own."""
     ungrouped = list(effect.sentences)
-    for name in said:
+    for name in groups:
         group = tuple(text for text in ungrouped if text in name.split("; "))
         ungrouped = [text for text in ungrouped if text not in group]
         if group:
@@ -141,7 +143,7 @@ class _Laid:
     def class_of(self, name: str, at: Int[np.ndarray, " a"], lost: Vector, sums: tuple[Sum, ...]) -> ClassOf:
         """Class of the addition with the amplitudes `at`; without it the residuals change by `lost`."""
         step = _Step(self, at, lost)
-        addition = step.told(name, sums)
+        addition = step.addition(name, sums)
         # The addition is among the candidates: it is no further member.
         rivals = (
             member for member in step.candidates(addition.evidence) if _texts(member.sums) != _texts(sums)
@@ -154,11 +156,11 @@ class _Laid:
         changes = np.stack([member.change for member in members])
         evidence = np.array([np.inf, *(member.evidence for member in members[1:])])
         members = [members[i] for i in distinct(evidence, changes, self.errors, ALIKE)][:MOST_MEMBERS]
-        weights = probabilities([member.evidence for member in members])
+        weights = special.softmax([member.evidence for member in members])
         members = [
             member._replace(probability=float(weight))
             for member, weight in zip(members, weights, strict=True)
-            if weight > LEAST_PROBABLE or member is addition
+            if weight > np.exp(-thresholds.IMPROBABLE) or member is addition
         ]
         return ClassOf(name, at, tuple(members), *self._spread(members))
 
@@ -172,9 +174,7 @@ class _Laid:
         sums: tuple[Sum, ...] = tuple(((1.0, change),) for change in changes)
         step = _Step(self, np.zeros(0, int), np.zeros(self.design.rows))
         column = self.design.stacked([self.columns.of(sums)])
-        projected = step.projector(column)
-        square, along = projected.T @ projected, projected.T @ step.left
-        likeness = step.member("", 0.0, sums, column, square, along, widths)
+        likeness = step.member("", sums, column, widths, 0.0)
         vectors, added = self.added(sums)
         pairs = self.template.cameras.pairs
         slopes = np.moveaxis(of_matrix(vectors[:, None], np.moveaxis(added, -1, 1), pairs), 1, -1)
@@ -231,7 +231,7 @@ class _Step:
         self.projector = Projector(self.jacobian, design.eliminated)
         self.left = self.projector(design.residual + self.lost)
 
-    def told(self, name: str, sums: tuple[Sum, ...]) -> Likeness:
+    def addition(self, name: str, sums: tuple[Sum, ...]) -> Likeness:
         """The addition itself as a member, with its fitted values."""
         fit, design, floor = self.laid.fit, self.laid.design, self.laid.state.floor
         positions = fit.model.free[self.at]
@@ -247,7 +247,7 @@ class _Step:
             np.zeros_like(self.laid.matrix),
         )  # fmt: skip
 
-    def candidates(self, told: float) -> Iterator[Likeness]:
+    def candidates(self, of_addition: float) -> Iterator[Likeness]:
         """Candidates not improbable relative to the addition, the most probable first."""
         state, design = self.laid.state, self.laid.design
         projected = self.projector(design.jacobian[:, self.at])
@@ -255,28 +255,27 @@ class _Step:
         along = design.products(state.columns, basis)
         gram, scores = state.bare.gram + along @ along.T, design.products(state.columns, self.left)
         places, scored = state.bare.places(), []
-        number = {name: i for i, name in enumerate(state.bare.names)}
         for probe in (*state.probes, *state.sentences, *(probe for probe, _ in state.parts)):
             at = places[probe.name]
             evidence = log_bayes(gram[at, at], scores[at], probe.widths) / state.floor**2
             if {probe.name, probe.effect.name} & set(self.laid.alike):
-                evidence = max(evidence, told)
-            scored.append((evidence, probe, gram[at, at], scores[at]))
+                evidence = max(evidence, of_addition)
+            scored.append((evidence, probe))
         scored.sort(key=lambda item: -item[0])
-        least = max(told, scored[0][0] if scored else told) - thresholds.IMPROBABLE
+        least = max(of_addition, scored[0][0] if scored else of_addition) - thresholds.IMPROBABLE
         chosen = []
-        for evidence, probe, square, along_residual in scored[:MOST_ASKED]:
+        for evidence, probe in scored[:MOST_ASKED]:
             if evidence <= least:
                 break
             sums = tuple(
                 tuple(total) for member in probe.group for total in member.first_order(self.laid.template)
             )
             if len(sums) == len(probe.widths) and self._can_be_said(sums):
-                chosen.append((probe, evidence, sums, square, along_residual))
-        self.laid.added([total for _, _, sums, *_ in chosen for total in sums])  # all of them in one go
-        for probe, evidence, sums, square, along_residual in chosen:
-            column = design.stacked([state.columns[number[probe.name]]])
-            yield self.member(probe.name, evidence, sums, column, square, along_residual, probe.widths)
+                chosen.append((probe, evidence, sums))
+        self.laid.added([total for *_, sums in chosen for total in sums])  # all of them in one go
+        for probe, evidence, sums in chosen:
+            column = design.stacked([state.candidates[probe.name].columns])
+            yield self.member(probe.name, sums, column, probe.widths, evidence)
 
     def in_other_kinds(self, member: Likeness) -> Likeness | None:
         """A member that is about exposures of one KIND, in all others instead; None for any other."""
@@ -294,34 +293,33 @@ class _Step:
             for amplitude in member.sums
         )
         column = design.stacked([self.laid.columns.of(sums)])
-        projected = self.projector(column)
-        square, along = projected.T @ projected, projected.T @ self.left
-        widths = np.array([_width(amplitude) for amplitude in sums])
-        evidence = log_bayes(square, along, widths) / self.laid.state.floor**2
+        widths = np.array([AMPLITUDES[amplitude[0][1].parameter].width for amplitude in sums])
+        name = "; ".join(sentence.text for amplitude in sums for _, sentence in amplitude)
+        twin = self.member(name, sums, column, widths)
         # The same difference, seen from the other side: as probable, however its throughputs are known.
         alike = max(thresholds.EVEN_ODDS, LINEAR * abs(member.evidence))
-        evidence = member.evidence if abs(evidence - member.evidence) < alike else evidence
-        name = "; ".join(sentence.text for amplitude in sums for _, sentence in amplitude)
-        return self.member(name, evidence, sums, column, square, along, widths)
+        near = abs(twin.evidence - member.evidence) < alike
+        return twin._replace(evidence=member.evidence) if near else twin
 
     def member(
         self,
         name: str,
-        evidence: float,
         sums: tuple[Sum, ...],
         column: Matrix,
-        square: Matrix,
-        along: Vector,
         widths: Vector,
+        evidence: float | None = None,
     ) -> Likeness:
-        laid = self.laid
+        """The model with other amplitudes, at the minimum; `evidence` in place of that of the linear step."""
+        laid, projected = self.laid, self.projector(column)
+        square, along = projected.T @ projected, projected.T @ self.left
+        if evidence is None:
+            evidence = log_bayes(square, along, widths) / laid.state.floor**2
         covariance = np.linalg.inv(square + np.diag(widths**-2.0))
         amplitudes = -covariance @ along
         count = len(laid.fit.model.free)
         values, slopes = np.zeros(count), np.zeros((count, len(widths)))
-        basis = self.projector.basis
-        values[self.rest] = moved(self.jacobian, basis, self.lost + column @ amplitudes)
-        slopes[self.rest] = moved(self.jacobian, basis, column)
+        values[self.rest] = -taken_up(self.jacobian, self.projector, self.lost + column @ amplitudes)
+        slopes[self.rest] = -taken_up(self.jacobian, self.projector, column)
         values[self.at] = -laid.fit.values[laid.fit.model.free[self.at]]
         vectors, added = laid.added(sums)
         change = of_matrix(vectors, added @ amplitudes, laid.template.cameras.pairs)
@@ -365,10 +363,6 @@ def _in_kind(sentence: Sentence, kind: str, other: str) -> Sentence:
 def _texts(sums: Sequence[Sum]) -> set[str]:
     """The sentences of some amplitudes."""
     return {sentence.text for amplitude in sums for _, sentence in amplitude}
-
-
-def _width(amplitude: Sum) -> float:
-    return AMPLITUDES[amplitude[0][1].parameter].width
 
 
 def covariance_of_free(fit: FitResult) -> Matrix:

@@ -7,13 +7,15 @@
 2. The few that leave least are fitted, all parameters with them, and other curves of dispersion in any case: plates
    grow to make up for those, by more than one step can tell. Their evidence against the description given is half
    the gain in χ² less the logarithm of the number of changes that were looked at.
+3. A change that gained nothing is not compared again once names have joined the model: these explain a part of the
+   misfit, and leave less for it to explain.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -52,19 +54,28 @@ def other_descriptions(
     tell: Callable[[str], None],
     *,
     all_of_them: bool = True,
+    earlier: Mapping[str, Choice] | None = None,
 ) -> tuple[list[Trial], dict[str, Choice]]:
-    """Changes of the description of a fit, by name: all are compared, the best of them fitted while `fits` allows."""
-    template = dataclasses.replace(result.model.template, effects=())
+    """Changes of the description of a fit, by name: all are compared, the best of them fitted while `fits` allows.
+
+    `earlier` are those that were compared before the last names joined the model.
+    """
+    template, hopeless = dataclasses.replace(result.model.template, effects=()), set[str]()
     if OtherDescription.name in result.model.effect_names:
         template = result.model.template.effect(OtherDescription.name).patch(template)
+    else:
+        hopeless = {choice.change for choice in (earlier or {}).values() if not choice.gains}
     curves = other_curves(template)
     # What is turned, exchanged or left out changes the light by per cents: nothing of that kind is a small misfit.
     sentences = tuple(alternatives(template)) if all_of_them else curves
-    tell(f"comparing {len(sentences)} other descriptions")
-    candidates = itertools.takewhile(lambda _: fits(), sentences)
+    asked = [sentence for sentence in sentences if sentence not in hopeless]
+    if not asked:
+        return [], {}
+    tell(f"comparing {len(asked)} other descriptions")
+    candidates = itertools.takewhile(lambda _: fits(), asked)
     screened = sorted(_screened(result, candidates, context), key=lambda item: item[0].left)
     compared, trials = {choice.change: choice for choice, _, _ in screened}, []
-    best = [item for item in screened if item[1] > thresholds.LEAST_GAIN][: thresholds.DESCRIPTIONS_FITTED]
+    best = [item for item in screened if item[1] > thresholds.LEAST_GAIN][: thresholds.MOST_FITTED]
     chosen = {choice.change for choice, _, _ in best}
     others = [item for item in screened if item[0].change in curves and item[0].change not in chosen]
     for choice, _, start in (*best, *others):
@@ -77,7 +88,7 @@ def other_descriptions(
         except ValueError:  # a free parameter of a removed element has no prior and is undetermined
             continue
         assert trial.fit is not None
-        gain = (result.posterior.objective - trial.fit.posterior.objective) * result.noise_scale**2
+        gain = (result.expansion.objective - trial.fit.expansion.objective) * result.noise_scale**2
         compared[choice.change] = dataclasses.replace(choice, better_by=float(gain))
         trials.append(trial)
     return trials, compared

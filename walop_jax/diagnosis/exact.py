@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.hypotheses import Ranked, said_by
+from walop_jax.diagnosis.hypotheses import Ranked, sentences_of
 from walop_jax.diagnosis.score import SCALES, log_bayes
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
@@ -33,7 +33,7 @@ class Trial:
     evidence, or of which a part would do, `nameless` sentences that are not improbable beside it. `predicts` is False
     where its linear step does not predict held-out data, `compared` holds the comparison of two fits
     (`predictions.before_and_after`), `against` the KINDs of exposures that contradict it, `refused` the reason for
-    which it was not added, `said` the groups of sentences that were added one after the other.
+    which it was not added, `groups` the groups of sentences that were added one after the other.
     """
 
     effect: EffectKind
@@ -50,7 +50,7 @@ class Trial:
     compared: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     against: str = ""
     refused: str = ""
-    said: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -73,12 +73,12 @@ class Trial:
         if self.effect is not Described:
             return ()
         if self.fit is None:
-            return () if self.item is None else said_by(self.item.probe)
+            return () if self.item is None else sentences_of(self.item.probe)
         return self.instance.sentences  # type: ignore[attr-defined]
 
 
 def _log_determinant(result: FitResult) -> float:
-    return float(np.linalg.slogdet(result.posterior.matrix)[1])
+    return float(np.linalg.slogdet(result.expansion.matrix)[1])
 
 
 def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
@@ -94,7 +94,7 @@ def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
     ]
     amplitudes = [i for effect in model.effect_names for i in amplitude_positions(model, effect)]
     at = [i for i in amplitudes if model.names[i] not in base_names]
-    gain = 0.5 * (base.posterior.objective - extended.posterior.objective)
+    gain = 0.5 * (base.expansion.objective - extended.expansion.objective)
     occam = 0.5 * (_log_determinant(extended) - _log_determinant(base))
     at_all_scales = _of_amplitudes(extended, at) - _of_amplitudes(extended, at, np.ones(1))
     return gain - occam - float(np.sum(np.log(widths))) + at_all_scales
@@ -141,10 +141,10 @@ def try_model(
         likelihood,
         start=np.array([start.get(p.name, p.start) for p in model.parameters]),
         noise_scale=base.noise_scale,
-        worth=base.posterior.objective,
+        worth=base.expansion.objective,
     )
     bayes = -np.inf  # of a diverged fit
-    if np.isfinite(result.posterior.matrix).all():
+    if np.isfinite(result.expansion.matrix).all():
         bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
     return Trial(effect, bayes, result.chi2, result.explains_data, fit=result)
 

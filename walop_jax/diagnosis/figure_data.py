@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,7 @@ Table = Mapping[str, Shaped[np.ndarray, " _"]]
 """Columns of a table by name."""
 
 PointMap = Float[np.ndarray, "p k"]
-Curve = Float[np.ndarray, "e k"]
+PerCamera = Mapping[str, Float[np.ndarray, "_ k"]]
 
 _SIGMA = "(data - model) in standard deviations, a value for each camera"
 _CAMERAS = Column("float", width=None)
@@ -97,31 +97,15 @@ class ResidualComparison:
     """Residuals without and with an effect, as maps over the field and as curves over the exposures.
 
     `effect` is empty where the starting model is compared with the final one. `combination` (plain ASCII) and
-    `harmonic` identify the combination of the exposures in the maps; the module docstring defines the columns.
+    `harmonic` identify the combination of the exposures in the maps. `field` (points) and `curves` (exposures) are the
+    columns of FIELD and CURVES with a value for each camera (`_TABLES`).
     """
 
     effect: str
     combination: str
     harmonic: int
-    before: PointMap
-    after: PointMap
-    mean_before: PointMap
-    mean_after: PointMap
-    rms_before: PointMap
-    rms_after: PointMap
-    curve_before: Curve
-    curve_error: Curve
-    curve_after: Curve
-
-    @property
-    def explained(self) -> PointMap:
-        """Effect on the maps, with all other parameters refitted."""
-        return self.before - self.after
-
-    @property
-    def curve_explained(self) -> Curve:
-        """Effect on the curves, with all other parameters refitted."""
-        return self.curve_before - self.curve_after
+    field: PerCamera
+    curves: PerCamera
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,10 +151,9 @@ def _columns(data: DiagnosisFigureData) -> dict[str, Mapping[str, np.ndarray]]:
     points, exposures, all_of = data.points, data.exposures, data.comparisons
     count, many = len(all_of), np.arange(len(all_of))
 
-    def stacked(name: str) -> np.ndarray:
-        return np.concatenate([getattr(comparison, name) for comparison in all_of])
+    def stacked(of_each: Sequence[PerCamera]) -> PerCamera:
+        return {name: np.concatenate([columns[name] for columns in of_each]) for name in of_each[0]}
 
-    maps = ("before", "after", "explained", "mean_before", "mean_after", "rms_before", "rms_after")
     return {
         "LADDER": data.ladder,
         "SHARES": data.shares,
@@ -183,12 +166,12 @@ def _columns(data: DiagnosisFigureData) -> dict[str, Mapping[str, np.ndarray]]:
         "FIELD": {
             "COMPARISON": np.repeat(many, len(points)),
             **{name.upper(): np.tile(getattr(points, name), count) for name in ("point", "x", "y")},
-            **{name.upper(): stacked(name) for name in maps},
+            **stacked([comparison.field for comparison in all_of]),
         },
         "CURVES": {
             "COMPARISON": np.repeat(many, len(exposures["EXPOSURE"])),
             **{name: np.tile(values, count) for name, values in exposures.items()},
-            **{n.upper(): stacked(f"curve_{n}") for n in ("before", "error", "after", "explained")},
+            **stacked([comparison.curves for comparison in all_of]),
         },
     }
 
@@ -214,19 +197,21 @@ def read_figure_data(path: str | os.PathLike[str]) -> DiagnosisFigureData:
 
 def _figure_data(tables: Mapping[str, Mapping[str, Any]]) -> DiagnosisFigureData:
     field, curves, about = tables["FIELD"], tables["CURVES"], tables["COMPARISONS"]
-    comparisons = []
-    for number in about["COMPARISON"]:
-        field_rows, curve_rows = field["COMPARISON"] == number, curves["COMPARISON"] == number
-        maps = ("before", "after", "mean_before", "mean_after", "rms_before", "rms_after")
-        comparisons.append(
-            ResidualComparison(
-                effect=str(about["EFFECT"][number]),
-                combination=str(about["COMBINATION"][number]),
-                harmonic=int(about["HARMONIC"][number]),
-                **{name: field[name.upper()][field_rows] for name in maps},
-                **{f"curve_{n}": curves[n.upper()][curve_rows] for n in ("before", "error", "after")},
-            )
+
+    def of_number(name: str, number: int) -> PerCamera:
+        rows = tables[name]["COMPARISON"] == number
+        return {key: tables[name][key][rows] for key, (rule, _) in _TABLES[name].items() if rule is _CAMERAS}
+
+    comparisons = [
+        ResidualComparison(
+            effect=str(about["EFFECT"][number]),
+            combination=str(about["COMBINATION"][number]),
+            harmonic=int(about["HARMONIC"][number]),
+            field=of_number("FIELD", number),
+            curves=of_number("CURVES", number),
         )
+        for number in about["COMPARISON"].tolist()
+    ]
     first, rows = field["COMPARISON"] == 0, curves["COMPARISON"] == 0
     return DiagnosisFigureData(
         points=Points(*(field[name][first] for name in ("POINT", "X", "Y"))),
@@ -311,24 +296,17 @@ def compare_residuals(
     pattern = np.where(size > 0, pattern / np.where(size > 0, size, 1.0), 1.0)
     power = used.T.astype(float) @ pattern**2
     weight = np.where(power > 0, power, np.nan)
-    curves = [np.einsum("pek,pk->ek", cube, pattern) / weight for cube in (before, after)]
+    curve, curve_after = (np.einsum("pek,pk->ek", cube, pattern) / weight for cube in (before, after))
     scatter = np.sqrt(np.einsum("pek,pk->ek", after**2, pattern**2)) / weight
     rows = used.sum(axis=1, keepdims=True)
     rows = np.where(rows > 0, rows, np.nan)
-    return ResidualComparison(
-        effect=effect,
-        combination=best.words,
-        harmonic=best.harmonic,
-        before=best.of(before, used),
-        after=best.of(after, used),
-        mean_before=before.sum(axis=1) / rows,
-        mean_after=after.sum(axis=1) / rows,
-        rms_before=np.sqrt((before**2).sum(axis=1) / rows),
-        rms_after=np.sqrt((after**2).sum(axis=1) / rows),
-        curve_before=curves[0],
-        curve_error=scatter,
-        curve_after=curves[1],
-    )
+    field = {"BEFORE": best.of(before, used), "AFTER": best.of(after, used)}
+    field["EXPLAINED"] = field["BEFORE"] - field["AFTER"]
+    for name, cube in (("BEFORE", before), ("AFTER", after)):
+        field[f"MEAN_{name}"] = cube.sum(axis=1) / rows
+        field[f"RMS_{name}"] = np.sqrt((cube**2).sum(axis=1) / rows)
+    curves = {"BEFORE": curve, "ERROR": scatter, "AFTER": curve_after, "EXPLAINED": curve - curve_after}
+    return ResidualComparison(effect, best.words, best.harmonic, field, curves)
 
 
 def best_combination(cube: Cube, used: Used, exposures: Exposures) -> _Combination:

@@ -72,7 +72,7 @@ def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
     basis = legendre.basis(points.x, points.y, 4, design.fit.model.template.units.field)
     degree = np.array([i + j for i, j in legendre.terms(4)])
     if len(field) <= len(degree):
-        return "too few points to tell"
+        return "too few points to decide"
     total = float(field @ field) or 1.0
     explained, words = 0.0, {}
     for d in range(5):
@@ -170,8 +170,8 @@ class Step:
     effect that explain the data as well. `equivalent` are the effects indistinguishable from it in this data set,
     `separation` is the distance (σ) of each rival from it. `residual_before` and `residual_after` are the residuals
     (data − model, in standard deviations as given; point, exposure, camera) without and with the effect at the time it
-    was added; where another name has been dropped since, they and χ² are of fits without that name. `told` are the
-    sentences of an effect without a name (`described`) with amplitude and error, `nameless` those that are not
+    was added; where another name has been dropped since, they and χ² are of fits without that name. `descriptions` are
+    the sentences of an effect without a name (`described`) with amplitude and error, `nameless` those that are not
     improbable in addition to what was found.
     """
 
@@ -195,7 +195,7 @@ class Step:
     separation: dict[str, float] = dataclasses.field(default_factory=dict)
     separated_by: str = ""
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
-    told: tuple[tuple[Change, float, float], ...] = ()
+    descriptions: tuple[tuple[Change, float, float], ...] = ()
     nameless: tuple[str, ...] = ()
     residual_before: Cube = dataclasses.field(default_factory=_no_cube)
     residual_after: Cube = dataclasses.field(default_factory=_no_cube)
@@ -241,6 +241,11 @@ class Choice:
     change: str
     left: float
     better_by: float = float("nan")
+
+    @property
+    def gains(self) -> bool:
+        """True if residuals are smaller with the change, by the linear step or by the fit."""
+        return self.left < 1.0 or self.better_by > 0.0
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -308,7 +313,7 @@ class Diagnosis(Drawn):
                 f"{looked_at} of {self.points} field points were looked at, and fitted: refit all of them with the "
                 "model found"
             )
-        if len(self.steps) > thresholds.MOST_NAMES:
+        if len(self.steps) > thresholds.MOST_SENTENCES:
             cautions.append(
                 f"{len(self.steps)} names were needed: something that is not in the catalogue can look like several "
                 "that are"
@@ -372,10 +377,10 @@ class Diagnosis(Drawn):
         )
 
 
-# --------------------------------------------------------------------------------- sentences, told to people
+# --------------------------------------------------------------------------------- descriptions
 
 
-def told(result: FitResult) -> tuple[tuple[Change, float, float], ...]:
+def descriptions_of(result: FitResult) -> tuple[tuple[Change, float, float], ...]:
     """The sentences of a fitted model, each with its amplitude and standard error."""
     if Described.name not in result.model.effect_names:
         return ()
@@ -411,9 +416,6 @@ def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
 
 # ------------------------------------------------------------------------------------------ as plain data
 
-_ALIKE, _CLASSES = 6, 3  # printed indistinguishable names, and groups of them: the file has all
-
-
 _AS_THEY_ARE = (
     "effect", "score", "p_value", "chi2_before", "chi2_after", "heldout_before", "heldout_after", "heldout_scheme",
     "alternatives", "equivalent", "nameless", "separated_by", "where", "confirmed", "log_bayes", "negligible",
@@ -425,7 +427,7 @@ def _step(step: Step) -> dict[str, Any]:
     near = sorted(step.separation.items(), key=lambda s: s[1])
     return {name: getattr(step, name) for name in _AS_THEY_ARE} | {
         "parameters": {n: {"value": v, "sigma": s, "unit": unit} for n, (v, s, unit) in entries.items()},
-        "sentences": [_sentence(*entry) for entry in step.told],
+        "sentences": [_sentence(*entry) for entry in step.descriptions],
         "change_of_qu": step.change_of_qu,
         "robust_error_ratio": step.robust_ratio,
         "separation_sigma": {name: value for name, value in near if math.isfinite(value)},
@@ -469,10 +471,10 @@ def sentences(content: Mapping[str, Any]) -> Iterator[str]:
     for choice in fitted:
         sense = "smaller" if choice["better_by"] > 0 else "larger"
         yield f"{choice['change']}: χ² {sense} by {abs(choice['better_by']):.4g}"
-    for alike in content.get("classes", ())[:_CLASSES]:
+    for alike in content.get("classes", ())[: thresholds.SHOWN]:
         yield (
             f"before anything was added {alike['effect']} was significant too; these data cannot distinguish it from "
-            f"{some(alike['equivalent'], _ALIKE)}; what would: {alike['separated_by']}"
+            f"{some(alike['equivalent'], thresholds.SHOWN)}; what would: {alike['separated_by']}"
         )
     if content.get("cannot_be_tested"):
         yield f"not tested, since these data cannot show it: {', '.join(content['cannot_be_tested'])}"
@@ -507,7 +509,7 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
         )
     rivals = (*step.get("equivalent", ()), *step.get("nameless", ()))
     if rivals:
-        yield f"{name}: these data cannot distinguish it from {some(rivals, _ALIKE)}"
+        yield f"{name}: these data cannot distinguish it from {some(rivals, thresholds.SHOWN)}"
     if rivals and step.get("separated_by"):
         yield f"what would: {step['separated_by']}"
 

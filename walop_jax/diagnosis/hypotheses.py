@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -77,6 +79,25 @@ class Ranked:
         return self.probe.name if self.effect is Described else self.effect.name
 
 
+class Hypotheses(NamedTuple):
+    """All possible omissions of a model: probes of effects with a name, and sentences.
+
+    `sentences` are those that no effect holds, `parts` those that effects hold in part, with the holders. `effects` are
+    those that fit the instrument, `every` all sentences, those that are an effect by another name as well.
+    """
+
+    names: Sequence[Probe] = ()
+    sentences: Sequence[Probe] = ()
+    parts: Sequence[tuple[Probe, frozenset[EffectKind]]] = ()
+    effects: tuple[EffectKind, ...] = ()
+    every: Sequence[Probe] = ()
+
+    @property
+    def amplitudes(self) -> int:
+        """Number of all amplitudes."""
+        return sum(len(probe.widths) for probe in (*self.names, *self.every))
+
+
 def applicable(
     catalogue: Sequence[EffectKind], context: Context, instrument: Instrument
 ) -> tuple[EffectKind, ...]:
@@ -129,36 +150,34 @@ def all_candidates(
     likelihood, values = columns.likelihood, columns.values
     template = likelihood.model.template
     shown = showable(likelihood.calset, template, effects)
-    changes: dict[int, list[Change]] = {}
-    for number, probe in enumerate([*shown, *sentences]):
+    linear: dict[str, list[Change]] = {}
+    for probe in (*shown, *sentences):
         members = [member.first_order(template) for member in probe.group]
-        if all(terms and all(columns.has(change) for change in terms) for terms in members):
-            changes[number] = [change for terms in members for change in terms]
-    gaps = [sentence.gap for sums in changes.values() for change in sums for sentence in fringes_of(change)]
-    survives = columns.survives(gaps)
-    blurred = {
-        number
-        for number, sums in changes.items()
-        if not all(survives[sentence.gap] for change in sums for sentence in fringes_of(change))
+        if all(terms and all(map(columns.has, terms)) for terms in members):
+            linear[probe.name] = list(itertools.chain(*members))
+    gaps = {
+        name: [sentence.gap for change in sums for sentence in fringes_of(change)]
+        for name, sums in linear.items()
     }
-    linear = {number: sums for number, sums in changes.items() if number not in blurred}
-    exact = sum(len(sums) for number, sums in linear.items() if number < len(shown))
-    computed = columns.rounded([change for sums in linear.values() for change in sums], exact)
-    named: dict[str, Candidate] = {}
-    described: dict[str, Candidate] = {}
-    first = [0, 0]
-    for number, probe in enumerate([*shown, *sentences]):
-        of_sentence = number >= len(shown)
-        if number in linear:
-            block = computed[of_sentence][:, first[of_sentence] : first[of_sentence] + len(probe.widths)]
-            first[of_sentence] += len(probe.widths)
-        elif number in blurred:
-            continue
-        else:
-            block = own_columns(likelihood, values, probe.group)
-        into = described if of_sentence else named
-        into[probe.name] = Candidate(probe.name, block, probe.widths)
-    return named, described
+    survives = columns.survives(list(itertools.chain(*gaps.values())))
+    blurred = {name for name in gaps if not all(survives[gap] for gap in gaps[name])}
+    linear = {name: sums for name, sums in linear.items() if name not in blurred}
+    exact = sum(len(linear.get(probe.name, ())) for probe in shown)
+    computed = columns.rounded(list(itertools.chain(*linear.values())), exact)
+    candidates: list[dict[str, Candidate]] = []
+    for listed, block in zip((shown, sentences), computed, strict=True):
+        sizes = [len(linear[probe.name]) for probe in listed if probe.name in linear]
+        blocks = iter(np.split(block, np.cumsum(sizes)[:-1], axis=1))
+        candidates.append({
+            probe.name: Candidate(
+                probe.name,
+                next(blocks) if probe.name in linear else own_columns(likelihood, values, probe.group),
+                probe.widths,
+            )
+            for probe in listed
+            if probe.name not in blurred
+        })  # fmt: skip
+    return candidates[0], candidates[1]
 
 
 def fringes_of(change: Change) -> Iterator[Sentence]:
@@ -166,6 +185,6 @@ def fringes_of(change: Change) -> Iterator[Sentence]:
     return (sentence for _, sentence in change if sentence.kind == "fringes")
 
 
-def said_by(probe: Probe) -> tuple[str, ...]:
+def sentences_of(probe: Probe) -> tuple[str, ...]:
     """The sentences of a group."""
     return tuple(text for member in probe.group for text in member.sentences)  # type: ignore[attr-defined]

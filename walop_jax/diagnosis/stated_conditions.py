@@ -14,7 +14,7 @@ The coordinates and times of sky exposures, the site and ROTATOR are asked in th
 (SKY) that is left in the counts. A number of the instrument that is thought to be known, and is not, looks much like
 these: the prior of each parameter, and those of each element together, are rivals with the column (mean −
 value)/width. So are terms of one camera with one amplitude: a non-linearity (its counts squared), a pedestal, scattered
-light (the median counts of an exposure), light of another camera. What cannot be told apart is told together.
+light (the median counts of an exposure), light of another camera. What cannot be separated is reported together.
 
 Limits      Mistakes that free parameters absorb whole show in no residual: with a single filter its displacement, the
             thicknesses of the plates look the same. One number at a time, by a linear step: the size is a hint.
@@ -43,19 +43,14 @@ from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import effect_context
 
-SHOWN = 4  # alternatives that are told in words
-ALIKE = 25.0  # in χ², within which conditions are told together
+ALIKE = 25.0  # in χ², within which conditions are reported together
 _PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
-MOST_OF_ELEMENT = 4  # numbers of an element whose priors may be wrong together
 _ASKED_OTHERWISE = (*thresholds.ASKED_BY_CAMERA, "standard_outlier")  # camera by camera, and as priors
 _LEVELS = "exposures at a second light level"
 _DARK = "bias and dark frames"
 _ONE_STAR = "a bright star in one beam: its light in the other cameras"
 _PLACES = {"x", "gap"}  # shapes of which there are so many that an effect is as good as a pattern
-_PRECESSION = (
-    46.124 / 3600.0,
-    20.043 / 3600.0,
-)  # deg a year: m, n, Capitaine et al. 2003, A&A 412, 567, J2000
+_PRECESSION = 46.124 / 3600.0, 20.043 / 3600.0  # deg a year, m, n, J2000: Capitaine et al. 2003, A&A 412, 567
 STEP = 1e-4  # of the width: the error of the derivative is its square
 
 
@@ -99,7 +94,7 @@ class _Single(NamedTuple):
     """
 
     candidate: Candidate
-    said: Callable[[Score], str]
+    worded: Callable[[Score], str]
     plausible: float | Float[np.ndarray, " _"] = 0.0
     unit: str = ""
     shown_by: str = ""
@@ -177,9 +172,9 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     # Of an element and one of its numbers alone, the shorter statement if it explains as much.
     likely = [item for item in likely if not any(_holds(item, rival) for rival in likely)]
     likely.sort(key=lambda item: (item.rank, item.log_p))  # a mistake of one number before sixteen
-    wordings = {item.candidate.name: item.said for item in rivals}
-    causes = "; or for ".join(wordings[score.name](score) for score in likely[:SHOWN])
-    further = f"; or for {len(likely) - SHOWN} others" if len(likely) > SHOWN else ""
+    wordings = {item.candidate.name: item.worded for item in rivals}
+    causes = "; or for ".join(wordings[score.name](score) for score in likely[: thresholds.SHOWN])
+    further = f"; or for {len(likely) - thresholds.SHOWN} others" if len(likely) > thresholds.SHOWN else ""
     p = corrected_p(best.log_p, len(scores))
     yield f"the residuals ask for {causes}{further} (p = {p:.2g}, limit {thresholds.ALARM:g})"
 
@@ -191,9 +186,9 @@ def _holds(score: Score, rival: Score) -> bool:
     return score.name.startswith(f"{rival.name}.") and rival.log_p < score.log_p
 
 
-def _conditions(design: Design) -> Iterator[_Single]:
-    """The numbers that the set states and that are used."""
-    statements = list(_stated(design.fit.calset))
+def _conditions(design: Design, what: str = "") -> Iterator[_Single]:
+    """The numbers that the set states and that are used, or the one that is `what`."""
+    statements = [item for item in _stated(design.fit.calset) if what in ("", item.what)]
     columns = [design.stacked([column[:, None]]) for column in _columns(design, statements)]
     for item, column in zip(statements, columns, strict=True):
         if not column.any():  # a number may be stated and not used
@@ -219,7 +214,7 @@ def _priors(design: Design) -> Iterator[_Single]:
     together: dict[str, list[int]] = {}
     for i in constrained:
         together.setdefault(parameters[rows.index[i]].name.rpartition(".")[0], []).append(i)
-    elements = {k: v for k, v in together.items() if k and 1 < len(v) <= MOST_OF_ELEMENT} | names
+    elements = {k: v for k, v in together.items() if k and 1 < len(v) <= thresholds.MOST_TOGETHER} | names
 
     def wording(score: Score) -> str:
         texts = []
@@ -227,7 +222,7 @@ def _priors(design: Design) -> Iterator[_Single]:
             p, mean, width = parameters[rows.index[i]], float(rows.mean[i]), float(rows.width[i])
             text = _worded(p.name, score, number, p.unit, mean, width)
             texts.append(f"{text}, not {mean:g} ± {width:g}")
-        return " with ".join(texts) + " (check what the model file knows of it)"
+        return " with ".join(texts) + " (check its value in the model file)"
 
     for name, members in elements.items():
         columns = np.zeros((len(design.residual), len(members)))
@@ -300,7 +295,7 @@ def _of_catalogue(design: Design, effects: Sequence[Probe]) -> Iterator[_Single]
 
 def _effect_in_words(probe: Probe, score: Score, cameras: Sequence[str]) -> str:
     effect, declared = probe.effect.combine(probe.group, score.amplitudes), probe.effect.numbers()
-    if len(score.amplitudes) > MOST_OF_ELEMENT:
+    if len(score.amplitudes) > thresholds.MOST_TOGETHER:
         return f"{effect.name}, {len(score.amplitudes)} numbers"
     choices = effect.choices()
     texts = [f"{n} {cameras[value] if n == 'camera' else value}" for n, value in choices.items()]
@@ -327,9 +322,9 @@ def condition_in_words(stated: _Stated, score: Score) -> str:
     return f"{text}, not {stated.value:g} ({stated.remedy})"
 
 
-def condition_scores(design: Design) -> list[_Scored]:
-    """The numbers that a set states, each with the score of changing it."""
-    singles = scored(design, tuple(_conditions(design)))
+def condition_scores(design: Design, what: str = "") -> list[_Scored]:
+    """The numbers that a set states, or the one that is `what`, each with the score of changing it."""
+    singles = scored(design, tuple(_conditions(design, what)))
     return [
         _Scored(r.stated, singles.table[r.candidate.name], r.candidate.columns[:, 0], float(info))
         for r, info in zip(singles.rivals, singles.left, strict=True)
@@ -339,9 +334,9 @@ def condition_scores(design: Design) -> list[_Scored]:
 
 def _columns(design: Design, statements: Sequence[_Stated]) -> Iterator[Float[np.ndarray, " _"]]:
     of_field = [item for item in statements if item.along is not None]
-    by_place = [_column(design, item) for item in of_field[:2]]  # X and Y come first
+    by_place = [_column(design, item) for item in of_field[:2] if len(of_field) > 2]  # X and Y come first
     for item in statements:
-        if item.along is None:
+        if item.along is None or not by_place:
             yield _column(design, item)
         else:
             (in_x, in_y), (by_x, by_y) = item.along, by_place
@@ -384,11 +379,8 @@ def _stated(calset: CalibrationSet) -> Iterator[_Stated]:
             counts = table.counts - share * sky
             return dataclasses.replace(calset, intensities=dataclasses.replace(table, counts=counts))
 
-        what, shown_by = (
-            "the light of the sky that is left, in units of SKY,",
-            "the same stars under another sky",
-        )
-        yield _Stated(what, "", "subtract the sky anew", shown_by, 0.1, less, 0.0)
+        what, remedy = "the light of the sky that is left, in units of SKY,", "subtract the sky anew"
+        yield _Stated(what, "", remedy, "the same stars under another sky", 0.1, less, 0.0)
 
 
 def _moved(
@@ -426,26 +418,22 @@ def _of_sky(calset: CalibrationSet) -> Iterator[_Stated]:
             moved = functools.partial(_moved, calset, moon, name.lower(), 1.0)
             yield _Stated(f"{name} of sky exposures", unit, remedy, shown_by, width, moved)
         for name, width in (("longitude", 180.0), ("latitude", 90.0)):
-            coordinate = float(getattr(site, name))
-
-            def elsewhere(step: float, name: str = name, coordinate: float = coordinate) -> CalibrationSet:
-                moved = (
-                    float(np.clip(coordinate + step, -90.0, 90.0))
-                    if name == "latitude"
-                    else coordinate + step
-                )
-                return dataclasses.replace(calset, site=dataclasses.replace(site, **{name: moved}))
-
+            elsewhere = functools.partial(_at_site, calset, name)
             remedy, shown_by = "check the site in the header", "the position of the telescope on a map"
-            yield _Stated(f"the {name} of the site", "deg", remedy, shown_by, width, elsewhere, coordinate)
+            value = float(getattr(site, name))
+            yield _Stated(f"the {name} of the site", "deg", remedy, shown_by, width, elsewhere, value)
     for kind in np.unique(e.kind[np.isfinite(e.rotator)]):
         remedy = "check its zero and its sense (docs: conventions)"
         moved = functools.partial(_moved, calset, e.kind == kind, "rotator", 1.0)
-        what, shown_by = (
-            f"ROTATOR of exposures of kind {kind}",
-            "polarised standards at several ROTATOR angles",
-        )
-        yield _Stated(what, "deg", remedy, shown_by, 45.0, moved)
+        shown_by = "polarised standards at several ROTATOR angles"
+        yield _Stated(f"ROTATOR of exposures of kind {kind}", "deg", remedy, shown_by, 45.0, moved)
+
+
+def _at_site(calset: CalibrationSet, name: str, step: float) -> CalibrationSet:
+    """The set with a site farther in longitude or latitude, up to the pole."""
+    value, limit = float(getattr(calset.site, name)) + step, 90.0 if name == "latitude" else np.inf
+    site = dataclasses.replace(calset.site, **{name: float(np.clip(value, -limit, limit))})
+    return dataclasses.replace(calset, site=site)
 
 
 def _of_field(calset: CalibrationSet) -> Iterator[_Stated]:

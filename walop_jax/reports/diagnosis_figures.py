@@ -70,7 +70,11 @@ def effect_figure(data: DiagnosisFigureData, number: int = 1, on: Canvas = PAGE)
     """Residuals without and with the effect of a comparison, and its part; of 0: starting and final model."""
     c = data.comparisons[number]
     without, with_it = (f"without\n{c.effect}", f"with\n{c.effect}") if number else _MODELS
-    rows = {without: c.before, c.effect or "explained": c.explained, with_it: c.after}
+    rows = {
+        without: c.field["BEFORE"],
+        c.effect or "explained": c.field["EXPLAINED"],
+        with_it: c.field["AFTER"],
+    }
     return residual_maps(data.points, rows, data.cameras, on)
 
 
@@ -82,9 +86,9 @@ def rms_figure(data: DiagnosisFigureData, on: Canvas = PAGE) -> AnyFigure:
     other points and are measured in other exposures: left out, if need be. Noise alone gives √(1 − 1/K) with K cameras
     and a free flux: 0.87 of four.
     """
-    overall = data.comparisons[0]
-    measured = np.isfinite(overall.before)
-    rms = (np.where(measured, values, np.nan) for values in (overall.rms_before, overall.rms_after))
+    overall = data.comparisons[0].field
+    measured = np.isfinite(overall["BEFORE"])
+    rms = (np.where(measured, values, np.nan) for values in (overall["RMS_BEFORE"], overall["RMS_AFTER"]))
     maps: dict[str, PointMap] = dict(zip(_MODELS, rms, strict=True))
     norm = Normalize(0.5, max(largest_size(*maps.values()), 1.5))
     return _maps(data.points, maps, data.cameras, norm, "magma_r", "rms residual (σ)", False, on)
@@ -146,9 +150,8 @@ def signature_figure(
     figure, (upper, lower) = on.panels(0.6 + 2.0 * len(cameras), 3.5, 2, len(cameras), **grid)
     position, label = _abscissa(exposures, angular)
     for k, camera in enumerate(cameras):
-        finite = np.isfinite(position) & np.isfinite(comparison.curve_before[:, k])
-        c = comparison
-        columns = (c.curve_before, c.curve_error, c.curve_explained, c.curve_after)
+        finite = np.isfinite(position) & np.isfinite(comparison.curves["BEFORE"][:, k])
+        columns = (comparison.curves[name] for name in ("BEFORE", "ERROR", "EXPLAINED", "AFTER"))
         x, before, error, explained, after = _binned(
             position[finite], *(column[finite, k] for column in columns)
         )
@@ -170,8 +173,8 @@ def _against_angle(comparison: ResidualComparison, exposures: Table) -> bool:
     behind = np.isfinite(exposures["CLP_ANGLE"])
     if comparison.harmonic >= 0 or not behind.any():
         return comparison.harmonic >= 0
-    explained = comparison.curve_explained
-    power = np.nansum(np.where(explained != 0, explained, comparison.curve_before) ** 2, axis=1)
+    explained = comparison.curves["EXPLAINED"]
+    power = np.nansum(np.where(explained != 0, explained, comparison.curves["BEFORE"]) ** 2, axis=1)
     return bool(power[behind].sum() > 0.5 * power.sum())
 
 

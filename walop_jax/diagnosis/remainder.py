@@ -26,20 +26,20 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
     """The state without unneeded additions, and its unidentified remainder (None: nothing).
 
     A model that predicts exposures worse than the first one is not adopted. More descriptions than
-    `thresholds.MOST_SENTENCES` can be one thing that none of them holds.
+    `thresholds.MOST_SENTENCES` count as a single cause that none of them describes: they become the remainder.
     """
     state, remainder = _leftover(first, prune(first, state, judge), judge)
     if state.steps and (worse := _worse(first.evidence, state.evidence)):
         return _not_adopted(first, state, worse)
-    said = _descriptions(state)
+    added = _descriptions(state)
     if remainder is not None:
-        against = tuple(text for name, text in _contradicted(state).items() if name not in said)
+        against = tuple(text for name, text in _contradicted(state).items() if name not in added)
         return state, dataclasses.replace(remainder, parts=(*remainder.parts, *against))
-    if len(said) <= thresholds.MOST_SENTENCES:
+    if len(added) <= thresholds.MOST_SENTENCES:
         return state, None
-    text = f"{len(said)} descriptions were needed: they say where it sits, no single one of them what it is"
-    remainder = Unexplained(state.evidence.table.p_global, f"{text} ({' | '.join(said)})", ())
-    columns = [first.evidence.said[name] for name in said]
+    text = f"{len(added)} descriptions were needed: they show its place, no single one its nature"
+    remainder = Unexplained(state.evidence.table.p_global, f"{text} ({' | '.join(added)})", ())
+    columns = [first.evidence.candidates[name] for name in added]
     if predicts_unseen(first.evidence.design, columns, thresholds.USEFUL):
         return state, remainder
     state = _without(first, state, [Described.name], judge)
@@ -104,7 +104,7 @@ def _leftover(first: State, state: State, judge: Refits) -> Remainder:
             continue
         remainder, with_term = _with_free_form(state, judge)
         if partial:
-            text = "explains a part and may stand in for something else, not added"
+            text = "explains a part and may imitate something else, not added"
             remainder = dataclasses.replace(_and(remainder, f"{text}: {'; '.join(partial)}"), parts=partial)
         if with_term is None:
             return state, remainder
@@ -143,7 +143,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     result, measured = evidence.result, evidence.design.measured
     patterns = tuple(evidence.patterns_needed())
     remainder = _unexplained(evidence, patterns)
-    blocks = dict.fromkeys(block for name, _ in patterns if (block := evidence.blocks[name]) is not None)
+    blocks = dict.fromkeys(block for name, _ in patterns if (block := evidence.candidates[name].block))
     if len(result.calset.exposures) > limits.FREE_EXPOSURES:
         blocks.pop("exposures", None)
     if FreeForm.name in result.model.effect_names or not blocks or judge.over(state.fits):
@@ -170,7 +170,7 @@ def _unexplained(evidence: Examination, patterns: tuple[tuple[str, float], ...])
     """Unidentified remainder of an examination: its patterns, and the location of the residuals."""
     if not evidence.alarm:
         ratio = evidence.chi2 / evidence.dof
-        text = f"residuals scatter more than N_ERR says (χ²/dof = {ratio:.3g}) without a known pattern"
+        text = f"residuals scatter more than N_ERR (χ²/dof = {ratio:.3g}) without a known pattern"
     elif patterns:
         text = f"unidentified patterns: {'; '.join(f'{name} (p = {p:.1g})' for name, p in patterns)}"
     else:
@@ -227,7 +227,7 @@ def _contradicted(state: State) -> dict[str, str]:
 
 def _descriptions(state: State) -> tuple[str, ...]:
     """Names of the added groups of sentences."""
-    return tuple(name for step in state.steps for name in step.said)
+    return tuple(name for step in state.steps for name in step.groups)
 
 
 _LEFT_OUT = (
