@@ -226,11 +226,10 @@ def read_nights(path: Path) -> Any:
     """The table of nights in a file, in the units of `COLUMNS`; `DataError` for one that is none."""
     source = read_input_table(path, (*SAME, "CALHASH"))
     table = source.table
-    for name in (*SAME, "CALHASH"):
-        if name not in table.colnames:
-            what = "the column is missing: this is no table of quality numbers"
-            advice = "name the table that walop-jax quality has made, or a new one"
-            raise fail(what, file=path, column=name, advice=advice)
+    if lacking := [name for name in (*SAME, "CALHASH") if name not in table.colnames]:
+        what = "the column is missing: this is no table of quality numbers"
+        advice = "name the table that walop-jax quality has made, or a new one"
+        raise fail(what, file=path, column=lacking[0], advice=advice)
     stated = [name for name in table.colnames if name in COLUMNS or name.startswith(f"{GAIN}_")]
     about = {name: COLUMNS.get(name, OF_CAMERA) for name in stated}
     rules = {name: RULES.get(name, Column("float", about[name][0], missing=np.nan)) for name in stated}
