@@ -81,7 +81,7 @@ def test_calibrations_and_catalogues_of_other_instruments_are_told(old, table, m
     other = table.copy()
     other.meta["INSTRUME"] = "WALOP-NORTH"
     (warning,) = walop.affected(old, old, other).warnings
-    assert "INSTRUME of the table is WALOP-NORTH, the calibration is one of WALOP-SOUTH" in warning
+    assert "INSTRUME of the table is WALOP-NORTH, the calibration is of WALOP-SOUTH" in warning
     new = dataclasses.replace(old, path=Path("NEW"))
     names = property(lambda it: "WALOP-NORTH" if it.path == new.path else "WALOP-SOUTH")
     monkeypatch.setattr(Calibration, "instrument", names)

@@ -120,8 +120,7 @@ def read_catalogue(
         place.refuse(sky < 0, "is below 0", "SKY", "the level of the sky that was subtracted, in electrons")
     stated = str(source.table.meta.get("INSTRUME", instrument.name))
     if stated.upper() != instrument.name.upper():
-        what = f"INSTRUME of the table is {stated}, the calibration is one of {instrument.name}"
-        source.remarks.append(what)
+        source.remarks.append(f"INSTRUME of the table is {stated}, the calibration is of {instrument.name}")
     copy, repeated = _copies(source, points, counts, sigma, rotator, star)
     bad |= copy[:, None]
     return Catalogue(

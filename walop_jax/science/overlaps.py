@@ -52,10 +52,11 @@ class Overlap:
 
 def extents(catalogue: Catalogue) -> Float[np.ndarray, " s"]:
     """The largest distance in X or Y (deg) between the rows of every star."""
-    order = np.argsort(catalogue.star, kind="stable")
-    first = np.searchsorted(catalogue.star[order], np.arange(catalogue.star.max() + 1))
-    places = (place[order] for place in (catalogue.points.x, catalogue.points.y))
-    return np.maximum(*(np.maximum.reduceat(p, first) - np.minimum.reduceat(p, first) for p in places))
+    x, y = catalogue.points.x, catalogue.points.y
+    ends = np.full((4, catalogue.star.max() + 1), -np.inf)
+    for end, values in zip(ends, (x, -x, y, -y), strict=True):
+        np.maximum.at(end, catalogue.star, values)
+    return np.maximum(ends[0] + ends[1], ends[2] + ends[3])
 
 
 def at_several_places(catalogue: Catalogue) -> Bool[np.ndarray, " n"]:

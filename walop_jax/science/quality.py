@@ -245,9 +245,8 @@ def joined(old: Any, new: Any) -> tuple[Any, list[str]]:
     latest: dict[tuple[str, ...], int] = {}
     hashes, remarks = set[str](), []
     for number, row in enumerate(rows):
-        key, content = tuple(str(row[name]) for name in SAME), str(row["CALHASH"])
-        if not np.isfinite(float(np.ma.filled(row["NIGHT"], np.nan))):
-            key = (*key, content)  # of no night: in the place of none
+        content = str(row["CALHASH"])  # in the key of a row without a night, which replaces no other
+        key = (*(str(row[name]) for name in SAME), content if np.isnan(row["NIGHT"]) else "")
         if content in hashes:
             remarks.append(f"{row['RUN']}: this calibration is in the table already")
             continue
@@ -287,10 +286,10 @@ def _plain(column: Any) -> Float[np.ndarray, " n"]:
 
 def _medians_before(values: Float[np.ndarray, " n"], alike: Sequence[object]) -> Float[np.ndarray, " n"]:
     """Median of all earlier rows of the same instrument and filters; of the first one itself."""
-    medians = np.empty(len(values))
+    medians = values.copy()
     for n, kind in enumerate(alike):
-        earlier = [values[k] for k in range(n) if alike[k] == kind and np.isfinite(values[k])]
-        medians[n] = np.median(earlier) if earlier else values[n]
+        if earlier := [values[k] for k in range(n) if alike[k] == kind and np.isfinite(values[k])]:
+            medians[n] = np.median(earlier)
     return medians
 
 
