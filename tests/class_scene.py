@@ -13,6 +13,7 @@ from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import only_a_class, with_average
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import Diagnosis, Step
+from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.fit.verdict import Quality
@@ -36,7 +37,7 @@ def told() -> tuple[FitResult, Context, Any]:
         for probe in grammar.sentences(model.template, calset.exposures, len(calset.points))
         if probe.name.startswith("gain of")
     ]
-    state = examine(result, (), np.random.default_rng(0), sentences=said)
+    state = examine(result, Hypotheses(sentences=said), np.random.default_rng(0))
     return result, context, classes_of(state, context, {Described.name}, [TOLD])
 
 

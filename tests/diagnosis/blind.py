@@ -28,8 +28,8 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.exact import Trial
-from walop_jax.diagnosis.examination import Evidence, Examination, examine
-from walop_jax.diagnosis.hypotheses import Probe, Ranked, probes, said_by
+from walop_jax.diagnosis.examination import Evidence, Examination, common_mode, examine
+from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, probes, said_by
 from walop_jax.diagnosis.score import ScoreSpace, separations
 from walop_jax.diagnosis.search import State, search
 from walop_jax.fit.base_model import base_model
@@ -197,7 +197,7 @@ class Blind:
         wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
         self.context, self.template = effect_context(model.template, calset.exposures), model.template
         every = grammar.sentences(model.template, calset.exposures, len(calset.points))
-        examination = examined(result, wanted, self.rng, None, every)
+        examination = examined(result, Hypotheses(wanted, every), self.rng)
         self.sentences = examination.sentences
         self.probes = list(examination.probes)
         self.in_sentences = {p.name: set(p.group[0].in_sentences(model.template)) for p in self.probes}
@@ -213,17 +213,17 @@ class Blind:
         self.said = {
             text: column
             for probe in self.sentences
-            for text, column in zip(said_by(probe), examination.said[probe.name].columns.T, strict=True)
+            for text, column in zip(said_by(probe), examination.candidates[probe.name].columns.T, strict=True)
         }
         for name, shape in outside(examination.design.measured, self.said):
             column = examination.design.projector(examination.design.stacked([shape[:, None]])[:, 0])
-            along = self._whitening.T @ examination.products(column)
+            products = examination.design.products(examination.columns, column)
+            along = self._whitening.T @ products
             self.outside[name] = along, max(float(column @ column - along @ along), 0.0)
         explained = {*self.effect_of, *(probe.name for probe in self.sentences)}
         self.patterns = [name for name in self.space.names if name not in explained]
-        self._behind_nuisance, self._reduce = self.space.with_base(
-            [SINGLE_EXPOSURES], examination.common_mode
-        )
+        widths = common_mode(self.space, examination.design)
+        self._behind_nuisance, self._reduce = self.space.with_base([SINGLE_EXPOSURES], widths)
         self.evidence = examination
         self._spaces: Spaces = {}
         self.free = examination.space.free

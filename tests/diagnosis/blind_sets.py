@@ -22,7 +22,7 @@ from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import Diagnosis
-from walop_jax.diagnosis.hypotheses import Probe, all_candidates, probes
+from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, all_candidates, probes
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
@@ -50,7 +50,7 @@ class Hiding:
         self.design = Design.of(self.fit)
         self.context = effect_context(self.fit.model.template, calset.exposures)
         every = list(probes(EFFECTS, self.context))
-        examination = examine(self.fit, every, np.random.default_rng(0))
+        examination = examine(self.fit, Hypotheses(every), np.random.default_rng(0))
         self.probes = [p for p in examination.probes if examination.table[p.name].testable]
         self.names = sorted({p.effect.name for p in self.probes})
 

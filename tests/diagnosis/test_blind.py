@@ -28,7 +28,7 @@ def test_shapes_are_what_their_sentences_say(blind):
         groups = [probe.name for probe in blind.sentences if texts & set(said_by(probe))]
         whole = [said[text][:, None] for text in suite.OUTSIDE[name] if text in said]
         some = [
-            *(blind.evidence.said[group].columns for group in groups),
+            *(blind.evidence.candidates[group].columns for group in groups),
             *([np.hstack(whole)] if whole else []),
         ]
         held = [

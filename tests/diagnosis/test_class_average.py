@@ -4,38 +4,40 @@ import numpy as np
 import pytest
 
 from walop_jax.diagnosis import class_average as average
+from walop_jax.diagnosis.design import taken_up
+from walop_jax.diagnosis.score import Projector
 
 
 def test_two_members_as_probable_by_hand():
     """Means ±d with variance s²: mean 0, variance s² + d²; at odds of 3 to 1 d/2 and s² + 3 d²/4."""
     d, square = 2.0, 0.25
     values, covariances = np.array([[d], [-d]]), [np.array([[square]])] * 2
-    even = average.mixture(np.array([0.5, 0.5]), values, covariances)
-    assert even.mean == pytest.approx([0.0])
-    assert even.covariance == pytest.approx(np.array([[square + d**2]]))
-    odd = average.mixture(average.probabilities([np.log(3.0), 0.0]), values, covariances)
-    assert odd.mean == pytest.approx([d / 2])
-    assert odd.between == pytest.approx(np.array([[0.75 * d**2]]))
+    mean, covariance = average.mixture(np.array([0.5, 0.5]), values, covariances)
+    assert mean == pytest.approx([0.0])
+    assert covariance == pytest.approx(np.array([[square + d**2]]))
+    mean, covariance = average.mixture(np.array([0.75, 0.25]), values, covariances)
+    assert mean == pytest.approx([d / 2])
+    assert covariance == pytest.approx(np.array([[square + 0.75 * d**2]]))
 
 
 def test_moments_of_a_mixture_are_those_of_its_draws():
     rng = np.random.default_rng(1)
     weights, values = np.array([0.2, 0.5, 0.3]), rng.normal(size=(3, 2))
     roots = 0.3 * rng.normal(size=(3, 2, 2))
-    found = average.mixture(weights, values, [root @ root.T for root in roots])
+    mean, covariance = average.mixture(weights, values, [root @ root.T for root in roots])
     member = rng.choice(3, 400_000, p=weights)
     draws = values[member] + np.einsum("kij,kj->ki", roots[member], rng.normal(size=(len(member), 2)))
-    np.testing.assert_allclose(found.mean, draws.mean(axis=0), atol=5e-3)
-    np.testing.assert_allclose(found.covariance, np.cov(draws.T), rtol=2e-2, atol=5e-3)
+    np.testing.assert_allclose(mean, draws.mean(axis=0), atol=5e-3)
+    np.testing.assert_allclose(covariance, np.cov(draws.T), rtol=2e-2, atol=5e-3)
 
 
 def test_truth_drawn_from_the_members_has_pulls_of_one():
     """The law of total variance: errors of a mixture are right on average, whoever of them is true."""
     rng = np.random.default_rng(2)
-    weights, values = average.probabilities([0.0, -1.0, -2.0]), np.array([[0.0], [5.0], [-9.0]])
-    found = average.mixture(weights, values, [np.eye(1)] * 3)
+    weights, values = np.array([0.6, 0.3, 0.1]), np.array([[0.0], [5.0], [-9.0]])
+    mean, covariance = average.mixture(weights, values, [np.eye(1)] * 3)
     true = values[rng.choice(3, 100_000, p=weights), 0] + rng.normal(size=100_000)
-    pulls = (true - found.mean[0]) / np.sqrt(found.covariance[0, 0])
+    pulls = (true - mean[0]) / np.sqrt(covariance[0, 0])
     assert np.mean(pulls) == pytest.approx(0.0, abs=0.02)
     assert np.mean(pulls**2) == pytest.approx(1.0, abs=0.02)
 
@@ -51,7 +53,7 @@ def test_one_linear_step_is_the_least_squares_fit_of_the_other_model():
     left = residual + lost - basis @ (basis.T @ (residual + lost))
     projected = instead - basis @ (basis.T @ instead)
     b = -np.linalg.solve(projected.T @ projected, projected.T @ left)
-    by = average.moved(others, basis, lost + instead @ b)
+    by = -taken_up(others, Projector(others), lost + instead @ b)
     right = np.linalg.lstsq(np.hstack([others, instead]), -data, rcond=None)[0]
     np.testing.assert_allclose(b, right[3:], rtol=1e-10)
     np.testing.assert_allclose(fit[:3] + by, right[:3], rtol=1e-10)

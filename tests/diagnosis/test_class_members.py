@@ -16,6 +16,7 @@ from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import Classes, _with_ties, averaged, only_a_class
 from walop_jax.diagnosis.examination import examine
+from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
@@ -103,7 +104,7 @@ def test_what_was_added_is_in_its_class_once():
         for probe in grammar.sentences(model.template, calset.exposures, len(calset.points))
         if probe.name in (own, other)
     ]
-    state = examine(fit(Likelihood.of(calset, model)), (), np.random.default_rng(0), sentences=said)
+    state = examine(fit(Likelihood.of(calset, model)), Hypotheses(sentences=said), np.random.default_rng(0))
     (found,) = classes_of(state, context, {Described.name}, [own]).additions
     assert [member.name for member in found.members] == [own, other]
 

@@ -15,6 +15,7 @@ from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import averaged, only_a_class
 from walop_jax.diagnosis.description_shape import shape_changes
 from walop_jax.diagnosis.examination import examine
+from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.fit.base_model import base_model, model_like
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
@@ -39,7 +40,7 @@ def described():
     calset = simulate(SMALL, seed=3, effects=[Described.saying([TEXT], [SIZE])]).calset
     context = effect_context(base_model(calset).template, calset.exposures)
     model = with_effects(base_model(calset), [Described.saying([TEXT], [0.0])], context)
-    state = examine(fit(Likelihood.of(calset, model)), (), np.random.default_rng(0))
+    state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
     return state, context, classes_of(state, context, {Described.name}, [TEXT])
 
 
@@ -146,7 +147,9 @@ def test_a_hidden_deviation_is_recovered_with_its_sign():
         )
         for t in ([TEXT], [TEXT, other])
     )
-    shape = classes_of(examine(one, (), np.random.default_rng(0)), context, {Described.name}, [TEXT]).shape
+    shape = classes_of(
+        examine(one, Hypotheses(), np.random.default_rng(0)), context, {Described.name}, [TEXT]
+    ).shape
     j = [total[0][1].text for total in shape.deviations.sums].index(other)
     exact = both.values[both.model.index(f"described.{other.replace(' ', '_')}")]
     assert exact == pytest.approx(-1.5e-3, rel=0.3)
@@ -219,7 +222,7 @@ def test_deviations_of_the_polariser_do_nothing_to_a_star():
     calset = simulate(SMALL, seed=3, effects=[Described.saying([text], [4e-3])]).calset
     context = effect_context(base_model(calset).template, calset.exposures)
     model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
-    state = examine(fit(Likelihood.of(calset, model)), (), np.random.default_rng(0))
+    state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
     classes = classes_of(state, context, {Described.name}, [text])
     assert classes.shape.on_stars == ()
     product = averaged(Calibration.from_fit(state.result.judged()), classes._replace(additions=()), context)

@@ -50,9 +50,7 @@ def found(fitted) -> DetectionLimits:
 def examination(fitted) -> Examination:
     calset = fitted.calset
     asked = hypotheses(CATALOGUE, fitted.model.template, calset.exposures, len(calset.points))
-    return examine(
-        fitted, asked.names, np.random.default_rng(1), sentences=asked.sentences, parts=asked.parts
-    )
+    return examine(fitted, asked, np.random.default_rng(1))
 
 
 def test_every_effect_has_a_limit_or_is_named_as_beyond_these_data(found):

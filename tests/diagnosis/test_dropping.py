@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scenes import PLAN
 
-from walop_jax.diagnosis import leftover, thresholds
+from walop_jax.diagnosis import remainder, thresholds
 from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.figure_data import figure_data
+from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.diagnosis.refits import Refits
 from walop_jax.diagnosis.search import State
 from walop_jax.diagnosis.workflow import diagnose
@@ -88,13 +89,13 @@ def test_what_has_no_name_is_asked_of_the_model_without_needless_names(monkeypat
         evidence = SimpleNamespace(alarm=bool(steps), result=result)
         return State(evidence, steps)
 
-    monkeypatch.setattr(leftover, "prune", lambda first, last, judge: state())
-    last, remainder = leftover.concluded(state(), state(Trial(ZERO, 1.0, 1.0, noise=False)), Mock(Refits))
-    assert (last.steps, remainder) == ((), None)
+    monkeypatch.setattr(remainder, "prune", lambda first, last, judge: state())
+    last, rest = remainder.concluded(state(), state(Trial(ZERO, 1.0, 1.0, noise=False)), Mock(Refits))
+    assert (last.steps, rest) == ((), None)
 
 
 def test_when_time_or_fits_are_over_nothing_further_is_tried():
-    how = (Context(), (), (), (), (), np.random.default_rng(0), lambda text: None)
+    how = (Context(), Hypotheses(), np.random.default_rng(0), lambda text: None)
     assert Refits(*how, minutes=0.0).over(0) == "0 minutes"
     assert Refits(*how).over(thresholds.MOST_FITS) == f"{thresholds.MOST_FITS} fits"
     assert Refits(*how).over(0) == ""
@@ -142,5 +143,5 @@ def test_a_name_that_leaves_the_data_as_unexplained_is_told_as_a_part_and_taken_
     def state(chi2, *steps):
         return State(SimpleNamespace(dof=100, result=SimpleNamespace(chi2=chi2, dof=100)), steps)
 
-    told = leftover._parts(state(6900.0), state(100.0 * left, step))
+    told = remainder._parts(state(6900.0), state(100.0 * left, step))
     assert told == ({"flexure": "flexure (χ²/dof 69 → 24)"} if part else {})

@@ -14,7 +14,7 @@ from walop_jax.data.calset import read_calibration_set
 from walop_jax.diagnosis.design import Design, exposure_folds, field_folds, held_out
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import document
-from walop_jax.diagnosis.hypotheses import probes
+from walop_jax.diagnosis.hypotheses import Hypotheses, probes
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, refit
@@ -114,7 +114,7 @@ def test_cost_of_the_scores_of_the_whole_catalogue(either_south_set):
         began = time.perf_counter()
         result = fit(Likelihood.of(calset, model))
         middle = time.perf_counter()
-        examine(result, wanted, np.random.default_rng(0))
+        examine(result, Hypotheses(wanted), np.random.default_rng(0))
         seconds[label] = middle - began, time.perf_counter() - middle
         print(f"{label}: refit {seconds[label][0]:.2f} s, scores {seconds[label][1]:.2f} s")
     assert seconds["warm"][1] <= 10 * seconds["warm"][0]

@@ -87,7 +87,10 @@ class Scenes:
         if number < 0:
             return self.pairs[-1 - number]
         r = self.residuals[number] * STEP
-        along = self.blind._whitening.T @ self.blind.evidence.products(r)
+        evidence = self.blind.evidence
+        along = self.blind._whitening.T @ evidence.design.products(
+            evidence.columns, evidence.design.projector(r)
+        )
         rest = float(r @ r - along @ along)
         return Scene("", (), 0.0, along, rest, removed=(str(self.without[number]),))
 

@@ -37,7 +37,7 @@ from walop_jax.diagnosis.detection_limits import (  # noqa: E402
     detection_limits,
 )
 from walop_jax.diagnosis.examination import Examination, examine  # noqa: E402
-from walop_jax.diagnosis.hypotheses import Probe, probes  # noqa: E402
+from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, probes  # noqa: E402
 from walop_jax.diagnosis.score import separations  # noqa: E402
 from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 from walop_jax.model.effects import EFFECTS  # noqa: E402
@@ -76,8 +76,8 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
     every = list(probes(EFFECTS, context))
     said = grammar.sentences(template, calset.exposures, len(calset.points))
     said = grammar.beside_names(said, EFFECTS, context, template)[0]
-    names = examine(result, every, np.random.default_rng(0))
-    whole = examine(result, every, np.random.default_rng(0), None, said)
+    names = examine(result, Hypotheses(every), np.random.default_rng(0))
+    whole = examine(result, Hypotheses(every, said), np.random.default_rng(0))
     p = names.table.local(thresholds.ALARM)
     space, full, rng = whole.space, whole.bare, np.random.default_rng(1)
     noise, threshold = noise_scores(space, rng, draws), np.log(whole.table.local(thresholds.ALARM))
@@ -121,7 +121,7 @@ def sets(seed: int, most: int) -> Iterator[tuple[str, float]]:
     limits = detection_limits(reference)
     calset = reference.calset
     every = list(probes(EFFECTS, effect_context(reference.model.template, calset.exposures)))
-    names = examine(reference, every, np.random.default_rng(0))
+    names = examine(reference, Hypotheses(every), np.random.default_rng(0))
     p = names.table.local(thresholds.ALARM)
     without = refit(simulate(PLAN, seed=seed, instrument=truth).calset)
     start = matrices_of(without.model.instrument(without.values), calset)

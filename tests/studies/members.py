@@ -22,6 +22,7 @@ from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import averaged
 from walop_jax.diagnosis.examination import examine
+from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, with_honest_errors
 from walop_jax.likelihood.likelihood import Likelihood
@@ -46,7 +47,7 @@ def judged(seed: int) -> sealed.Judged:
     result = with_honest_errors(fit(Likelihood.of(one.calset, model))).judged()
     every = grammar.sentences(model.template, one.calset.exposures, len(one.calset.points))
     some = [probe for probe in every if probe.name.startswith(KINDS)]
-    state = examine(result, (), np.random.default_rng(0), sentences=some)
+    state = examine(result, Hypotheses(sentences=some), np.random.default_rng(0))
     classes = classes_of(state, context, {Described.name}, [TOLD])
     return sealed.judged(averaged(Calibration.from_fit(result), classes, context), True, one)
 

@@ -131,7 +131,8 @@ def search(bench: Bench) -> Callable[[int], Answer]:
 
     def answer(scene: int) -> Answer:
         r = bench.residual(scene)
-        along = blind._whitening.T @ blind.evidence.products(r)
+        evidence = blind.evidence
+        along = blind._whitening.T @ evidence.design.products(evidence.columns, evidence.design.projector(r))
         seen = Scene("", (), 0.0, along, float(r @ r - along @ along), removed=(str(bench.without[scene]),))
         start = blind.start(seen)
         verdict, left = blind.judged(seen, start)

@@ -12,40 +12,26 @@ Limits       Members with the same effect on the result count once, as the most 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from walop_jax.likelihood.inverses import pseudo_inverse, unit_columns
+from walop_jax.likelihood.inverses import pseudo_inverse
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
 
 
-class Mixture(NamedTuple):
-    """Mean of some models, its covariance, and the contribution of the spread `between` them."""
-
-    mean: Vector
-    covariance: Matrix
-    between: Matrix
-
-
-def probabilities(evidence: Sequence[float] | Vector) -> Vector:
-    """Posterior probabilities, from ln B, of models with equal prior probabilities."""
-    odds = np.exp(np.asarray(evidence, float) - np.max(evidence))
-    return odds / odds.sum()
-
-
-def mixture(weights: Vector, values: Float[np.ndarray, "k n"], covariances: Sequence[Matrix]) -> Mixture:
-    """The mean over models of some probabilities, by the law of total variance."""
+def mixture(
+    weights: Vector, values: Float[np.ndarray, "k n"], covariances: Sequence[Matrix]
+) -> tuple[Vector, Matrix]:
+    """Mean and covariance over models of some probabilities, by the law of total variance."""
     mean = weights @ values
     away = values - mean
-    between = (away * weights[:, None]).T @ away
-    within = np.zeros_like(between)
-    for weight, covariance in zip(weights, covariances, strict=True):
-        within += weight * covariance
-    return Mixture(mean, within + between, between)
+    covariance = (away * weights[:, None]).T @ away
+    for weight, within in zip(weights, covariances, strict=True):
+        covariance += weight * within
+    return mean, covariance
 
 
 def known_apart_from(covariance: Matrix, at: Int[np.ndarray, " k"]) -> Matrix:
@@ -54,16 +40,6 @@ def known_apart_from(covariance: Matrix, at: Int[np.ndarray, " k"]) -> Matrix:
     conditional = covariance - across @ pseudo_inverse(covariance[np.ix_(at, at)], 1e-12) @ across.T
     conditional[at], conditional[:, at] = 0.0, 0.0
     return 0.5 * (conditional + conditional.T)
-
-
-def moved(others: Matrix, basis: Matrix, rows: Float[np.ndarray, "r ..."]) -> Float[np.ndarray, "f ..."]:
-    """Change −J⁺ d of the parameters with columns J that compensates a change d of the residuals.
-
-    `basis` is an orthonormal basis of the columns.
-    """
-    unit, norm = unit_columns(others)
-    scaled = np.linalg.lstsq(basis.T @ unit, -(basis.T @ rows), rcond=None)[0]
-    return scaled / norm.reshape(-1, *[1] * (rows.ndim - 1))
 
 
 def distinct(

@@ -23,13 +23,15 @@ from collections.abc import Collection, Iterator, Sequence
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from scipy import special
 
 from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_average import distinct, moved, probabilities
+from walop_jax.diagnosis.class_average import distinct
 from walop_jax.diagnosis.class_product import Classes, ClassOf, Likeness, Shape, Sum
 from walop_jax.diagnosis.description_shape import shape_changes
+from walop_jax.diagnosis.design import taken_up
 from walop_jax.diagnosis.exact import signature
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.hidden_mistakes import usual_exposure
@@ -46,7 +48,7 @@ Matrix = Float[np.ndarray, "_ _"]
 ALIKE = 0.5  # of the errors of the matrix: members that differ by less count as one
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
 LINEAR = 0.01  # relative error of the evidence of a linear step
-LEAST_PROBABLE, PLAUSIBLE = 1e-3, 0.02  # of members in the average, and in the check of the farthest
+PLAUSIBLE = 0.02  # probability of members in the check of the farthest
 
 
 def classes_of(
@@ -154,11 +156,11 @@ class _Laid:
         changes = np.stack([member.change for member in members])
         evidence = np.array([np.inf, *(member.evidence for member in members[1:])])
         members = [members[i] for i in distinct(evidence, changes, self.errors, ALIKE)][:MOST_MEMBERS]
-        weights = probabilities([member.evidence for member in members])
+        weights = special.softmax([member.evidence for member in members])
         members = [
             member._replace(probability=float(weight))
             for member, weight in zip(members, weights, strict=True)
-            if weight > LEAST_PROBABLE or member is addition
+            if weight > np.exp(-thresholds.IMPROBABLE) or member is addition
         ]
         return ClassOf(name, at, tuple(members), *self._spread(members))
 
@@ -255,7 +257,6 @@ class _Step:
         along = design.products(state.columns, basis)
         gram, scores = state.bare.gram + along @ along.T, design.products(state.columns, self.left)
         places, scored = state.bare.places(), []
-        number = {name: i for i, name in enumerate(state.bare.names)}
         for probe in (*state.probes, *state.sentences, *(probe for probe, _ in state.parts)):
             at = places[probe.name]
             evidence = log_bayes(gram[at, at], scores[at], probe.widths) / state.floor**2
@@ -275,7 +276,7 @@ class _Step:
                 chosen.append((probe, evidence, sums, square, along_residual))
         self.laid.added([total for _, _, sums, *_ in chosen for total in sums])  # all of them in one go
         for probe, evidence, sums, square, along_residual in chosen:
-            column = design.stacked([state.columns[number[probe.name]]])
+            column = design.stacked([state.candidates[probe.name].columns])
             yield self.member(probe.name, evidence, sums, column, square, along_residual, probe.widths)
 
     def in_other_kinds(self, member: Likeness) -> Likeness | None:
@@ -319,9 +320,8 @@ class _Step:
         amplitudes = -covariance @ along
         count = len(laid.fit.model.free)
         values, slopes = np.zeros(count), np.zeros((count, len(widths)))
-        basis = self.projector.basis
-        values[self.rest] = moved(self.jacobian, basis, self.lost + column @ amplitudes)
-        slopes[self.rest] = moved(self.jacobian, basis, column)
+        values[self.rest] = -taken_up(self.jacobian, self.projector, self.lost + column @ amplitudes)
+        slopes[self.rest] = -taken_up(self.jacobian, self.projector, column)
         values[self.at] = -laid.fit.values[laid.fit.model.free[self.at]]
         vectors, added = laid.added(sums)
         change = of_matrix(vectors, added @ amplitudes, laid.template.cameras.pairs)

@@ -36,10 +36,6 @@ Matrix = Float[np.ndarray, "_ _"]
 Sum = tuple[tuple[float, Sentence], ...]
 """One amplitude: a sum of sentences with their coefficients."""
 
-FAR = 3.0  # errors of the product that no plausible member may lie from an element of it, in the median
-_SAME = 1e-9  # of a row of coefficients, which earlier rows must hold for it to be a combination of them
-_SHOWN = 4  # members listed in a sentence
-
 
 class Likeness(NamedTuple):
     """One member of a class: its words, ln B against the model without what was added, its amplitudes in sentences.
@@ -160,9 +156,10 @@ def averaged(calibration: Calibration, classes: Classes, context: Context) -> Ca
             slopes = into @ member.slopes + amplitudes
             means.append(start + into @ member.values + amplitudes @ member.amplitudes)
             errors.append(conditional + slopes @ member.covariance @ slopes.T)
-        average = mixture(np.array([member.probability for member in group.members]), np.stack(means), errors)
-        values += average.mean - start
-        covariance += average.covariance - fitted
+        weights = np.array([member.probability for member in group.members])
+        mean, average = mixture(weights, np.stack(means), errors)
+        values += mean - start
+        covariance += average - fitted
     if classes.shape is not None:  # the descriptions remain: their parameters are as free as before
         deviations, amplitudes = classes.shape.deviations, _deviations_of(model, classes.shape)
         slopes = into @ deviations.slopes + amplitudes
@@ -232,11 +229,13 @@ def _with_ties(model: Model, new: Sequence[int], amplitudes: Float[np.ndarray, "
     parameters, free = list(model.parameters), list[int]()
     for i in new:
         row, earlier = amplitudes[i], amplitudes[free]
-        same = next((k for k in free if np.allclose(amplitudes[k], row, rtol=_SAME, atol=0.0)), None)
+        same = next(
+            (k for k in free if np.allclose(amplitudes[k], row, rtol=thresholds.ROUNDING, atol=0.0)), None
+        )
         remainder = row - np.linalg.lstsq(earlier.T, row, rcond=None)[0] @ earlier if free else row
         if same is not None:
             parameters[i] = dataclasses.replace(parameters[i], tie=parameters[same].name)
-        elif np.abs(remainder).max() <= _SAME * np.abs(row).max():
+        elif np.abs(remainder).max() <= thresholds.ROUNDING * np.abs(row).max():
             parameters[i] = dataclasses.replace(parameters[i], free=False)
         else:
             free.append(i)
@@ -266,9 +265,9 @@ def _positive(matrix: Matrix) -> Matrix:
 def only_a_class(classes: Classes) -> Iterator[str]:
     """A sentence on each class whose members differ by so much that nothing of it may be trusted, and on shapes."""
     for group in classes.additions:
-        if not (_dominates(group.spread, group.stated) or group.off > FAR):
+        if not (_dominates(group.spread, group.stated) or group.off > thresholds.SEPARATION):
             continue
-        names = some([f"{m.name} ({100 * m.probability:.0f} %)" for m in group.members[1:]], _SHOWN)
+        names = some([f"{m.name} ({100 * m.probability:.0f} %)" for m in group.members[1:]], thresholds.SHOWN)
         yield (
             f"only a class of causes was named: {group.added} ({100 * group.members[0].probability:.0f} %) or {names}, "
             f"with different effects on stars (p by {two_digits(100 * group.spread)} %, median, where the "

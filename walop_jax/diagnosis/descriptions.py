@@ -64,7 +64,7 @@ def other_descriptions(
     candidates = itertools.takewhile(lambda _: fits(), sentences)
     screened = sorted(_screened(result, candidates, context), key=lambda item: item[0].left)
     compared, trials = {choice.change: choice for choice, _, _ in screened}, []
-    best = [item for item in screened if item[1] > thresholds.LEAST_GAIN][: thresholds.DESCRIPTIONS_FITTED]
+    best = [item for item in screened if item[1] > thresholds.LEAST_GAIN][: thresholds.MOST_FITTED]
     chosen = {choice.change for choice, _, _ in best}
     others = [item for item in screened if item[0].change in curves and item[0].change not in chosen]
     for choice, _, start in (*best, *others):

@@ -376,13 +376,8 @@ class Design:
         return -np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(norm)), scaled.T @ r) / norm
 
     def taken_up(self, along: Float[np.ndarray, "q k"]) -> Float[np.ndarray, "f k"]:
-        """By how much the free parameters change, at first order, when the model lacks some amplitudes: R⁻¹ QᵀC.
-
-        J = QR with Q the basis of `projector`; a column of C holds the derivative of the rows with respect to an
-        amplitude that the data have, `along` is QᵀC.
-        """
-        unit, norm = unit_columns(self.jacobian)
-        return np.linalg.lstsq(self.projector.basis.T @ unit, along, rcond=None)[0] / norm[:, None]
+        """By how much the free parameters change when the model lacks some amplitudes (`taken_up`); `along` is QᵀC."""
+        return _taken_up(self.jacobian, self.projector, along)
 
     def robust_ratio(self, name: str) -> float:
         """Largest ratio of robust to stated errors among the parameters of an effect; NaN when it has none.
@@ -400,6 +395,23 @@ class Design:
         by_exposure = np.zeros((self.measured.used.shape[1], len(at)))
         np.add.at(by_exposure, self.exposure, pull)
         return float(np.sqrt(np.max(np.sum(by_exposure**2, axis=0) / np.diag(inverse[:, at]))))
+
+
+def taken_up(
+    jacobian: Float[np.ndarray, "_ f"], projector: Projector, rows: Float[np.ndarray, "_ ..."]
+) -> Float[np.ndarray, "f ..."]:
+    """Change R⁻¹QᵀC of the parameters with the Jacobian J = QR, at first order, by changes C of the rows.
+
+    Q is the basis of `projector`, that of J.
+    """
+    return _taken_up(jacobian, projector, projector.basis.T @ rows)
+
+
+def _taken_up(
+    jacobian: Float[np.ndarray, "_ f"], projector: Projector, along: Float[np.ndarray, "q ..."]
+) -> Float[np.ndarray, "f ..."]:
+    unit, norm = unit_columns(jacobian)
+    return (np.linalg.lstsq(projector.basis.T @ unit, along, rcond=None)[0].T / norm).T
 
 
 HOLDOUT_FOLDS = 5

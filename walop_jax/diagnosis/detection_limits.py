@@ -63,7 +63,6 @@ MANY_SHAPES = 8
 """Shapes of an effect above which one of them, of the median size, stands for all in what it does to the matrix."""
 
 SECOND_ORDER = 1.1
-_ABSORBED = 1e-9  # share of the square of a column that a rival leaves below which the two are the same
 
 NO_LEVEL = "q and u cannot both be measured with one exposure"
 HEAD = ("amplitude", ">detected", ">named", "unit", ">error of q, u (%)", "can be mistaken for")
@@ -305,7 +304,7 @@ def detection_limits(
     result = sampled(on_field_points(result), most_points(calset, template, listed.amplitudes))
     tell(Stage("differentiating every effect", "differentiating"))
     rng = np.random.default_rng(seed)
-    examination = examine(result, listed.names, rng, sentences=listed.sentences, parts=listed.parts)
+    examination = examine(result, listed, rng)
     p = examination.table.local(thresholds.ALARM)
     tell(Stage("comparing the effects", "comparing"))
     rivals = examination.bare.subset([probe.name for probe in examination.probes])
@@ -350,7 +349,7 @@ def _columns(examination: Examination, rivals: ScoreSpace, probe: Probe, p: floa
         del apart[probe.effect.name]
         nearest = min(apart.values(), default=np.inf)
         named = detected
-        if nearest <= np.sqrt(_ABSORBED * square):
+        if nearest <= np.sqrt(thresholds.ROUNDING * square):
             named = np.inf
         elif np.isfinite(nearest):
             surely = special.ndtri(thresholds.PROBABILITY) / np.sqrt(square)
@@ -389,7 +388,8 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     if not looked_at:
         return errors
     raw = [
-        examination.named[c.probe.name].columns[:, c.number, None] for c in (columns[i] for i in looked_at)
+        examination.candidates[c.probe.name].columns[:, c.number, None]
+        for c in (columns[i] for i in looked_at)
     ]
     along = design.products(raw, design.projector.basis).T
     for i, taken_up in zip(looked_at, design.taken_up(along).T, strict=True):

@@ -10,9 +10,9 @@ Separation    The change D of the residuals that a candidate makes at its amplit
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import itertools
-from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -25,10 +25,9 @@ from scipy import special
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Design, number_of_columns, strata
-from walop_jax.diagnosis.hypotheses import Probe, Ranked, all_candidates, said_by
+from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, all_candidates, said_by
 from walop_jax.diagnosis.score import (
     Candidate,
-    Projector,
     Score,
     ScoreSpace,
     ScoreTable,
@@ -62,7 +61,7 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
         mean = float(np.logaddexp.reduce([s.log_bayes for _, s in alive]) - np.log(len(shapes)))
         alternatives = [
             item
-            for item in alive[1 : thresholds.MOST_SHAPES]
+            for item in alive[1 : thresholds.MOST_FITTED]
             if item[1].log_bayes > best - max(thresholds.WITHIN, 0.2 * best)
         ]
         ranked.append(Ranked(effect, probe, score, mean, tuple(alternatives)))
@@ -85,11 +84,11 @@ def follow_physics(probe: Probe, score: Score) -> bool:
     return bool(np.all((score.amplitudes >= -thresholds.SEPARATION * sigma)[probe.one_sided]))
 
 
-def shortest(item: Ranked, most: int = thresholds.MOST_TOGETHER) -> Described:
+def shortest(item: Ranked) -> Described:
     """The sentences of a group that are worth their length, with the amplitudes of a linear step.
 
-    All subsets of `most` members or fewer are compared, and those that the whole group passes through as it loses
-    its least probable member again and again.
+    All subsets of `thresholds.MOST_TOGETHER` members or fewer are compared, and those that the whole group passes
+    through as it loses its least probable member again and again.
     """
     information = np.linalg.pinv(item.score.covariance, hermitian=True)
     scores, widths = information @ item.score.amplitudes, item.probe.widths
@@ -97,7 +96,7 @@ def shortest(item: Ranked, most: int = thresholds.MOST_TOGETHER) -> Described:
     def worth(indices: Sequence[int]) -> float:
         return log_bayes(information[np.ix_(indices, indices)], scores[indices], widths[indices])
 
-    subset = list(range(len(widths)))
+    subset, most = list(range(len(widths))), thresholds.MOST_TOGETHER
     subsets = [list(indices) for n in subset for indices in itertools.combinations(subset, n + 1) if n < most]
     while len(subset) > most:
         subsets.append(subset)
@@ -296,7 +295,7 @@ class Evidence:
 
     def held_in_part(self, item: Ranked) -> tuple[str, ...]:
         """Effects of which a part, by itself, is not improbable beside a candidate; parts share the prior of theirs."""
-        count = Counter(effect for _, effects in self.parts for effect in effects)
+        count = collections.Counter(effect for _, effects in self.parts for effect in effects)
         least = max(0.0, item.log_bayes - thresholds.IMPROBABLE)
         return tuple(
             dict.fromkeys(
@@ -330,7 +329,7 @@ class Evidence:
             value, sigma = float(item.score.amplitudes[0]), float(np.sqrt(item.score.covariance[0, 0]))
             unit = item.effect.numbers()[names[0]].unit
             one_sided = names[0] in item.effect.one_sided
-            below = upper_limit(value, sigma, one_sided=one_sided, probability=thresholds.LIMIT)
+            below = upper_limit(value, sigma, one_sided=one_sided)
             yield {
                 "effect": item.effect.name, "parameter": names[0], "unit": unit,
                 "value": value, "sigma": sigma, "below_95": below,
@@ -342,46 +341,33 @@ def explains(chi2: float, dof: float) -> bool:
     return bool(dof > 0 and chi2 - dof < SUSPECT_SIGMA * np.sqrt(2.0 * dof))
 
 
-def upper_limit(
-    value: float, sigma: float, *, one_sided: bool, probability: float = thresholds.LIMIT
-) -> float:
-    """Size that an amplitude stays below with a probability, for a flat prior (positive when one-sided)."""
+def upper_limit(value: float, sigma: float, *, one_sided: bool) -> float:
+    """Size below which an amplitude stays (`thresholds.LIMIT`), for a flat prior (positive when one-sided)."""
     if one_sided:
-        below_zero = special.ndtr(-value / sigma)
-        return float(value + sigma * special.ndtri(below_zero + probability * (1.0 - below_zero)))
-    return float(scipy.stats.foldnorm.ppf(probability, abs(value) / sigma, scale=sigma))
+        return float(scipy.stats.truncnorm.ppf(thresholds.LIMIT, -value / sigma, np.inf, value, sigma))
+    return float(scipy.stats.foldnorm.ppf(thresholds.LIMIT, abs(value) / sigma, scale=sigma))
 
 
 # ----------------------------------------------------------------------------------------------- of one fit
-
-
-@dataclasses.dataclass(frozen=True)
-class _Absorbed:
-    """Absorption by the parameters of an active effect: the projection without them, and the columns' share of it."""
-
-    rest: Projector
-    basis: Matrix
-    columns: Matrix  # basisᵀ C
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Examination(Evidence):
     """The evidence of one fit, and its origin.
 
-    `named` and `said` are the columns of effects and of sentences, `columns` those of all candidates, ahead of any
-    projection; `bare` is their space ahead of the nuisance of single exposures with prior widths `common_mode`.
-    `blocks` are the blocks of the free-form term that can take candidates up.
+    `candidates` are those of `space` by name, in its order, with their columns ahead of any projection; `bare` is their
+    space ahead of the nuisance of single exposures.
     """
 
     result: FitResult
     design: Design
-    named: Mapping[str, Candidate]
-    said: Mapping[str, Candidate]
-    blocks: Mapping[str, str | None]
+    candidates: Mapping[str, Candidate]
     bare: ScoreSpace
-    columns: Sequence[Matrix]
-    common_mode: Vector
-    absorbed: Mapping[str, _Absorbed]
+
+    @property
+    def columns(self) -> list[Matrix]:
+        """Columns of all candidates."""
+        return [candidate.columns for candidate in self.candidates.values()]
 
     @property
     def noise_p(self) -> float:
@@ -398,17 +384,14 @@ class Examination(Evidence):
 
     def separation(self, name: str, change: Vector) -> dict[str, float]:
         """Distance (σ) of each rival from an active effect that changes the residuals (data rows) by `change`."""
-        absorbed = self.absorbed[name]
-        padded = np.pad(change, (0, len(self.design.residual) - len(change)))
-        projected = absorbed.rest(padded)
-        space = dataclasses.replace(self.bare, gram=self.bare.gram + absorbed.columns.T @ absorbed.columns)
-        scores = self.products(projected) + absorbed.columns.T @ (absorbed.basis.T @ projected)
+        design, columns = self.design, self.columns
+        rest, basis = design.without(name)
+        along = design.products(columns, basis)
+        projected = rest(np.pad(change, (0, len(design.residual) - len(change))))
+        space = dataclasses.replace(self.bare, gram=self.bare.gram + along @ along.T)
+        scores = design.products(columns, design.projector(projected)) + along @ (basis.T @ projected)
         distances = self.nearest(separations(space, scores, float(projected @ projected)))
         return {rival: apart / self.floor for rival, apart in distances.items()}
-
-    def products(self, rows: Vector) -> Vector:
-        """Products of the projected columns of all candidates with rows."""
-        return self.design.products(self.columns, self.design.projector(rows))
 
     def is_like(self, design: Design) -> bool:
         """True if the expected counts of another fit are close enough to reuse its columns."""
@@ -418,56 +401,43 @@ class Examination(Evidence):
 
 def examine(
     result: FitResult,
-    wanted: Sequence[Probe],
+    hypotheses: Hypotheses,
     rng: np.random.Generator,
     earlier: Examination | None = None,
-    sentences: Sequence[Probe] = (),
-    parts: Parts = (),
 ) -> Examination:
-    """Score effects that a model has not, sentences, `parts` (`grammar.beside_names`) and patterns against a fit.
+    """Score effects that a model has not, sentences and patterns against a fit.
 
     `earlier` is of a smaller model; its columns serve again where the light has hardly changed.
     """
     active, design = result.model.effect_names, Design.of(result)
-    inactive = [probe for probe in wanted if probe.effect.name not in active]
-    listed = [*sentences, *(probe for probe, _ in parts)]
-    named, said = (
-        (earlier.named, earlier.said)
-        if earlier is not None and earlier.is_like(design)
-        else all_candidates(design.columns, inactive, listed)
-    )
-    probes = [probe for probe in inactive if probe.name in named]
-    sentences = tuple(probe for probe in sentences if probe.name in said)
-    held = [
+    inactive = [probe for probe in hypotheses.names if probe.effect.name not in active]
+    listed = [*hypotheses.sentences, *(probe for probe, _ in hypotheses.parts)]
+    if earlier is not None and earlier.is_like(design):
+        computed = earlier.candidates
+    else:
+        computed = collections.ChainMap(*all_candidates(design.columns, inactive, listed))
+    probes = [probe for probe in inactive if probe.name in computed]
+    sentences = tuple(probe for probe in hypotheses.sentences if probe.name in computed)
+    parts = [
         (probe, {effect for effect in effects if effect.name not in active})
-        for probe, effects in parts
-        if probe.name in said
+        for probe, effects in hypotheses.parts
+        if probe.name in computed
     ]
     patterns = [
         dataclasses.replace(item, columns=item.columns.astype(np.float32))
         for item in map(design.measured.candidate, strata(design.measured))
     ]
-    candidates = [
-        *(named[probe.name] for probe in probes),
-        *(said[probe.name] for probe in sentences),
-        *(said[probe.name] for probe, _ in held),
-        *patterns,
-    ]
-    blocks = {candidate.name: candidate.block for candidate in candidates}
-    names, widths = [c.name for c in candidates], [c.widths for c in candidates]
-    columns = [candidate.columns for candidate in candidates]
-    absorbed = {}
-    for name in active:
-        projector, basis = design.without(name)
-        absorbed[name] = _Absorbed(projector, basis, design.products(columns, basis).T)
+    of_probes = [computed[probe.name] for probe in (*probes, *sentences, *(probe for probe, _ in parts))]
+    candidates = {candidate.name: candidate for candidate in (*of_probes, *patterns)}
+    names, widths = list(candidates), [candidate.widths for candidate in candidates.values()]
+    columns = [candidate.columns for candidate in candidates.values()]
     exact = sum(len(probe.widths) for probe in probes)  # rivals may be the same to the last digit
     scale = result.noise_scale
     bare = ScoreSpace.projected(design.projector, names, widths, columns, scale=scale, exact=exact)
     r = design.projector(design.residual)
-    space, scores, square, common_mode = bare, design.products(columns, r), float(r @ r), np.zeros(0)
+    space, scores, square = bare, design.products(columns, r), float(r @ r)
     if SINGLE_EXPOSURES in names:
-        common_mode = _common_mode(bare, design, thresholds.COMMON_MODE)
-        space, reduce = bare.with_base([SINGLE_EXPOSURES], common_mode)
+        space, reduce = bare.with_base([SINGLE_EXPOSURES], common_mode(bare, design))
         scores, square = reduce(scores, square)
     return Examination(
         space=space,
@@ -476,29 +446,24 @@ def examine(
         table=space.table(scores, square, space.smallest_p(rng)),
         probes=probes,
         sentences=sentences,
-        parts=held,
+        parts=parts,
         patterns=[pattern.name for pattern in patterns],
         chi2=result.chi2,
         dof=result.dof,
         scale=result.noise_scale,
         result=result,
         design=design,
-        named=named,
-        said=said,
-        blocks=blocks,
+        candidates=candidates,
         bare=bare,
-        columns=columns,
-        common_mode=common_mode,
-        absorbed=absorbed,
     )
 
 
-def _common_mode(space: ScoreSpace, design: Design, rms: float) -> Vector:
-    """Prior widths of the gains of single exposures that amount to `rms` per intensity."""
+def common_mode(space: ScoreSpace, design: Design) -> Vector:
+    """Prior widths of the gains of single exposures that amount to `thresholds.COMMON_MODE` per intensity."""
     at = space.places()[SINGLE_EXPOSURES]
     points = np.repeat(design.measured.used.sum(axis=0), len(design.measured.gained))
     square = np.where(space.before[at] > 0, space.before[at], np.inf)
-    return np.maximum(rms * np.sqrt(points / square), 1e-30)
+    return np.maximum(thresholds.COMMON_MODE * np.sqrt(points / square), 1e-30)
 
 
 def most_points(calset: CalibrationSet, instrument: Instrument, amplitudes: int) -> int:

@@ -308,7 +308,7 @@ class Diagnosis(Drawn):
                 f"{looked_at} of {self.points} field points were looked at, and fitted: refit all of them with the "
                 "model found"
             )
-        if len(self.steps) > thresholds.MOST_NAMES:
+        if len(self.steps) > thresholds.MOST_SENTENCES:
             cautions.append(
                 f"{len(self.steps)} names were needed: something that is not in the catalogue can look like several "
                 "that are"
@@ -411,9 +411,6 @@ def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
 
 # ------------------------------------------------------------------------------------------ as plain data
 
-_ALIKE, _CLASSES = 6, 3  # printed indistinguishable names, and groups of them: the file has all
-
-
 _AS_THEY_ARE = (
     "effect", "score", "p_value", "chi2_before", "chi2_after", "heldout_before", "heldout_after", "heldout_scheme",
     "alternatives", "equivalent", "nameless", "separated_by", "where", "confirmed", "log_bayes", "negligible",
@@ -469,10 +466,10 @@ def sentences(content: Mapping[str, Any]) -> Iterator[str]:
     for choice in fitted:
         sense = "smaller" if choice["better_by"] > 0 else "larger"
         yield f"{choice['change']}: χ² {sense} by {abs(choice['better_by']):.4g}"
-    for alike in content.get("classes", ())[:_CLASSES]:
+    for alike in content.get("classes", ())[: thresholds.SHOWN]:
         yield (
             f"before anything was added {alike['effect']} was significant too; these data cannot distinguish it from "
-            f"{some(alike['equivalent'], _ALIKE)}; what would: {alike['separated_by']}"
+            f"{some(alike['equivalent'], thresholds.SHOWN)}; what would: {alike['separated_by']}"
         )
     if content.get("cannot_be_tested"):
         yield f"not tested, since these data cannot show it: {', '.join(content['cannot_be_tested'])}"
@@ -507,7 +504,7 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
         )
     rivals = (*step.get("equivalent", ()), *step.get("nameless", ()))
     if rivals:
-        yield f"{name}: these data cannot distinguish it from {some(rivals, _ALIKE)}"
+        yield f"{name}: these data cannot distinguish it from {some(rivals, thresholds.SHOWN)}"
     if rivals and step.get("separated_by"):
         yield f"what would: {step['separated_by']}"
 

@@ -34,7 +34,7 @@ from walop_jax.diagnosis.dependences import (
     starts_of_steps,
     varies,
 )
-from walop_jax.diagnosis.hypotheses import Probe, applicable, probes, said_by
+from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, applicable, probes, said_by
 from walop_jax.model.effects import Context, Described, EffectKind
 from walop_jax.model.effects.change import BAND, KINDS, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
@@ -64,25 +64,6 @@ def _probe(group: tuple[Sentence, ...]) -> Probe:
 # --------------------------------------------------------------------------------------------- possible omissions
 
 
-class Hypotheses(NamedTuple):
-    """All possible omissions of a model: effects that fit the instrument, their probes, and sentences.
-
-    `sentences` are those that no effect holds, `parts` those that effects hold in part, with the holders, `every` are
-    all of them, those that are an effect by another name as well.
-    """
-
-    effects: tuple[EffectKind, ...]
-    names: tuple[Probe, ...]
-    sentences: list[Probe]
-    parts: list[tuple[Probe, frozenset[EffectKind]]]
-    every: tuple[Probe, ...]
-
-    @property
-    def amplitudes(self) -> int:
-        """Number of all amplitudes."""
-        return sum(len(probe.widths) for probe in (*self.names, *self.every))
-
-
 def hypotheses(
     catalogue: Sequence[EffectKind], instrument: Instrument, exposures: Exposures, points: int
 ) -> Hypotheses:
@@ -90,7 +71,7 @@ def hypotheses(
     context, all_probes = effect_context(instrument, exposures), sentences(instrument, exposures, points)
     effects = applicable(catalogue, context, instrument)
     alone, partial = beside_names(all_probes, effects, context, instrument)
-    return Hypotheses(effects, tuple(probes(effects, context)), alone, partial, all_probes)
+    return Hypotheses(tuple(probes(effects, context)), alone, partial, effects, all_probes)
 
 
 # ------------------------------------------------------------------------------------- names that are sentences

@@ -38,7 +38,6 @@ from walop_jax.model.instrument import Instrument
 STAR_POINTS = 16  # field points at which the errors of stars are computed
 MOST_HIDDEN = 12  # mistakes in a product: each costs a star one product of two vectors
 _FAINT = 0.5  # of the worst mistake, below which a measured effect is dropped
-_NOTHING = 1e-9  # smallest change of the analysis vectors
 
 
 class _Mistake(NamedTuple):
@@ -173,7 +172,7 @@ class _Starlight:
                 added = change = change_by_effect(self.instrument, effect, *at)
             size, unit = float(sizes[number]), declared[parameter].unit
             number_of = (f"{probe.effect.name}.{parameter}", EFFECT, size, unit, probe.effect.revealed_by)
-            acts = bool(np.abs(added).max(initial=0.0) > _NOTHING)
+            acts = bool(np.abs(added).max(initial=0.0) > thresholds.ROUNDING)
             yield _Mistake(*number_of, along[:, number], bool(alive[number]), effect, change, acts)
 
 

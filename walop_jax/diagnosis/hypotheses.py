@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -75,6 +76,25 @@ class Ranked:
     def name(self) -> str:
         """Its name; without one, its descriptions."""
         return self.probe.name if self.effect is Described else self.effect.name
+
+
+class Hypotheses(NamedTuple):
+    """All possible omissions of a model: probes of effects with a name, and sentences.
+
+    `sentences` are those that no effect holds, `parts` those that effects hold in part, with the holders. `effects` are
+    those that fit the instrument, `every` all sentences, those that are an effect by another name as well.
+    """
+
+    names: Sequence[Probe] = ()
+    sentences: Sequence[Probe] = ()
+    parts: Sequence[tuple[Probe, frozenset[EffectKind]]] = ()
+    effects: tuple[EffectKind, ...] = ()
+    every: Sequence[Probe] = ()
+
+    @property
+    def amplitudes(self) -> int:
+        """Number of all amplitudes."""
+        return sum(len(probe.widths) for probe in (*self.names, *self.every))
 
 
 def applicable(

@@ -21,29 +21,26 @@ from walop_jax.diagnosis.exact import (
 )
 from walop_jax.diagnosis.examination import Examination, examine, shortest
 from walop_jax.diagnosis.findings import Choice
-from walop_jax.diagnosis.hypotheses import Probe, Ranked, said_by
+from walop_jax.diagnosis.hypotheses import Hypotheses, Ranked, said_by
 from walop_jax.diagnosis.predictions import before_and_after, gains_by_kind, predicts_unseen
 from walop_jax.diagnosis.search import State, names_first
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.columns import columns
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Context, Described, EffectKind
+from walop_jax.model.effects import Context, Described
 
 
 @dataclasses.dataclass(frozen=True)
 class Refits:
     """All that the fits of a search have in common; `adopt` is the only function that gives a state another fit.
 
-    `wanted` are the probes of `catalogue`, `sentences` and `parts` other descriptions (`grammar.beside_names`).
-    Nothing further is tried after `most` fits, nor after the time `until` (infinite: no matter how long it takes).
+    Nothing further is tried after `most` fits, nor `minutes` after the time `began` (infinite: no matter how long it
+    takes).
     """
 
     context: Context
-    catalogue: tuple[EffectKind, ...]
-    wanted: Sequence[Probe]
-    sentences: Sequence[Probe]
-    parts: Sequence[tuple[Probe, frozenset[EffectKind]]]
+    hypotheses: Hypotheses
     rng: np.random.Generator
     tell: Callable[[str], None]
     minutes: float = np.inf
@@ -58,7 +55,7 @@ class Refits:
 
     def examined(self, result: FitResult, earlier: Examination | None = None) -> Examination:
         """A fit, scored; the columns of an `earlier` one serve again where the light has hardly changed."""
-        evidence = examine(result, self.wanted, self.rng, earlier, self.sentences, self.parts)
+        evidence = examine(result, self.hypotheses, self.rng, earlier)
         if evidence.alarm:
             self.tell(Stage(f"p = {evidence.table.p_global:.2g}: something is missing", "naming"))
         return evidence
@@ -103,7 +100,7 @@ class Refits:
     def _hopeful(self, evidence: Examination, item: Ranked) -> bool:
         """True if a sentence predicts held-out data by its linear step: it has no name that would support it."""
         single = any("exposure" in text for text in said_by(item.probe))
-        column = [evidence.said[item.probe.name]]
+        column = [evidence.candidates[item.probe.name]]
         return predicts_unseen(evidence.design, column, thresholds.HOPEFUL, of_states=not single)
 
     def others(self, state: State) -> tuple[list[Trial], Mapping[str, Choice]]:
@@ -113,7 +110,7 @@ class Refits:
         def allowed() -> bool:
             return not self.over(state.fits + len(trials))
 
-        for effect in self.catalogue if state.evidence.poor else ():
+        for effect in self.hypotheses.effects if state.evidence.poor else ():
             if effect.is_structural() and effect.name not in result.model.effect_names and allowed():
                 self.tell(f"trying {effect.name}")
                 trials.append(try_effect(result, effect.neutral(self.context), self.context))
@@ -199,7 +196,7 @@ def without(result: FitResult, name: str, remaining: Collection[str]) -> FitResu
 def contradicting(before: Design, after: Design) -> str:
     """KINDs of exposures that all others predict worse with the additions of a fit; empty: none."""
     gains = gains_by_kind(before, after)
-    return ", ".join(f"KIND {kind}" for kind, gain in gains.items() if gain < -thresholds.CONTRADICTED)
+    return ", ".join(f"KIND {kind}" for kind, gain in gains.items() if gain < -thresholds.EVEN_ODDS)
 
 
 def refitted_in_order(steps: Sequence[Trial], start: Design, end: Design) -> list[Trial]:

@@ -15,7 +15,6 @@ Limits      Missing effects correlate as well, and are added to the noise: a pai
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -27,34 +26,25 @@ from walop_jax.io.text import some
 
 LEAST = 0.25
 """Correlation below which a common pattern of the optics cannot be separated from common noise."""
-_SHOWN = 3
-
-
-class _Pair(NamedTuple):
-    """Positions of two exposures and the correlation of their residuals."""
-
-    first: int
-    second: int
-    correlation: float
 
 
 def repeated_noise(design: Design) -> Iterator[str]:
     """Sentences on exposures that hold the same noise, by their number."""
-    pairs = pairs_alike(design, thresholds.ALARM)
-    if pairs:
+    if pairs := pairs_alike(design):
         number = design.fit.calset.exposures.exposure
-        descriptions = [
-            f"{number[p.first]} and {number[p.second]} (correlation {p.correlation:.2f})" for p in pairs
-        ]
-        listed = some(descriptions, _SHOWN, "; ")
+        listed = [f"{number[a]} and {number[b]} (correlation {alike:.2f})" for a, b, alike in pairs]
+        listed = some(listed, thresholds.SHOWN, "; ")
         yield (
             f"exposures hold the same noise, as independent ones never do: {listed}: remove one of each pair, "
             "repeated data shrink the errors"
         )
 
 
-def pairs_alike(design: Design, alarm: float = thresholds.ALARM) -> list[_Pair]:
-    """Pairs of exposures whose residuals hang together as only those of the same measurement do, closest first."""
+def pairs_alike(design: Design) -> list[tuple[int, int, float]]:
+    """Pairs of exposures whose residuals hang together as only those of the same measurement do, closest first.
+
+    Their positions, and the correlation.
+    """
     measured = design.measured
     if measured.shared.exposures is not None:
         return []
@@ -76,12 +66,9 @@ def pairs_alike(design: Design, alarm: float = thresholds.ALARM) -> list[_Pair]:
     correlation = product[first, second] / np.sqrt(first_square * second_square)
     # The fit takes something of every exposure: the noise is measured by the residuals.
     deviate = correlation * np.sqrt(expected[first, second])
-    limit = -special.ndtri(local_p(alarm, len(first)))
+    limit = -special.ndtri(local_p(thresholds.ALARM, len(first)))
     excess = 0.5 * (first_square / free[first] + second_square / free[second]) / shared[first, second] - 1.0
     pattern = correlation / np.maximum(1.0 - correlation, 1e-12)
     alike = (deviate > limit) & (correlation > LEAST) & (excess < 0.5 * pattern)
-    pairs = [
-        _Pair(int(a), int(b), float(c))
-        for a, b, c in zip(first[alike], second[alike], correlation[alike], strict=True)
-    ]
-    return sorted(pairs, key=lambda pair: -pair.correlation)
+    pairs = zip(first[alike].tolist(), second[alike].tolist(), correlation[alike].tolist(), strict=True)
+    return sorted(pairs, key=lambda pair: -pair[2])

@@ -11,7 +11,7 @@ from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import log_evidence_ratio
 from walop_jax.diagnosis.score import corrected_p, local_p
-from walop_jax.diagnosis.stated_conditions import ALIKE, SHOWN, condition_in_words, condition_scores
+from walop_jax.diagnosis.stated_conditions import ALIKE, condition_in_words, condition_scores
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.io.text import with_error
 from walop_jax.likelihood.likelihood import Likelihood
@@ -35,7 +35,9 @@ def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
     ]
     if alike:
         alike.sort(key=lambda pair: -pair[0])
-        causes = "; or ".join(condition_in_words(item.stated, item.score) for _, item in alike[:SHOWN])
+        causes = "; or ".join(
+            condition_in_words(item.stated, item.score) for _, item in alike[: thresholds.SHOWN]
+        )
         yield f"what was found explains no more than one number that the set states would, if it were {causes}"
 
 
@@ -62,10 +64,10 @@ def instead_of_names(before: FitResult, after: FitResult) -> str:
                 break
             likelihood = Likelihood.of(stated.changed(size), before.model)
             result = fit(likelihood, start=result.values, noise_scale=before.noise_scale)
-            rescored = {c.stated.what: c for c in condition_scores(Design.of(result))}
-            if not result.converged or stated.what not in rescored:
+            rescored = condition_scores(Design.of(result), stated.what) if result.converged else []
+            if not rescored:
                 break
-            current = rescored[stated.what]
+            (current,) = rescored
         score, square = current.score, current.square
         worth = 0.5 * (before.expansion.objective - result.expansion.objective)
         worth -= 0.5 * float(np.log1p(square * stated.width**2))

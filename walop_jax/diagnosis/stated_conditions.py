@@ -43,10 +43,8 @@ from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import effect_context
 
-SHOWN = 4  # alternatives that are given in words
 ALIKE = 25.0  # in χ², within which conditions are reported together
 _PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
-MOST_OF_ELEMENT = 4  # numbers of an element whose priors may be wrong together
 _ASKED_OTHERWISE = (*thresholds.ASKED_BY_CAMERA, "standard_outlier")  # camera by camera, and as priors
 _LEVELS = "exposures at a second light level"
 _DARK = "bias and dark frames"
@@ -178,8 +176,8 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     likely = [item for item in likely if not any(_holds(item, rival) for rival in likely)]
     likely.sort(key=lambda item: (item.rank, item.log_p))  # a mistake of one number before sixteen
     wordings = {item.candidate.name: item.said for item in rivals}
-    causes = "; or for ".join(wordings[score.name](score) for score in likely[:SHOWN])
-    further = f"; or for {len(likely) - SHOWN} others" if len(likely) > SHOWN else ""
+    causes = "; or for ".join(wordings[score.name](score) for score in likely[: thresholds.SHOWN])
+    further = f"; or for {len(likely) - thresholds.SHOWN} others" if len(likely) > thresholds.SHOWN else ""
     p = corrected_p(best.log_p, len(scores))
     yield f"the residuals ask for {causes}{further} (p = {p:.2g}, limit {thresholds.ALARM:g})"
 
@@ -191,9 +189,9 @@ def _holds(score: Score, rival: Score) -> bool:
     return score.name.startswith(f"{rival.name}.") and rival.log_p < score.log_p
 
 
-def _conditions(design: Design) -> Iterator[_Single]:
-    """The numbers that the set states and that are used."""
-    statements = list(_stated(design.fit.calset))
+def _conditions(design: Design, what: str = "") -> Iterator[_Single]:
+    """The numbers that the set states and that are used, or the one that is `what`."""
+    statements = [item for item in _stated(design.fit.calset) if what in ("", item.what)]
     columns = [design.stacked([column[:, None]]) for column in _columns(design, statements)]
     for item, column in zip(statements, columns, strict=True):
         if not column.any():  # a number may be stated and not used
@@ -219,7 +217,7 @@ def _priors(design: Design) -> Iterator[_Single]:
     together: dict[str, list[int]] = {}
     for i in constrained:
         together.setdefault(parameters[rows.index[i]].name.rpartition(".")[0], []).append(i)
-    elements = {k: v for k, v in together.items() if k and 1 < len(v) <= MOST_OF_ELEMENT} | names
+    elements = {k: v for k, v in together.items() if k and 1 < len(v) <= thresholds.MOST_TOGETHER} | names
 
     def wording(score: Score) -> str:
         texts = []
@@ -300,7 +298,7 @@ def _of_catalogue(design: Design, effects: Sequence[Probe]) -> Iterator[_Single]
 
 def _effect_in_words(probe: Probe, score: Score, cameras: Sequence[str]) -> str:
     effect, declared = probe.effect.combine(probe.group, score.amplitudes), probe.effect.numbers()
-    if len(score.amplitudes) > MOST_OF_ELEMENT:
+    if len(score.amplitudes) > thresholds.MOST_TOGETHER:
         return f"{effect.name}, {len(score.amplitudes)} numbers"
     choices = effect.choices()
     texts = [f"{n} {cameras[value] if n == 'camera' else value}" for n, value in choices.items()]
@@ -327,9 +325,9 @@ def condition_in_words(stated: _Stated, score: Score) -> str:
     return f"{text}, not {stated.value:g} ({stated.remedy})"
 
 
-def condition_scores(design: Design) -> list[_Scored]:
-    """The numbers that a set states, each with the score of changing it."""
-    singles = scored(design, tuple(_conditions(design)))
+def condition_scores(design: Design, what: str = "") -> list[_Scored]:
+    """The numbers that a set states, or the one that is `what`, each with the score of changing it."""
+    singles = scored(design, tuple(_conditions(design, what)))
     return [
         _Scored(r.stated, singles.table[r.candidate.name], r.candidate.columns[:, 0], float(info))
         for r, info in zip(singles.rivals, singles.left, strict=True)
@@ -339,9 +337,9 @@ def condition_scores(design: Design) -> list[_Scored]:
 
 def _columns(design: Design, statements: Sequence[_Stated]) -> Iterator[Float[np.ndarray, " _"]]:
     of_field = [item for item in statements if item.along is not None]
-    by_place = [_column(design, item) for item in of_field[:2]]  # X and Y come first
+    by_place = [_column(design, item) for item in of_field[:2] if len(of_field) > 2]  # X and Y come first
     for item in statements:
-        if item.along is None:
+        if item.along is None or not by_place:
             yield _column(design, item)
         else:
             (in_x, in_y), (by_x, by_y) = item.along, by_place

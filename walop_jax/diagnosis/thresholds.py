@@ -21,11 +21,13 @@ MOST_STEPS = 6
 MOST_LEADERS = 5
 """Names that are tried at one step. Not measured."""
 MOST_SENTENCES = 2
-"""Descriptions of one step; more of them in the final model can be one thing that none of them holds. Blind."""
+"""Descriptions that one step tries. More descriptions, or names, in the final model can be one thing that none of them
+holds. Blind."""
 MOST_TOGETHER = 4
-"""Members of a longer group of descriptions that are fitted by themselves. Not measured."""
-MOST_SHAPES = 4
-"""Shapes of one effect from which it is fitted. Not measured."""
+"""Numbers of one thing that are tried together: members of a longer group of descriptions, priors of an element. Not
+measured."""
+MOST_FITTED = 4
+"""Shapes of one effect from which it is fitted; other descriptions of the instrument that are fitted. Not measured."""
 WITHIN = 8.0
 """Evidence below the best within which a rival is tried. Not measured."""
 LINEAR_GOOD = 1.0
@@ -60,18 +62,18 @@ HOPEFUL = 1.0
 measured."""
 
 EVEN_ODDS = 3.0
-"""Difference in evidence that is no preference; a description needs that much more than a name. Not measured."""
+"""Difference in evidence that is no preference; a description needs that much more than a name. More loss in ln p of
+the exposures of one KIND, as those of others predict them, contradicts an addition. Not measured."""
 IMPROBABLE = 6.9
-"""Difference in evidence at which the other has a probability of 10⁻³: rivals are listed down to it. Blind."""
+"""Difference in evidence at which the other has a probability of 10⁻³: rivals are listed down to it, and members of a
+class are averaged. Blind."""
 SEPARATION = 3.0
-"""Below it the data cannot distinguish two candidates. Blind, limits."""
+"""Below it the data cannot distinguish two candidates. No plausible member of a class may lie farther from an element
+of a trusted product, in its errors. Blind, limits."""
 LEAST_EVIDENCE = 1.0
 """Evidence that an effect must be worth to the final model to stay in it. Not measured."""
 USEFUL = 2.0
 """Standard errors by which a term without a name must predict unseen settings better to be kept. Not measured."""
-CONTRADICTED = 3.0
-"""Loss in ln p of the exposures of one KIND, as those of others predict them, above which nothing is added. Not
-measured."""
 HELD_OUT_WORSE = 0.01
 """Share by which exposures that were left out may be predicted worse after a diagnosis than before. Not measured."""
 MOST_PATTERNS = 8
@@ -83,10 +85,12 @@ MOST_CLASSES = 8
 
 NEGLIGIBLE = 1e-4
 """Change of calibrated q and u that does not matter for an instrument good to 10⁻³."""
-MOST_NAMES = 2
-"""Names above which a single effect outside the catalogue is as likely. Blind."""
 LARGEST_ROBUST_RATIO = 1.5
 """Of errors that allow for common disturbances of an exposure, to errors that do not. Not measured."""
+SHOWN = 4
+"""Alternatives that a sentence lists; files have all. Nothing depends on it."""
+ROUNDING = 1e-9
+"""Share below which a number is rounding. Nothing depends on it."""
 LIMIT = 0.95
 """Probability with which an effect that was not found stays below its limit. Limits."""
 PROBABILITY = 0.99
@@ -94,8 +98,6 @@ PROBABILITY = 0.99
 
 # --------------------------------------------------- other descriptions of the instrument, other readings of the data
 
-DESCRIPTIONS_FITTED = 4
-"""Other descriptions that are fitted. Not measured."""
 LEAST_GAIN = 12.0
 """Gain in χ² behind one linear step above which a description is worth a fit. Not measured."""
 READING_COARSE = 0.01

@@ -68,7 +68,6 @@ UNEVEN = 1.25
 """Factor between the squared residuals of a group and those of all below which it is a matter of the stated errors."""
 NOISELESS = 1e-6
 """Squared residuals, beyond the reach of the parameters, of data that hold no noise: rounding, and second order."""
-_SHOWN = 3
 
 
 def examined(
@@ -216,7 +215,7 @@ def sampled(result: FitResult, most: int) -> FitResult:
 def _significant(finding: str, table: ScoreTable) -> Iterator[str]:
     """A doubt if the lowest p-value of a table is below the threshold."""
     if table.p_global < thresholds.ALARM:
-        names = " | ".join(table.significant(thresholds.ALARM, _SHOWN))
+        names = " | ".join(table.significant(thresholds.ALARM, thresholds.SHOWN))
         yield (
             f"the residuals {finding} (p = {table.p_global:.2g}, limit {thresholds.ALARM:g}; nearest: {names}): "
             "walop-jax diagnose looks for the cause"
@@ -285,5 +284,5 @@ def _groups(design: Design) -> Iterator[str]:
     odd = [s for s in scores if s.p_value < limit and not 1.0 / UNEVEN < s.ratio < UNEVEN]
     if odd:
         odd.sort(key=lambda s: -abs(np.log(max(s.ratio, 1e-12))))
-        listed = some([f"{s.name} {s.ratio:.3g}" for s in odd], _SHOWN)
+        listed = some([f"{s.name} {s.ratio:.3g}" for s in odd], thresholds.SHOWN)
         yield f"some parts of the data scatter more than the rest (mean squared residual): {listed}"

@@ -37,6 +37,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import special
 
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.score import local_p
 from walop_jax.fit.refit import FitResult
@@ -46,7 +47,6 @@ from walop_jax.sky.nights import night_of
 ALARM = 1e-3
 """Probability that noise alone raises a doubt, all groupings together."""
 MOST_PLACES = 1000  # field points that are asked, spread over the set
-_SHOWN = 2
 WITH_STRUCTURE = "N_ERR with structure of field points"
 
 
@@ -98,7 +98,7 @@ def in_words(components: list[VarianceComponent]) -> Iterator[str]:
     if not components:
         return
     first = components[0]
-    further = ", ".join(f"{c.grouping.name} {c.deviate:.2g} σ" for c in components[1 : 1 + _SHOWN])
+    further = ", ".join(f"{c.grouping.name} {c.deviate:.2g} σ" for c in components[1 : 1 + thresholds.SHOWN])
     yield (
         f"residuals {first.grouping.words}, {first.deviate:.2g} σ: structure of {first.size:.2g} that the model does "
         f"not have" + (f" (also {further})" if further else "")

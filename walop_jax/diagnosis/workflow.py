@@ -5,7 +5,7 @@ name; global p by Monte Carlo. 3. Below `thresholds.ALARM`: add names one after 
 together with everything before it is added (`refits`). 4. Drop names that are not needed beside the others. 5. Names
 that leave a poor fit nearly as poor are reported as parts of what is missing, and taken out again. 6. What no name
 explains is described, and the verdict is `unexplained`; a free-form term for it stays in the model where it predicts
-settings and parts of the field that it has not seen, and names that only stood in for it are dropped (`leftover`). 7.
+settings and parts of the field that it has not seen, and names that only stood in for it are dropped (`remainder`). 7.
 List for each name what the data cannot separate from it, and give the verdict. Names are given at any size;
 `Step.negligible` says when it does not matter for q and u.
 
@@ -29,10 +29,11 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
 from walop_jax.diagnosis.examination import Examination, most_points
 from walop_jax.diagnosis.findings import Choice, Diagnosis, Outcome, Step, Unexplained, describe, told
-from walop_jax.diagnosis.grammar import Hypotheses, hypotheses
-from walop_jax.diagnosis.leftover import back_to, concluded
+from walop_jax.diagnosis.grammar import hypotheses
+from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.diagnosis.readings import mixups_of, refusal
 from walop_jax.diagnosis.refits import Refits
+from walop_jax.diagnosis.remainder import back_to, concluded
 from walop_jax.diagnosis.rival_conditions import instead_of_names, rival_conditions
 from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.diagnosis.search import State, search
@@ -86,10 +87,7 @@ def diagnose(
         raise refusal(before, readings)
     judge = Refits(
         context=context,
-        catalogue=candidates.effects,
-        wanted=candidates.names,
-        sentences=candidates.sentences,
-        parts=candidates.parts,
+        hypotheses=candidates,
         rng=np.random.default_rng(seed),
         tell=tell,
         minutes=np.inf if minutes is None else minutes,

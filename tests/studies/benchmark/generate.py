@@ -35,7 +35,7 @@ from walop_jax.data.records import Block, CalibrationSet, Points  # noqa: E402
 from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
 from walop_jax.diagnosis.design import Measured, strata  # noqa: E402
 from walop_jax.diagnosis.examination import Examination, examine  # noqa: E402
-from walop_jax.diagnosis.hypotheses import Probe, all_candidates, said_by  # noqa: E402
+from walop_jax.diagnosis.hypotheses import Hypotheses, all_candidates, said_by  # noqa: E402
 from walop_jax.diagnosis.score import ABSORBED, FAINTEST  # noqa: E402
 from walop_jax.fit.refit import FitResult  # noqa: E402
 from walop_jax.likelihood.columns import Columns  # noqa: E402
@@ -83,20 +83,19 @@ class Layout:
 
         def examined(
             result: FitResult,
-            wanted: Sequence[Probe],
+            hypotheses: Hypotheses,
             rng: np.random.Generator,
-            _: None,
-            said: Sequence[Probe],
         ) -> Examination:
             """With the columns of all exposures that were taken: the one before may be kept back."""
-            both = all_candidates(Columns(Likelihood.of(whole, result.model), result.values), wanted, said)
+            columns = Columns(Likelihood.of(whole, result.model), result.values)
+            both = all_candidates(columns, hypotheses.names, hypotheses.sentences)
             self.columns = {name: one.columns for some in both for name, one in some.items()}
             named, told = (
                 {n: dataclasses.replace(one, columns=one.columns[self.inside]) for n, one in some.items()}
                 for some in both
             )
-            known = SimpleNamespace(named=named, said=told, is_like=lambda design: True)
-            return examine(result, wanted, rng, known, said)  # type: ignore[arg-type]
+            known = SimpleNamespace(candidates=named | told, is_like=lambda design: True)
+            return examine(result, hypotheses, rng, known)  # type: ignore[arg-type]
 
         used = (one.intensities.block(0, len(one.points)).used for one in (fitted, whole))
         inside, every = used

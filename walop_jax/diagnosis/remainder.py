@@ -39,7 +39,7 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
         return state, None
     text = f"{len(said)} descriptions were needed: they show its place, no single one its nature"
     remainder = Unexplained(state.evidence.table.p_global, f"{text} ({' | '.join(said)})", ())
-    columns = [first.evidence.said[name] for name in said]
+    columns = [first.evidence.candidates[name] for name in said]
     if predicts_unseen(first.evidence.design, columns, thresholds.USEFUL):
         return state, remainder
     state = _without(first, state, [Described.name], judge)
@@ -143,7 +143,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     result, measured = evidence.result, evidence.design.measured
     patterns = tuple(evidence.patterns_needed())
     remainder = _unexplained(evidence, patterns)
-    blocks = dict.fromkeys(block for name, _ in patterns if (block := evidence.blocks[name]) is not None)
+    blocks = dict.fromkeys(block for name, _ in patterns if (block := evidence.candidates[name].block))
     if len(result.calset.exposures) > limits.FREE_EXPOSURES:
         blocks.pop("exposures", None)
     if FreeForm.name in result.model.effect_names or not blocks or judge.over(state.fits):
