@@ -257,16 +257,16 @@ def test_models_without_data():
 def test_quality_bits_follow_the_fit(result):
     assert result.judged().verdict.quality == 0
     minimum = dataclasses.replace(result.minimum, result=RESULTS.stagnation, condition=1e11)
-    posterior = dataclasses.replace(result.posterior, data=10.0 * result.dof)
+    expansion = dataclasses.replace(result.expansion, data=10.0 * result.dof)
     values = result.values.copy()
     index = result.model.index("pupil.magnification")
     values[index] += 5 * result.model.parameters[index].prior[1]
-    bad = dataclasses.replace(result, minimum=minimum, posterior=posterior, values=values)
+    bad = dataclasses.replace(result, minimum=minimum, expansion=expansion, values=values)
     assert bad.judged().verdict.quality == 1 | 2 | 4 | 8 | 8192
     assert bad.at_prior_edge == ("pupil.magnification",)
-    slightly = dataclasses.replace(result.posterior, data=result.dof * 1.0 + 20.0 * np.sqrt(result.dof))
+    slightly = dataclasses.replace(result.expansion, data=result.dof * 1.0 + 20.0 * np.sqrt(result.dof))
     assert (
-        dataclasses.replace(result, posterior=slightly).judged(["odd"]).verdict.quality & ~8 == 8192 | 32768
+        dataclasses.replace(result, expansion=slightly).judged(["odd"]).verdict.quality & ~8 == 8192 | 32768
     )
 
 

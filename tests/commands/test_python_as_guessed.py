@@ -23,6 +23,14 @@ def test_a_run_answers_like_its_fit(fitted):
     assert "walop_jax" in type(run.plot("modulation")).__module__
 
 
+def test_only_draws_are_called_a_posterior(fitted):
+    run = walop.read(fitted.run)
+    fit = run.fit()
+    assert not hasattr(fit, "posterior")
+    assert fit.expansion.chi2 == fit.chi2
+    assert run.posterior is None  # nothing has been drawn
+
+
 def test_a_model_shows_its_parameters(fitted):
     model = walop.base_model(walop.read(fitted.calset)).change("half1.wedge", free=False)
     table = model.to_table()
@@ -32,6 +40,12 @@ def test_a_model_shows_its_parameters(fitted):
     assert "half1.wedge" in model.summary()
     assert len(repr(model).splitlines()) <= 26
     assert "<table>" in model._repr_html_()
+
+
+def test_intensities_print_as_a_line(fitted):
+    intensities = walop.read(fitted.calset).intensities
+    assert repr(intensities).startswith(f"{intensities.rows} rows of ")
+    assert len(repr(intensities)) < 100
 
 
 def test_a_set_becomes_arrays_and_comes_back(fitted):

@@ -95,7 +95,7 @@ def test_a_posterior_has_the_errors_of_a_fit_that_leaves_too_much(spoilt_file: P
 
 def stated_covariance(result: FitResult) -> np.ndarray:
     """The covariance of a fit with the errors that its data state."""
-    return covariance(result.model, result.posterior)
+    return covariance(result.model, result.expansion)
 
 
 def test_what_is_no_run_is_refused(fitted: FittedSet, tmp_path: Path):

@@ -51,6 +51,10 @@ def test_existing_files_are_kept(call, plan, tmp_path):
     assert result.exit_code == 1
     assert "exists already" in result.stderr
     assert output.read_text() == "mine"
+    # A name that is misspelt comes first: the call has to be written again anyway.
+    result = call("simulate", plan, "-o", output, "--effect", "clp_zeroo=1")
+    assert result.exit_code == 2
+    assert "did you mean 'clp_zero'" in result.stderr
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def test_an_argument_that_does_not_exist_is_named_with_the_nearest(name: str):
         (lambda: walop.report(1.0), "1.0 is not a run or a calibration; give a fit, a Run, or the path of"),
         (
             lambda: walop.refit("x.fits", free=["half1.wedge"]),
-            "refit: there is no argument 'free'; the model says that of its parameters: model=base_model(calset)",
+            "refit: there is no argument 'free'; that is a matter of the model: model=base_model(calset)",
         ),
         (walop.refit, "refit: missing a required argument: 'data'; the arguments are data, model"),
     ],

@@ -13,6 +13,7 @@ from astropy.io import fits
 from astropy.table import Table
 from tables_in_memory import ROWS, SOUTH, remarks, table
 
+from walop_jax.data.table_files import read_table_file
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.io.errors import DataError
 from walop_jax.science.catalogue import read_catalogue
@@ -162,3 +163,12 @@ def test_texts_of_other_names_are_read(tmp_path, name):
     (tmp_path / name).write_bytes(gzip.compress(content) if name.endswith(".gz") else content)
     points = field_points(read_input_table(tmp_path / name), SOUTH)
     assert points.settings.teff.tolist() == [5000.0, 6000.0]
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", "|", " "])
+def test_columns_are_told_apart_where_none_is_asked_for(tmp_path, separator):
+    """Catalogues of cameras and logs of a telescope: names are not known ahead of reading."""
+    (tmp_path / "t.txt").write_text(commas_to(separator, "A,B,C\n1,2.5,x\n3,4.5,y\n"))
+    _, found, _ = read_table_file(tmp_path / "t.txt", ())
+    assert found.colnames == ["A", "B", "C"]
+    assert found["B"].tolist() == [2.5, 4.5]

@@ -148,6 +148,7 @@ def test_the_command_and_the_set(words: Path, tmp_path: Path):
         ({"OBSTYPE": "DOME"}, r"KIND: OBSTYPE = 'DOME' is none of its values.*POLFLAT"),
         ({"DATE-OBS": "yesterday"}, r"MJD: DATE-OBS = 'yesterday' is no date"),
         ({"POLARIS": 3}, r"CLP_IN: POLARIS = 3 is none"),
+        ({"TELRA": "06:75:13.2"}, r"RA: TELRA = '06:75:13\.2' is no angle; .* minutes below 60"),
     ],
 )
 def test_words_that_cannot_be_meant_are_told(words: Path, tmp_path: Path, changes, message):
@@ -167,12 +168,41 @@ def test_words_that_cannot_be_meant_are_told(words: Path, tmp_path: Path, change
         ('word = "ROT"', "", r"\[ROTATOR\] needs word"),
         ('word = "ROT"', 'words = "ROT"', r"there is no key 'words'"),
         ("[KIND]", "[HA]", "values|not a number"),
+        ("extension = 0", 'schedule = "survey"', "schedule = 'survey' must be a table"),
+        ("extension = 0", 'schedule = { observr = "x" }', r"no key 'observr'; did you mean 'observer'"),
+        ("extension = 0", 'schedule = { mode = "semi" }', "mode = 'semi' is neither manual nor auto"),
+        ("extension = 0", f'schedule = {{ pi = "{"x" * 101}" }}', "pi has more than 100 characters"),
     ],
 )
 def test_files_of_words_that_cannot_be_meant_are_told(words: Path, tmp_path: Path, old, new, message):
     words.write_text(WORDS.replace(old, new, 1))
     with pytest.raises(DataError, match=message):
         exposures_table(headers(tmp_path), read_words(words))
+
+
+@pytest.mark.parametrize(
+    "began",
+    [
+        "2026-11-26T18:00:00Z",
+        "2026-11-26T20:30:00+02:30",
+        "2026-11-26 18:00:00.000000",
+        {"$date": "2026-11-26T18:00:00.000Z"},
+        {"$date": {"$numberLong": "1795716000000"}},  # date -d 2026-11-26T18:00Z +%s
+        {"$date": 1795716000000},
+    ],
+)
+def test_times_of_a_log(words: Path, tmp_path: Path, began):
+    """A zone is taken into account, a byte-order mark and NaN are nothing; a file for each camera is remarked on."""
+    record = HEADERS[0] | {"DATE-OBS": began, "POLANG": float("nan"), "TELRA": "6h45m13.2s"}
+    (tmp_path / "log.json").write_text("\ufeff" + json.dumps([record] * 4))
+    columns, remarks = exposures_table([tmp_path / "log.json"], read_words(words))
+    np.testing.assert_allclose(columns["MJD"], 61370.75 + 15 / 86400, atol=1e-9)
+    np.testing.assert_allclose(columns["RA"], 101.305, atol=1e-10)
+    assert np.isnan(columns["CLP_ANGLE"]).all()
+    assert (
+        "3 exposures begin before the one ahead of them has ended: is a record there twice, or a file"
+        in remarks[-1]
+    )
 
 
 def test_nothing_says_what_was_observed(tmp_path: Path):

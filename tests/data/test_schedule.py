@@ -80,8 +80,9 @@ def validate(schedule: dict[str, Any]) -> None:
                 assert 0 <= state.get("speed", 0) <= 3.0
 
 
-def same(one: Exposures, two: Exposures) -> None:
+def same(one: Exposures, columns: dict[str, np.ndarray]) -> None:
     """Everything that a schedule states."""
+    two = Exposures.from_columns(columns)
     assert one.kind.tolist() == two.kind.tolist()
     assert one.filter.tolist() == two.filter.tolist()
     np.testing.assert_array_equal(one.exptime, two.exptime)
@@ -111,7 +112,7 @@ def test_a_plan_with_filters_plate_and_sky(tmp_path: Path):
     exposures = PLAN.exposures()
     schedule = written(tmp_path / "s.json", exposures)
     validate(schedule)
-    again, _, remarks = read_schedule(tmp_path / "s.json", FILTERS)
+    again, remarks = read_schedule(tmp_path / "s.json", FILTERS)
     same(exposures, again)
     assert "their time is not known" in remarks[0]
     assert {target["type"] for target in schedule["targets"]} == {"CAL-CAL", "CAL-MOO", "CAL-POL"}
@@ -185,9 +186,9 @@ def test_an_executed_schedule_has_times(tmp_path: Path):
             )
             one["executed"] = [f"{time}Z" for time in began]
     (tmp_path / "done.json").write_text(json.dumps(schedule))
-    again, _, remarks = read_schedule(tmp_path / "done.json", FILTERS)
+    again, remarks = read_schedule(tmp_path / "done.json", FILTERS)
     assert remarks == []
-    np.testing.assert_allclose(again.mjd, exposures.mjd, atol=1e-9)
+    np.testing.assert_allclose(again["MJD"], exposures.mjd, atol=1e-9)
     (tmp_path / "words.toml").write_text('filters = { "SDSS-r" = 1, "NB-660" = 3 }\n')
     table = walop.exposures(tmp_path / "done.json", words=tmp_path / "words.toml")
     np.testing.assert_allclose(table["MJD"], exposures.mjd, atol=1e-9)
@@ -245,6 +246,12 @@ def test_times_that_are_no_whole_seconds_are_told():
         (lambda one: one["polarizer"].update(angle=None), "angle = None must be a finite number"),
         (lambda one: one["polarizer"].update(angle=1e6), "angle = 1e.06 must be between 0 and 360"),
         (lambda one: one.update(hwp=None), "hwp = None must be a table"),
+        (lambda one: one.update(filter=[1]), r"filter = \[1\] must be a whole number"),
+        (lambda one: one.update(filter=True), "filter = True must be a whole number"),
+        (
+            lambda one: one.update(hwp={"engage": True, "continuous": True, "speed": 6}),
+            "speed = 6 must be at most 3 turns a minute",
+        ),
     ],
 )
 def test_what_cannot_be_read_back_is_told(tmp_path: Path, change, message):
@@ -258,13 +265,34 @@ def test_what_cannot_be_read_back_is_told(tmp_path: Path, change, message):
         read_schedule(tmp_path / "s.json", FILTERS)
 
 
+@pytest.mark.parametrize(
+    ("coordinates", "message"),
+    [
+        ({"ra": "25:00:00"}, "'25:00:00' is no angle"),
+        ({"ra": "05:75:00"}, "'05:75:00' is no angle"),
+        ({"dec": "+95:00:00"}, r"DEC: exceeds ±90"),
+        ({"ra": None}, "target 16, .*: no object with RA and DEC, where these are is not known"),
+    ],
+)
+def test_objects_without_a_place_on_the_sky_are_told(tmp_path: Path, coordinates, message):
+    schedule = written(tmp_path / "s.json", PLAN.exposures())
+    for entry in schedule["objects"]:
+        entry.update(coordinates)
+    (tmp_path / "s.json").write_text(json.dumps(schedule))
+    if coordinates == {"ra": None}:
+        assert re.search(message, "; ".join(read_schedule(tmp_path / "s.json", FILTERS)[1]))
+        return
+    with pytest.raises(DataError, match=message):
+        read_schedule(tmp_path / "s.json", FILTERS)
+
+
 def test_exposures_of_science_are_left_out_and_other_types_refused(tmp_path: Path):
     schedule = written(tmp_path / "s.json", PLAN.exposures())
     schedule["targets"][-1]["type"] = "PAS"
     (tmp_path / "s.json").write_text(json.dumps(schedule))
-    again, names, remarks = read_schedule(tmp_path / "s.json", FILTERS)
-    assert len(again) == len(PLAN.exposures()) - 1
-    assert schedule["targets"][-1]["target"] not in names
+    again, remarks = read_schedule(tmp_path / "s.json", FILTERS)
+    assert len(again["TARGET"]) == len(PLAN.exposures()) - 1
+    assert schedule["targets"][-1]["target"] not in again["TARGET"]
     assert "no calibration (PAS and SCI), left out" in "; ".join(remarks)
     schedule["targets"][-1]["type"] = "CAL-XXX"
     (tmp_path / "s.json").write_text(json.dumps(schedule))
@@ -279,5 +307,5 @@ def test_times_that_overlap_are_remarked_on(tmp_path: Path):
         for one in target["acquisition"]:
             one["executed"] = ["2026-11-26T01:00:00Z"] * one["exposure"]["multiples"]
     (tmp_path / "s.json").write_text(json.dumps(schedule))
-    _, _, remarks = read_schedule(tmp_path / "s.json", FILTERS)
+    _, remarks = read_schedule(tmp_path / "s.json", FILTERS)
     assert f"{len(PLAN.exposures()) - 1} exposures begin before the one ahead of them has ended" in remarks[0]

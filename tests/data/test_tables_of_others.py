@@ -479,3 +479,44 @@ def test_a_column_is_renamed_whatever_names_there_are():
     names = extended(given, {"FLAG": np.ones(ROWS, int)}).colnames
     assert len(set(names)) == len(names) == 9
     assert "OLD_OLD_FLAG" in names
+
+
+@pytest.mark.parametrize("counts", ["N{k}", "{camera}"])
+@pytest.mark.parametrize("sky", ["SKY{k}", "{camera}_SKY"])
+def test_the_level_of_the_sky_has_a_column_for_each_camera(counts, sky):
+    """Of counts by the names of the cameras no sky is made, and of a table without levels none."""
+
+    def side_by_side(**columns):
+        made = table()["X", "Y"]
+        for form, values in columns.items():
+            for k, camera in enumerate(SOUTH.cameras.names):
+                made[form.format(k=k, camera=camera)] = values[:, k]
+        return made
+
+    plain = table()
+    numbers = {counts: plain["N"], f"{counts}_ERR": plain["N_ERR"]}
+    assert read(side_by_side(**numbers)).sky is None
+    level = 100.0 + np.arange(4.0) * np.ones((ROWS, 1))
+    found = read(side_by_side(**numbers, **{sky: level}))
+    np.testing.assert_array_equal(found.sky, level)
+    np.testing.assert_allclose(found.counts, plain["N"])
+
+
+def test_a_position_in_hours_or_beyond_the_sky_is_refused():
+    """Rows are stars by RA and DEC: 15 arcsec of a right ascension in hours would be one."""
+    rng = np.random.default_rng(1)
+    many = table()[np.zeros(40, int)]
+    many["X"], many["Y"] = rng.uniform(-0.2, 0.2, (2, 40))
+    many["DEC"] = -20.0 + many["Y"]
+    many["RA"] = (100.0 + many["X"]) / 15.0
+    with pytest.raises(DataError, match=r"RA: lies between .* looks like hours"):
+        read(many)
+    with pytest.raises(DataError, match="DEC: is beyond ±90°"):
+        read(table(RA=np.arange(5.0), DEC=np.full(5, 100.0)))
+
+
+@pytest.mark.parametrize("name", ["GaiaID", "Gaia", "gaia_dr3_source_id", "ID_GAIA", "DR3Name"])
+def test_an_identity_under_an_unknown_name_is_named(name):
+    assert f"{name.upper()}: the identity of a star is read from SOURCE_ID" in remarks(
+        read(table(**{name: range(5)}))
+    )

@@ -164,7 +164,7 @@ BAD = {
     "dark": ("X-Field     :  1.0000", "X-Field     :  0.0000", "no electric field"),
     "no state": ("X-Field     :  1.0000\n", "", "neither X-Field nor"),
     "bad state": ("X-Field     :  1.0000", "X-Field     :  east", "line 8: X-Field is 'east', not a number"),
-    "no configuration": ("Configuration 1 of 4\n", "", "does not say which configuration"),
+    "no configuration": ("Configuration 1 of 4\n", "", "does not name its configuration"),
     "error entry": (FIRST, "Error", "line 18: the transmission is 'Error', not a number.*without this field"),
     "not a number": (FIRST, "NaN", "line 18: the transmission is 'NaN', not a number"),
     "nothing": (FIRST, "", "line 18: the transmission is '', not a number"),

@@ -213,6 +213,21 @@ def test_a_pattern_that_grows_is_found(turning, hidden):
     assert error @ space.gram[at, at] @ error < stats.chi2.isf(1e-6, len(error))
 
 
+@pytest.mark.parametrize(("second", "asked"), [(3.0, False), (24.0, True)])
+def test_the_time_since_the_beginning_of_a_night_is_asked_of_several_nights(second, asked):
+    exposures = builders.exposures(
+        *(
+            {"kind": "moon", "mjd": 61000.0 + (begin + hour) / 24.0}
+            for begin in (0.0, second)
+            for hour in (0, 1, 2)
+        )
+    )
+    said = [
+        p.group[0].sentences[0] for p in grammar.sentences(nominal_instrument("WALOP-SOUTH"), exposures, 25)
+    ]
+    assert ("added polarisation q ahead of polariser * night hours" in said) == asked
+
+
 def test_steps_part_the_exposures_evenly_and_are_dated_between():
     """Midway between exposures; of many exposures every fourth time at first, then all times of the neighbourhood."""
     few = builders.exposures(*({"mjd": 61000.0 + hour / 24.0} for hour in (0, 1, 3, 4)))

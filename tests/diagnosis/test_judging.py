@@ -62,8 +62,8 @@ def test_evidence_of_many_numbers_is_the_mean_over_fits_with_priors_of_four_widt
         for name in added:
             narrower = narrower.change(name, prior=(0.0, scale * 0.005))
         found = fit(Likelihood.of(calset, narrower))
-        curvature = [np.linalg.slogdet(one.posterior.matrix)[1] for one in (base, found)]
-        gain = base.posterior.objective - found.posterior.objective - (curvature[1] - curvature[0])
+        curvature = [np.linalg.slogdet(one.expansion.matrix)[1] for one in (base, found)]
+        gain = base.expansion.objective - found.expansion.objective - (curvature[1] - curvature[0])
         evidence.append(0.5 * gain - len(added) * np.log(scale * 0.005))
     extended = fit(Likelihood.of(calset, with_patches))
     mean = np.logaddexp.reduce(evidence) - np.log(4.0)
@@ -308,8 +308,8 @@ def test_decided_keeps_every_trial_once(monkeypatch):
 
     def result(name, scale=30.0):
         found = object.__new__(FitResult)
-        posterior = SimpleNamespace(objective=objective[name], noise_scale=scale)
-        vars(found).update(likelihood=name, values=None, posterior=posterior)
+        expansion = SimpleNamespace(objective=objective[name], noise_scale=scale)
+        vars(found).update(likelihood=name, values=None, expansion=expansion)
         return found
 
     def trial(name, evidence, effect):

@@ -24,8 +24,8 @@ def arms_apart(design: Design) -> Design:
 @pytest.mark.parametrize("apart", [False, True])
 def test_rows_are_columns(scale, apart):
     fit = small_fit_with_plate()
-    posterior = dataclasses.replace(fit.posterior, noise_scale=scale)
-    design = Design.of(dataclasses.replace(fit, posterior=posterior))
+    expansion = dataclasses.replace(fit.expansion, noise_scale=scale)
+    design = Design.of(dataclasses.replace(fit, expansion=expansion))
     design = arms_apart(design) if apart else design
     found = list(strata(design.measured))
     one = np.eye(design.measured.cameras)

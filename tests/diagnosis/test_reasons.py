@@ -61,7 +61,7 @@ FOUND = {
             "ghost",
             ["score is 3.5 (p = 0.4", "not significant by itself, so not tried", "share is below 0.0002"],
         ),
-        ("chwp_axis", ["cannot show it at any plausible size"]),
+        ("chwp_axis", ["these data are insensitive to it"]),
         ("turn of polariser", ["by another name"]),
         ("half1.wedge turned by 90 deg", ["leaves 93 % of the squared residuals; it was not fitted"]),
         (

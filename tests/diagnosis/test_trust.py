@@ -130,9 +130,9 @@ def test_chi2_a_few_per_cent_too_large_is_trusted_only_without_doubts(clean):
     """10⁴ degrees of freedom: χ²/dof = 1.1 is 7 standard deviations, 1.2 more than errors are put down to."""
 
     def found(ratio: float, *doubts: str) -> FitResult:
-        data = 1e4 * ratio - (clean.chi2 - clean.posterior.data)
-        posterior = dataclasses.replace(clean.posterior, data=data, dof=10_000)
-        return dataclasses.replace(clean, posterior=posterior).judged(doubts)
+        data = 1e4 * ratio - (clean.chi2 - clean.expansion.data)
+        expansion = dataclasses.replace(clean.expansion, data=data, dof=10_000)
+        return dataclasses.replace(clean, expansion=expansion).judged(doubts)
 
     assert found(1.1).chi2 == pytest.approx(11_000)
     cases = [
@@ -223,7 +223,7 @@ def test_exposures_beside_summed_pixels_count_by_themselves(calset, clean):
     residual, used = clean.likelihood.residuals(clean.values)[1], clean.likelihood.used
     beside = float(np.sum(residual[:, ~through] ** 2))
     assert beside > 100.0
-    priors = clean.chi2 - clean.posterior.data
+    priors = clean.chi2 - clean.expansion.data
     assert found.chi2 == pytest.approx(330_000.0 + beside + priors, abs=0.1)
     assert found.dof == 330_000 + 3 * used[:, ~through].sum()
 

@@ -32,20 +32,20 @@ def design():
 
 def test_rows_and_priors_make_the_objective(design):
     fitted = design.fit
-    assert design.residual @ design.residual == pytest.approx(fitted.posterior.objective, rel=1e-10)
-    scale = np.sqrt(np.diag(fitted.posterior.matrix))
+    assert design.residual @ design.residual == pytest.approx(fitted.expansion.objective, rel=1e-10)
+    scale = np.sqrt(np.diag(fitted.expansion.matrix))
     gram = design.jacobian.T @ design.jacobian
     np.testing.assert_allclose(
-        gram / np.outer(scale, scale), fitted.posterior.matrix / np.outer(scale, scale), atol=1e-9
+        gram / np.outer(scale, scale), fitted.expansion.matrix / np.outer(scale, scale), atol=1e-9
     )
     assert np.abs(design.jacobian.T @ design.residual / scale).max() < 1e-3
 
 
 def test_measured_residuals_keep_the_errors_as_given(design):
     """Errors that a fit has scaled act on the rows of the design only."""
-    posterior = dataclasses.replace(design.fit.posterior, noise_scale=3.0)
-    scaled = Design.of(dataclasses.replace(design.fit, posterior=posterior))
-    assert np.sum(scaled.measured.residual**2) == pytest.approx(posterior.data, rel=1e-10)
+    expansion = dataclasses.replace(design.fit.expansion, noise_scale=3.0)
+    scaled = Design.of(dataclasses.replace(design.fit, expansion=expansion))
+    assert np.sum(scaled.measured.residual**2) == pytest.approx(expansion.data, rel=1e-10)
     rows = 3.0 * scaled.cube(scaled.residual)
     np.testing.assert_allclose(rows, scaled.measured.residual, rtol=1e-12)
 

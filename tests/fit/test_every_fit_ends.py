@@ -82,9 +82,9 @@ def test_bad_data_cost_no_more_passes_than_they_are_worth(mistake, passes):
     assert all(" of at most " in line and "χ²/dof" in line for line in steps)
     assert any(f"start {result.starts} of 13" in line for line in steps)
     # The best of all places looked at is what comes back.
-    scaled = result.posterior.noise_scale
+    scaled = result.expansion.noise_scale
     at_start = Likelihood.of(calset, model).expand(model.start, scaled)
-    assert result.posterior.objective <= at_start.objective
+    assert result.expansion.objective <= at_start.objective
 
 
 def test_good_data_take_one_search(passes):

@@ -125,12 +125,12 @@ def test_blocks_that_scatter_widely_make_the_covariance(monkeypatch):
     """Sandwich written out: far larger than all else, it is the whole answer; B blocks know B − 1 differences."""
     result = small_fit()
     rng = np.random.default_rng(1)
-    model, posterior = result.model, result.posterior
-    size, count = np.sqrt(np.diag(posterior.matrix)), 2 * len(model.free)
+    model, expansion = result.model, result.expansion
+    size, count = np.sqrt(np.diag(expansion.matrix)), 2 * len(model.free)
     gradients = 100.0 * rng.standard_normal((count, len(size))) * size
     monkeypatch.setattr(robust, "_gradients", lambda *_: iter([("blocks", gradients)]))
-    found = robust.robust_errors(result.likelihood, result.values, posterior).covariance
-    inverse = np.linalg.inv(posterior.matrix / np.outer(size, size))
+    found = robust.robust_errors(result.likelihood, result.values, expansion).covariance
+    inverse = np.linalg.inv(expansion.matrix / np.outer(size, size))
     scaled = gradients / size
     expected = inverse @ (count / (count - 1) * scaled.T @ scaled) @ inverse
     # The priors, which are no blocks, are 1e-4 of it.

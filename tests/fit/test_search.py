@@ -16,7 +16,7 @@ from walop_jax.fit.model_file import model_without_data
 from walop_jax.fit.refit import _start
 from walop_jax.fit.search import _order_starts, _search, find_minimum
 from walop_jax.instruments.description import parsed
-from walop_jax.likelihood.likelihood import Census, Likelihood, OpticsUsed, Posterior
+from walop_jax.likelihood.likelihood import Census, Expansion, Likelihood, OpticsUsed
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import build
 from walop_jax.model.specification import effect_context, with_effects
@@ -147,7 +147,7 @@ def test_a_search_ends_with_equal_plates_wherever_it_began(north):
         away = values[model.free] - goal
         census = Census(np.ones(4, int), (0.0, 0.1, 0.0, 0.1), 4)
         square = float(away @ away)
-        return Posterior(square, 0.0, 0.0, scale, away, np.eye(len(away)), census, 1, OpticsUsed(None))
+        return Expansion(square, 0.0, 0.0, scale, away, np.eye(len(away)), census, 1, OpticsUsed(None))
 
     first = model.start.copy()
     for i, _ in ties(model):
@@ -196,7 +196,7 @@ def test_fringes_of_another_order_are_no_end(start, monkeypatch):
         matrix = others.copy()
         matrix[np.ix_(at, at)] += jacobian.T @ jacobian
         census = Census(np.ones(4, int), (0.0, 0.1, 0.0, 0.1), 4)
-        return Posterior(square, 0.0, 0.0, scale, gradient, matrix, census, DOF, OpticsUsed(None))
+        return Expansion(square, 0.0, 0.0, scale, gradient, matrix, census, DOF, OpticsUsed(None))
 
     monkeypatch.setattr(Likelihood, "expand", expand)
     assert model.gaps() == (model.index("etalon.gap"),)

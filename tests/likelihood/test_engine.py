@@ -375,7 +375,7 @@ def test_set_a_has_the_oracles_residuals(either_south_set, start):
     rows = 4 * data["point"].size
     found = likelihood.residuals(vector)[1][data["point"], data["exposure"]]
     np.testing.assert_allclose(found.ravel(), expected[:rows], rtol=1e-6, atol=1e-4)
-    posterior = likelihood.expand(vector)
-    assert posterior.data == pytest.approx(np.sum(expected[:rows] ** 2), rel=1e-6)
-    assert posterior.priors == pytest.approx(np.sum(expected[rows:] ** 2), rel=1e-10)
+    expansion = likelihood.expand(vector)
+    assert expansion.data == pytest.approx(np.sum(expected[:rows] ** 2), rel=1e-6)
+    assert expansion.priors == pytest.approx(np.sum(expected[rows:] ** 2), rel=1e-10)
     assert likelihood.census.n_data == rows

@@ -13,7 +13,7 @@ from small_run import SEED, SMALL
 from walop_jax.data.records import Block, CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.base_model import base_model
-from walop_jax.likelihood.likelihood import Likelihood, Posterior
+from walop_jax.likelihood.likelihood import Expansion, Likelihood
 from walop_jax.simulation.simulate import simulate
 
 few = settings(max_examples=8, deadline=None, derandomize=True)
@@ -26,7 +26,7 @@ def simulated():
 
 
 @functools.cache
-def plain() -> tuple[Likelihood, np.ndarray, Posterior]:
+def plain() -> tuple[Likelihood, np.ndarray, Expansion]:
     """A likelihood, values away from the minimum, and the expansion there."""
     likelihood = of(simulated().calset)
     scale = np.array([p.scale for p in likelihood.model.parameters])

@@ -25,7 +25,7 @@ from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixel_
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.compressed import compressed
-from walop_jax.likelihood.frames import Cells, PixelPosterior, expand_pixels, stands_for_pixels
+from walop_jax.likelihood.frames import Cells, PixelExpansion, expand_pixels, stands_for_pixels
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name
@@ -204,8 +204,8 @@ def test_the_set_that_stands_for_frames_keeps_the_table_beside_them(with_stars, 
     monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
     calset = with_stars.calset
     found = fit(Likelihood.of(calset, with_stars.model, interpolate=True))
-    assert isinstance(found.posterior, PixelPosterior)
-    small = compressed(found.posterior)
+    assert isinstance(found.expansion, PixelExpansion)
+    small = compressed(found.expansion)
     assert small.compression.pixels == SIDE**2
     table = without_frames(calset)
     last = small.intensities.block(len(small.points) - len(table.points), len(small.points))
@@ -217,7 +217,7 @@ def test_the_set_that_stands_for_frames_keeps_the_table_beside_them(with_stars, 
     free = found.sigma > 0
     np.testing.assert_allclose((again.values - found.values)[free] / found.sigma[free], 0.0, atol=2e-3)
     np.testing.assert_allclose(again.sigma[free] / found.sigma[free], 1.0, atol=5e-3)
-    ours = residual_map_of_pixels(found.posterior.sums)
+    ours = residual_map_of_pixels(found.expansion.sums)
     assert np.isfinite(ours.values).all()
 
 
@@ -243,8 +243,8 @@ def fitted(path):
 
 @pytest.fixture(scope="module")
 def stand_in(fitted):
-    assert isinstance(fitted.posterior, PixelPosterior)
-    return compressed(fitted.posterior)
+    assert isinstance(fitted.expansion, PixelExpansion)
+    return compressed(fitted.expansion)
 
 
 def test_the_fit_of_the_sums_ends_where_the_usual_one_ends(fitted, usual):
@@ -267,7 +267,7 @@ def test_a_wave_of_five_pixels_is_told_of_frames_and_of_the_set_that_stands_for_
         patch.setattr(limits, "LARGE_ABOVE", 0)
         likelihood = Likelihood.of(read_calibration_set(rough), fitted.model, interpolate=True)
         of_pixels = with_honest_errors(fit(likelihood, start=fitted.values))
-        small = with_pixel_structure(compressed(of_pixels.posterior), pixel_structure(of_pixels))
+        small = with_pixel_structure(compressed(of_pixels.expansion), pixel_structure(of_pixels))
         of_points = with_honest_errors(fit(Likelihood.of(small, fitted.model, interpolate=False)))
         seen = [examined(one, as_written=True) for one in (of_pixels, of_points)]
     for one in seen:
@@ -314,7 +314,7 @@ def test_it_comes_back_from_its_file(stand_in, fitted, tmp_path):
     record = again.compression
     assert record is not None
     assert record.pixels == SIDE**2
-    assert record.chi2 == fitted.posterior.data
+    assert record.chi2 == fitted.expansion.data
     assert record.frames[0].sha256 == fitted.calset.inputs[0].sha256
     assert any("stand for" in text for text in again.remarks)
     block, other = (one.intensities.block(0, len(one.points)) for one in (stand_in, again))

@@ -91,22 +91,22 @@ def test_a_master_is_pulled_once_whatever_is_tied_to_it(calset, model):
 def test_fit_sampler_and_diagnosis_have_one_posterior(calset, model):
     """χ² of data, priors and pulls of the same three, with a tied parameter that has a pull of its own declared."""
     result = fit(Likelihood.of(calset, model))
-    posterior, target, design = result.posterior, Target(result), Design.of(result)
+    expansion, target, design = result.expansion, Target(result), Design.of(result)
     x = result.values[model.free]
-    assert target.objective(x) == pytest.approx(posterior.objective, rel=1e-10)
-    assert design.residual @ design.residual == pytest.approx(posterior.objective, rel=1e-10)
+    assert target.objective(x) == pytest.approx(expansion.objective, rel=1e-10)
+    assert design.residual @ design.residual == pytest.approx(expansion.objective, rel=1e-10)
     np.testing.assert_allclose(target.prior_rows(x), -design.residual[design.rows :], rtol=1e-12)
-    size = np.sqrt(np.diag(posterior.matrix))
+    size = np.sqrt(np.diag(expansion.matrix))
     gram = design.jacobian.T @ design.jacobian
     np.testing.assert_allclose(
-        gram / np.outer(size, size), posterior.matrix / np.outer(size, size), atol=1e-9
+        gram / np.outer(size, size), expansion.matrix / np.outer(size, size), atol=1e-9
     )
     pulls = sum(
         p.free and p.tie is None and p.prior is None and p.loose is not None for p in model.parameters
     )
     fluxes = int(result.likelihood.used.sum())
     assert fluxes < design.eliminated <= fluxes + pulls
-    assert design.projector.free == posterior.dof
+    assert design.projector.free == expansion.dof
 
 
 def test_a_frozen_parameter_is_taken_as_it_is(calset, model):

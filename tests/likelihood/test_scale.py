@@ -44,7 +44,7 @@ from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.compressed import compressed
-from walop_jax.likelihood.frames import PixelPosterior, frame_sums
+from walop_jax.likelihood.frames import PixelExpansion, frame_sums
 from walop_jax.likelihood.layout import MeasuredPoints
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.light import instrument_matrix
@@ -181,9 +181,9 @@ def test_whole_frames(tmp_path, side):
     fitted = time.perf_counter() - began
     residuals = residual_map(result)
     whole = time.perf_counter() - began
-    assert isinstance(result.posterior, PixelPosterior)
+    assert isinstance(result.expansion, PixelExpansion)
     again = seconds(lambda: frame_sums(result.likelihood, result.values))
-    small = compressed(result.posterior)
+    small = compressed(result.expansion)
     truth = np.asarray(values_of(simulate(RUN, seed=3).truth))
     known = result.sigma > 0
     pulls = (result.values - truth)[known] / result.sigma[known]

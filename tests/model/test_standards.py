@@ -285,12 +285,12 @@ def test_slopes_of_a_field_are_those_of_its_residuals():
     # The Jacobian leaves out what the residuals turn the flux by, which is of no consequence for the gradient.
     np.testing.assert_allclose(slope, (up - down) / 2e-6, atol=0.01 * np.abs(slope).max())
     assert slope @ residual[used].ravel() == pytest.approx((up @ up - down @ down) / 4e-6, rel=1e-3)
-    posterior = likelihood.expand(values)
-    assert posterior.data == pytest.approx(np.sum(residual**2), rel=1e-12)
+    expansion = likelihood.expand(values)
+    assert expansion.data == pytest.approx(np.sum(residual**2), rel=1e-12)
     half = slope @ residual[used].ravel()
     rows = likelihood.priors
     half += rows.jacobian(likelihood.model.selection())[:, i] @ rows.residuals(values)
-    assert posterior.gradient[i] == pytest.approx(half, rel=1e-9)
+    assert expansion.gradient[i] == pytest.approx(half, rel=1e-9)
     (effect,), *_ = effect_by_name("standard_outlier").probes(
         effect_context(likelihood.model.template, likelihood.calset.exposures)
     )

@@ -179,7 +179,7 @@ def test_kept_nights_are_stacked(quiet, sets, single, tmp_path):
     assert any("stay as they were linearised" in text for text in kept.verdict.warnings)
     with pytest.raises(DataError, match="no calibration is known"):
         stack([tmp_path]).at(SMALL.start)
-    with pytest.raises(DataError, match="nothing says at which values"):
+    with pytest.raises(DataError, match="no values at which to linearise"):
         stack([sets[0]])
 
 
@@ -257,7 +257,7 @@ def test_bad_input(quiet, single):
         both.at(one.mjd)
     deaf = dataclasses.replace(two, matrix=np.zeros_like(two.matrix), gradient=np.zeros_like(two.gradient))
     free = next(p.name for p in one.parameters if p.prior is None and p.loose is None)
-    with pytest.raises(DataError, match=r"says nothing of .*, which has a value of its own there"):
+    with pytest.raises(DataError, match=r"has no information on .*, which has a value of its own there"):
         stack([one, deaf, three], {free: {"per": "night"}})
     scattered = dataclasses.replace(single, errors_from="residuals").judged()
     with pytest.raises(DataError, match="do not explain its scatter"):

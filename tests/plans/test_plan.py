@@ -166,9 +166,9 @@ def test_exposures_that_are_not_there(changes, message):
 
 
 def test_exposures_that_say_nothing_of_what_is_wanted(small):
-    """The polariser is indoors: what it sees says nothing of the sky."""
+    """The polariser is indoors: its light has nothing of the sky."""
     indoors = dataclasses.replace(small, choices=small.choices[:1], families=small.families[:1])
-    with pytest.raises(ValueError, match=r"sky.depolarisation: nothing that could .* no moon or standard"):
+    with pytest.raises(ValueError, match=r"sky.depolarisation: no possible exposure .* no moon or standard"):
         plan_from(indoors, 15.0, criterion_by_name(indoors, None, "sky.depolarisation"))
 
 
@@ -322,7 +322,7 @@ def test_the_distance_of_two_effects_is_that_of_a_fit():
     rival = with_effects(base_model(calset, throughput_degree=2), pair[1:], context)
     # Priors are centred on the design, the truth is not: what they cost is taken out by a fit of the truth's own model.
     own = with_effects(base_model(calset, throughput_degree=2), (effect.name,), context)
-    chi2 = [fit.posterior.objective for fit in (refit(calset, rival), refit(calset, own))]
+    chi2 = [fit.expansion.objective for fit in (refit(calset, rival), refit(calset, own))]
     assert np.sqrt(chi2[0] - chi2[1]) == pytest.approx(plan.value, rel=0.05)
 
 

@@ -114,7 +114,7 @@ def test_inflation_finds_the_noise_as_stated(scene: Scene) -> None:
     assert inflated.trusted, inflated.warnings
     assert inflated.ln_f is not None
     measured = scene.target.measured
-    expected = 0.5 * np.log(scene.result.posterior.data / (measured - len(scene.target.free)))
+    expected = 0.5 * np.log(scene.result.expansion.data / (measured - len(scene.target.free)))
     assert inflated.ln_f.mean() == pytest.approx(expected, abs=1.0 / np.sqrt(measured))
     assert inflated.ln_f.std() == pytest.approx(1.0 / np.sqrt(2 * measured), rel=0.15)
     assert "noise.ln_f" in inflated.intervals()["NAME"][0]

@@ -57,7 +57,13 @@ def test_a_no_go(change, words):
 def test_what_is_not_trusted_is_no_go():
     bad = small_fit().judged(["the residuals hold patterns"])
     assert certificate(small_fit().remarked("a remark"), accuracy()).go
-    assert not certificate(bad, accuracy()).go
+    refused = certificate(bad, accuracy())
+    assert not refused.go
+    # The first reason alone, and nothing of an accuracy that is not known.
+    assert [one.found for one in refused.requirements if not one.met and one.needed] == [
+        "the residuals hold patterns"
+    ]
+    assert not any("% of the field" in one.what for one in refused.requirements)
     assert "diagnose" in certificate(bad, accuracy()).missing[0]
 
 

@@ -9,7 +9,7 @@ import pytest
 from astropy import units
 from astropy.coordinates import SkyCoord
 from astropy.io.votable import parse, validate
-from astropy.table import Table
+from astropy.table import MaskedColumn, Table
 
 from walop_jax.data.user_tables import in_memory
 from walop_jax.io.errors import DataError
@@ -157,6 +157,39 @@ def test_one_rotator_for_a_field_far_from_the_equator_is_remarked_on():
     )
 
 
+@pytest.mark.parametrize(
+    ("ra", "dec", "message"),
+    [
+        (
+            lambda ra: (100.0 + ra / 360.0) / 15.0,
+            lambda dec: dec / 100.0,
+            "RA: lies between .* looks like hours",
+        ),
+        (lambda ra: ra + 400.0, lambda dec: dec, "RA: is beyond ±360°"),
+        (lambda ra: ra, lambda dec: dec + 200.0, "DEC: is beyond ±90°"),
+    ],
+)
+def test_positions_that_are_none_are_refused(ra, dec, message):
+    table = result()
+    table["RA"], table["DEC"] = ra(table["RA"]), dec(table["DEC"])
+    with pytest.raises(DataError, match=message):
+        common_table(in_memory(table))
+
+
+def test_sexagesimal_and_unknown_positions():
+    """6h30m is 97.5 deg; a star without a position is no row, and unknown identifiers are no numbers of others."""
+    table = result()
+    table.replace_column("RA", ["", *39 * ["06:30:00"]])
+    table.replace_column("DEC", 40 * ["-44:30:00"])
+    table["SOURCE_ID"] = MaskedColumn(table["SOURCE_ID"], mask=np.arange(40) == 1)
+    made, said = common_table(in_memory(table))
+    np.testing.assert_allclose(made["RAJ2000"], 97.5)
+    np.testing.assert_allclose(made["DEJ2000"], -44.5)
+    assert made["GaiaID"].tolist()[:2] == [-1, 4_000_000_000_000_000_002]
+    assert len(made) == 39
+    assert "1 rows without RA and DEC are left out" in said
+
+
 FAULTS = {
     "PA: not half the angle": lambda t: t["u"].__imul__(-1),  # the sign of COSMO
     "Pol: not the length": lambda t: t["Pol"].__imul__(100),
@@ -165,6 +198,7 @@ FAULTS = {
     "cov_qu: larger": lambda t: t["cov_qu"].__imul__(100),
     "PA_gal: not PA": lambda t: t["PA_gal"].__iadd__(10),
     "q_gal, u_gal": lambda t: t["u_gal"].__imul__(-1),
+    "RAJ2000, DEJ2000: no direction": lambda t: t["DEJ2000"].__imul__(100),
     "GLON, GLAT": lambda t: t["GLON"].__iadd__(1),
     "e_q_sys, e_u_sys": lambda t: t["e_u_sys"].__imul__(2),
     "e_PA: the column is missing": lambda t: t.remove_column("e_PA"),

@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from astropy import units
-from astropy.table import QTable, Table
+from astropy.table import QTable, Table, vstack
 from astropy.wcs import WCS
 from camera_files import CAMERAS, CENTRE, ascii_head, four, ldac, of_camera, photutils, some_stars
 
@@ -245,7 +245,7 @@ def test_a_map_of_ones_own_with_an_aperture_of_several(tmp_path):
     )
     columns["QUALITY"] = columns.pop("FLAGS") + 2
     file = ldac(tmp_path / "a.fits", columns)
-    with pytest.raises(DataError, match=r"FLUX_APER: has 2 apertures; say which .*FLUX_APER\[1\]"):
+    with pytest.raises(DataError, match=r"FLUX_APER: has 2 apertures; name it .*FLUX_APER\[1\]"):
         read_camera_catalogue(file)
     own = tmp_path / "own.toml"
     own.write_text(
@@ -479,3 +479,78 @@ def test_a_text_without_names_of_columns_is_told_from_a_catalogue(tmp_path):
     (tmp_path / "O1.cat").write_text("1 97.5 -44.0 1000.0 30.0\n")
     with pytest.raises(DataError, match=r"neither as ASCII_HEAD nor as FITS_LDAC .*CATALOG_TYPE"):
         read_camera_catalogue(tmp_path / "O1.cat")
+
+
+@pytest.mark.parametrize(
+    ("units_of", "gain", "factor", "message"),
+    [
+        (("electron", ""), None, 1.0, None),
+        (("", "electron"), None, 1.0, None),
+        (("ADU", "ct"), 2.0, 2.0, None),
+        (("kct", "kct"), None, 1e3, None),
+        (("electron", "electron"), 2.0, 1.0, "is in electrons: the gain is not used"),
+        (("electron", "ct"), 2.0, None, "FLUXERR_AUTO: is in ct, FLUX_AUTO in electron; give both in"),
+        (("ct / s", "ct / s"), None, None, "multiply by the exposure time"),
+        (("Jy", "Jy"), None, None, "the unit 'Jy' cannot be converted to 'ct'"),
+        (("mag", "mag"), None, None, r"is logarithmic \(mag\); counts in electrons are needed"),
+    ],
+)
+def test_units_of_fluxes_and_errors(tmp_path, units_of, gain, factor, message):
+    columns = Table(of_camera(STARS, 0, np.random.default_rng(0)))
+    for name, unit in zip(("FLUX_AUTO", "FLUXERR_AUTO"), units_of, strict=True):
+        columns[name].unit = unit or None
+    columns.write(tmp_path / "a.ecsv")
+    if factor is None:
+        with pytest.raises(DataError, match=message):
+            read_camera_catalogue(tmp_path / "a.ecsv", gain=gain)
+        return
+    read = read_camera_catalogue(tmp_path / "a.ecsv", gain=gain)
+    np.testing.assert_allclose(read.flux, factor * columns["FLUX_AUTO"], rtol=1e-12)
+    np.testing.assert_allclose(read.error, factor * columns["FLUXERR_AUTO"], rtol=1e-12)
+    assert message is None or message in "; ".join(read.remarks)
+
+
+def test_rows_that_are_there_twice_are_one_star(tmp_path):
+    """All rows of all cameras: no star is ambiguous, none is lost."""
+    made = by_source(walop.gather(four(vstack([STARS, STARS]), tmp_path, scatter=0.0)))
+    np.testing.assert_allclose(made["N"], STARS["N"], rtol=1e-12)
+    assert not made["N_FLAG"].any()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c["FLUX_AUTO"].__imul__(-1.0), "300 of 300 fluxes are below 0 by more than 5 errors"),
+        (lambda c: c["FLUX_AUTO"].__setitem__(3, np.inf), "1 of 300 fluxes are not finite, or have no error"),
+        (
+            lambda c: c.update(PHOT_BP_MEAN_MAG=c.pop("BP_RP")),
+            "PHOT_BP_MEAN_MAG: the colour of a star is read",
+        ),
+        (
+            lambda c: c.update(GaiaDR3=c.pop("SOURCE_ID")),
+            "GAIADR3: the identity of a star is read from SOURCE_ID",
+        ),
+        (lambda c: c.update(gaia_source_id=c.pop("SOURCE_ID")), "GAIA_SOURCE_ID: the identity of a star"),
+    ],
+)
+def test_what_is_odd_or_not_used_is_remarked_on(tmp_path, change, message):
+    columns = of_camera(STARS, 0, np.random.default_rng(0))
+    change(columns)
+    assert message in "; ".join(read_camera_catalogue(ldac(tmp_path / "a.fits", columns)).remarks)
+
+
+def test_fluxes_without_any_error_are_refused(tmp_path):
+    columns = of_camera(STARS, 0, np.random.default_rng(0))
+    columns["FLUXERR_AUTO"] *= 0.0
+    with pytest.raises(DataError, match="FLUXERR_AUTO: has no flux with an error above 0"):
+        read_camera_catalogue(ldac(tmp_path / "a.fits", columns))
+
+
+def test_columns_of_gaia_under_other_names_and_replaced_ones_are_named(tmp_path, caplog):
+    known = STARS["RA", "DEC", "SOURCE_ID", "BP_RP"].copy()
+    known["SOURCE_ID"] += 1
+    known.rename_column("BP_RP", "BP-RP")
+    made, said = remarks(caplog, four(STARS["RA", "DEC", "N", "N_ERR", "SOURCE_ID"], tmp_path), gaia=known)
+    assert set(made["SOURCE_ID"].tolist()) == set(known["SOURCE_ID"].tolist())
+    assert "SOURCE_ID of the cameras: replaced by those of" in said
+    assert "BP-RP: the colour of a star is read from TEFF (K) or BP_RP" in said

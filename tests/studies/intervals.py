@@ -154,7 +154,7 @@ def frames(runs: int) -> Iterator[tuple[FitResult, tuple[np.ndarray, np.ndarray]
             calset = read_calibration_set(path)
             model = base_model(calset, throughput_degree=2)
             of_pixels = with_honest_errors(fit(Likelihood.of(calset, model, interpolate=True)))
-            small = with_pixel_structure(compressed(of_pixels.posterior), pixel_structure(of_pixels))
+            small = with_pixel_structure(compressed(of_pixels.expansion), pixel_structure(of_pixels))
             found = examined(fit(Likelihood.of(small, model, interpolate=False)), as_written=True)
             rng = np.random.default_rng(seed)
             yield found, pulls(Calibration.from_fit(found), made.truth, made.calset, rng, gains=wave)

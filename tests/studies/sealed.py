@@ -418,7 +418,7 @@ def outcome(number: int, options: argparse.Namespace) -> Outcome:
             time.process_time() - began,
         )
     # The truth has no parameters that noise could take up; a fit of them takes as many from χ².
-    held = fitted.posterior.data - one.chi2 + len(fitted.model.free)
+    held = fitted.expansion.data - one.chi2 + len(fitted.model.free)
     before = judged(Calibration.from_fit(fitted), bool(fitted.trusted), one) if fitted.converged else None
     if options.refit_only:
         return Outcome(one.text, held, before, None, "", np.nan, False, time.process_time() - began)

@@ -246,7 +246,7 @@ class Calibration(Contents, Fitted):
             sources=calset.sources,
             site=calset.site,
             origin=calset.origin,
-            field=result.posterior.census.field,
+            field=result.expansion.census.field,
             inputs=calset.inputs,
             residuals=residuals,
             hidden=result.hidden,
@@ -309,7 +309,7 @@ class Calibration(Contents, Fitted):
 
         Without `settings` those of `usual_settings`; a single one serves all positions. Beyond the field of the
         instrument all is NaN. Raises `DataError` for a unit that is none of angles, a position that is not finite and a
-        filter that neither the calibration nor the package knows, ValueError for a moving element that the instrument
+        filter unknown to the calibration and the package, ValueError for a moving element that the instrument
         does not have.
         """
         x, y = np.broadcast_arrays(in_unit(x, "deg", "x"), in_unit(y, "deg", "y"))

@@ -408,7 +408,7 @@ class _Reader:
             advice = "a product is not edited by hand: fit again, with a model file for what should differ"
             raise self.primary.fail("the content is not what was written", "CONTHASH", advice)
         if rule not in (None, HASHRULE):
-            raise self.primary.fail(f"is {rule!r}, this program knows {HASHRULE}", "HASHRULE", _NEWER)
+            raise self.primary.fail(f"is {rule!r}, this version reads {HASHRULE}", "HASHRULE", _NEWER)
         return held
 
     def _check_version(self) -> None:

@@ -30,8 +30,8 @@ from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.flux import project_flux
-from walop_jax.likelihood.frames import FrameSums, PixelPosterior, in_blocks, information
-from walop_jax.likelihood.likelihood import Census, Likelihood, Posterior
+from walop_jax.likelihood.frames import FrameSums, PixelExpansion, in_blocks, information
+from walop_jax.likelihood.likelihood import Census, Expansion, Likelihood
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
@@ -135,12 +135,12 @@ def residual_map(result: FitResult) -> ResidualMap:
 
     >>> walop.residual_map(result).excess()["m21"]  # doctest: +SKIP
     """
-    if isinstance(result.posterior, PixelPosterior):
-        return residual_map_of_pixels(result.posterior.sums)
-    return residual_map_at(result.likelihood, result.values, result.posterior)
+    if isinstance(result.expansion, PixelExpansion):
+        return residual_map_of_pixels(result.expansion.sums)
+    return residual_map_at(result.likelihood, result.values, result.expansion)
 
 
-def residual_map_at(likelihood: Likelihood, values: Vector, near: Posterior | None = None) -> ResidualMap:
+def residual_map_at(likelihood: Likelihood, values: Vector, near: Expansion | None = None) -> ResidualMap:
     """As `residual_map`, at any full vector of parameter values; `near` is an expansion at similar ones."""
     instrument = likelihood.model.instrument(values)
     nodes, _ = likelihood.nodes(instrument, near)

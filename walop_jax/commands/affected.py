@@ -34,7 +34,7 @@ def affected(
 ) -> Outcome[Affected]:
     """List the catalogues that a new calibration changes, and by how much.
 
-    The stars are reduced from their rows by both calibrations; the shift of q and u is told in standard errors of the
+    The stars are reduced from their rows by both calibrations; the shift of q and u is given in standard errors of the
     old result, by catalogue and night. A night must be made again where more than 5 % of its stars shift by more than
     the limit, or gain or lose their result. OLD and NEW may be surveys (walop-jax stack), with stars of one night in a
     catalogue: the calibrations at their time are taken.

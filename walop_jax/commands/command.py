@@ -217,9 +217,7 @@ COMMON: Mapping[str, tuple[Any, Any, Option | None]] = {
 """The parameters that every command takes in Python, with their defaults, kinds and options."""
 
 OF_MODELS = ("free", "fixed", "fix", "frozen", "start", "prior", "priors", "tie", "ties", "bounds")
-IN_THE_MODEL = (
-    "the model says that of its parameters: model=base_model(calset).change('half1.wedge', free=False)"
-)
+IN_THE_MODEL = "that is a matter of the model: model=base_model(calset).change('half1.wedge', free=False)"
 """Advice on arguments that users of other fitting programs expect."""
 
 

@@ -46,13 +46,14 @@ def diagnose(
 ) -> Outcome[Diagnosis]:
     """Find the effects that the model lacks, add them, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
 
-    The verdict is consistent, effect_found or unexplained. Effects that the data cannot tell apart are listed
+    The verdict is consistent, effect_found or unexplained. Effects that the data cannot separate are listed
     together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and RUN/summary.json
     are of the extended model, and RUN/model.toml is that model, for `refit --model` and `compare --model`;
     `walop-jax report` draws its figures from RUN/diagnosis.fits. Exit code 3 where that calibration is not to be
     trusted, whatever was found.
 
-    `--why NAME RUN` fits nothing: it says from RUN/diagnosis.json why NAME was not named, with the numbers.
+    `--why NAME RUN` fits nothing: it prints from RUN/diagnosis.json the reason for which NAME was not named, with the
+    numbers.
 
     In Python: a `Diagnosis`, whose `why(name)` gives that answer; `effects=(*walop.EFFECTS, MyEffect)` adds one of your
     own to those that may be named.

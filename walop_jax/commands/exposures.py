@@ -27,7 +27,7 @@ def exposures(
 ) -> Outcome[Any]:
     """Make the table EXPOSURES of a calibration set from the records of an observatory.
 
-    WORDS.toml says which header word (or key of a log, or column of a table) is which column, in which unit, and what
+    WORDS.toml assigns header words (keys of a log, columns of a table) to columns, in which unit, and what
     is made of it (walop-jax docs files). Words that are missing, units that do not fit and values that cannot be meant
     are errors, with file and word. An executed schedule (format v4) needs the numbers of its filters alone.
 
@@ -35,30 +35,17 @@ def exposures(
 
     >>> walop.exposures(["night/0001.fits", "night/0002.fits"], words="words.toml")  # doctest: +SKIP
     """
-    import json
-
-    from walop_jax.data.header_words import exposures_table, read_words
+    from walop_jax.data.header_words import exposures_table, json_content, read_words
     from walop_jax.data.schedule import is_schedule, read_schedule
     from walop_jax.data.schema import EXPOSURES
     from walop_jax.io.plain_tables import astropy_table, write_table
-    from walop_jax.io.text import read_text
 
     if words is None:
-        raise UsageError("give the file that says which word is which column", "words")
+        raise UsageError("give the file that assigns words to columns", "words")
     paths = several(files)
     rules = read_words(words)
-    first = Path(paths[0])
-    content = None
-    if first.suffix.lower() == ".json" and len(paths) == 1:
-        try:
-            content = json.loads(read_text(first))
-        except (json.JSONDecodeError, RecursionError):
-            content = None  # an error of the reader below
-    if is_schedule(content):
-        executed, names, remarks = read_schedule(first, rules.filters)
-        import numpy as np
-
-        columns = {**executed.columns(), "TARGET": np.array(names)}
+    if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json" and is_schedule(json_content(paths[0])):
+        columns, remarks = read_schedule(paths[0], rules.filters)
     else:
         columns, remarks = exposures_table(paths, rules)
     units = {name: "deg" for name in columns if name.endswith(("_ANGLE", "_TURN"))}

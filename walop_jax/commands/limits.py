@@ -43,7 +43,7 @@ def limits(
     """Compute the size at which every effect would be detected and named in calibration sets.
 
     And what those may be that are too small: the largest error of q and u that a single effect can make over
-    the field without being detected. An observing plan (TOML, see walop-jax docs files) says the same before any
+    the field without being detected. An observing plan (TOML, see walop-jax docs files) gives the same before any
     data are taken.
 
     In Python: `DetectionLimits`, of a fit, an observing plan, or what `refit` takes; its `to_table()` is a row for each

@@ -73,7 +73,7 @@ def matrix(
     if job.typed and points is not None and output is None:
         if "," in str(points) and not Path(points).exists():
             raise UsageError("it is no table; a single field point is --x 0.1 --y 0.2", "points")
-        raise UsageError("say where the table is to be written", "output")
+        raise UsageError("name the table to be written", "output")
     if output is not None:
         table_format(output)
     held = calibration_of(calibration, effects)

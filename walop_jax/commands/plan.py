@@ -56,19 +56,19 @@ Criterion = Annotated[
     Option(
         "Quantity to be known best: worst (default: the largest error of p over field and colour), mean, a parameter, "
         "a table of stars (X, Y in degrees, Q, U), or apart: effects that --apart names, or those that a diagnosis of "
-        "RUN could not tell apart.",
+        "RUN could not separate.",
         "NAME|TABLE",
         str,
     ),
 ]
 Goal = Annotated[
     "float | None",
-    Option("A value of the criterion, in % for errors of p: say how long it takes.", "VALUE", float),
+    Option("A value of the criterion, in % for errors of p: print the time that it takes.", "VALUE", float),
 ]
 Apart = Annotated[
     Any,
     Option(
-        "Effect that is to be told from the others, NAME=VALUE as for simulate, or NAME alone for one that is a rival "
+        "Effect to be separated from the others, NAME=VALUE as for simulate, or NAME alone for one that is a rival "
         "only. Give it twice or more.",
         "NAME=VALUE",
         list[str],
@@ -127,7 +127,7 @@ def plan(
     alike = (apart,) if isinstance(apart, str) else tuple(apart or ())
     if criterion == "apart" and not alike:
         if prior is None:
-            raise UsageError("give the effects that are to be told apart, or a RUN of diagnose", "apart")
+            raise UsageError("give the effects to be separated, or a RUN of diagnose", "apart")
         alike = _alike(after, prior)
     if candidates is not None:
         available = candidates
@@ -175,7 +175,7 @@ def plan(
 
 
 def scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike | None) -> Sequence[str]:
-    """Write the exposures of a plan as a schedule; filters are numbered in their order unless words say otherwise."""
+    """Write the exposures of a plan as a schedule; filters are numbered in their order unless `words` number them."""
     from walop_jax.data.header_words import Words, read_words
     from walop_jax.data.schedule import schedule_of
     from walop_jax.io.atomic import atomic_path
@@ -282,5 +282,5 @@ def _alike(after: Any, known: Calibration) -> tuple[Any, ...]:
     raise fail(
         "the diagnosis left no effects that look alike",
         file=path,
-        advice="name those that are to be told apart with --apart",
+        advice="name the effects to be separated with --apart",
     )

@@ -314,7 +314,7 @@ def progress(quiet: bool, stages: Sequence[str] = ()) -> Iterator[Callable[[str]
     """Give a function that shows progress and time on stderr: on a terminal in a line that goes.
 
     Elsewhere a line is printed when there has been none for `LINE_EVERY` seconds. `stages` are those of the work, in
-    their order: they are counted. A message that knows its share of the work (`share`) moves a bar.
+    their order: they are counted. A message with its share of the work (`share`) moves a bar.
     """
     if quiet:
         yield lambda message: None

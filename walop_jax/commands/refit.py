@@ -53,14 +53,14 @@ def refit(
     residuals hold patterns or differ between parts of the data) is written with TRUSTED = F and warnings, exit
     code 3.
 
-    The first lines say how well p of a star will be known, whether that is good enough for --goal, and what to do if
+    The first lines give the error of p of a star, whether it is good enough for --goal, and what to do if
     not; the calibration may make half of the goal.
 
     Sets of more than 65536 points (whole frames) are read in slabs on every pass. The calibration then holds a map of
     the residuals of the smooth model. --compress makes of them a set of some hundred field points, a megabyte: refit,
     diagnose, limits, epoch and sample read it like any other set and answer in seconds as from all pixels, near the
-    values that were fitted; they say when these have moved too far. Structure smaller than a twentieth of the field
-    is not in it.
+    values that were fitted, with a warning when these have moved too far. Structure smaller than a twentieth of the
+    field is not in it.
 
     In Python: the fit. Raises `DataError` for data that cannot be trusted, ValueError for a model that does not fit.
 
@@ -132,9 +132,9 @@ def _compressed(result: FitResult) -> CalibrationSet:
     from walop_jax.diagnosis.trust import pixel_structure
     from walop_jax.fit.stand_in import with_pixel_structure
     from walop_jax.likelihood.compressed import compressed
-    from walop_jax.likelihood.frames import PixelPosterior
+    from walop_jax.likelihood.frames import PixelExpansion
 
-    if not isinstance(result.posterior, PixelPosterior):
+    if not isinstance(result.expansion, PixelExpansion):
         raise fail(
             "cannot be compressed",
             file=result.calset.inputs[0].path if result.calset.inputs else IN_MEMORY,
@@ -143,7 +143,7 @@ def _compressed(result: FitResult) -> CalibrationSet:
         )
     if not result.converged:
         raise ValueError(f"the fit of the frames did not converge ({result.minimum.message})")
-    return with_pixel_structure(compressed(result.posterior), pixel_structure(result))
+    return with_pixel_structure(compressed(result.expansion), pixel_structure(result))
 
 
 def next_steps(trusted: bool, output: PathLike | None, data: Sets, **options: object) -> tuple[str, ...]:

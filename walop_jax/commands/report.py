@@ -80,7 +80,7 @@ def report(
 
     if isinstance(fit_of(run), FitResult):
         if output is None:
-            raise UsageError("say where the page of a fit in memory is to be written", "output")
+            raise UsageError("give output, the folder for the page of a fit in memory", "output")
         with tempfile.TemporaryDirectory() as temporary:
             if isinstance(run, FitResult):
                 save(run, Path(temporary) / "fit")

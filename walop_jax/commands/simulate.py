@@ -41,7 +41,7 @@ LIKE = Option(
 NIGHT = Option("Number of the night: days after the date of the plan.", "N", int, least=0)
 
 
-@command(stages=("following", "writing"), writes="file", random=True)
+@command(stages=("following", "writing"), writes=(), random=True)
 def simulate(
     job: Job,
     plan: Annotated[ObservingPlan | PathLike | None, PLAN] = None,
@@ -103,7 +103,7 @@ def simulate(
         if like is not None:
             if instrument is not None or catalogue_seed is not None:
                 raise ValueError(
-                    "like says which instrument and catalogue: leave out instrument and catalogue_seed"
+                    "like gives instrument and catalogue: leave out instrument and catalogue_seed"
                 )
             template = _template(like, catalogue)
             plan = template.planned(plan)
@@ -113,8 +113,9 @@ def simulate(
             true, lost = template.instrument_of(plan, hidden)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    if truth is not None:
-        check_output(truth, overwrite=job.overwrite)
+    for path in (output, truth):
+        if path is not None:
+            check_output(path, overwrite=job.overwrite)
     drawn: dict[str, Any] = {"instrument": true, "effects": hidden, "catalogue_seed": catalogue_seed}
     drawn["catalogue"] = None if template is None else template.catalogue
     about: dict[str, Any] = {"output": output, "instrument": plan.name, "seed": job.seed, "truth": truth}

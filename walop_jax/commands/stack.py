@@ -40,7 +40,7 @@ def stack(
     """Fit many nights at once, each parameter under a law of its change with time.
 
     Breaks of any parameter, or of an effect that the model lacks, are looked for, named and dated, and become laws.
-    Laws stand in the [law] tables of a model file: a value for each night or file, a random walk, intervals, steps,
+    Laws are given in the [law] tables of a model file: a value for each night or file, a random walk, intervals, steps,
     drifts, annual terms; parameters without one are shared by all nights (walop-jax docs nights). A night is linearised
     at the values of a fit, and again at the common solution; its normal equations are kept, so that it need not be read
     again.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def table_of(given: Any, columns: Mapping[str, Any]) -> InputTable:
-    """A table: a file of one, an astropy table, or columns by name; `columns` are added, or stand in place of its."""
+    """A table: a file of one, an astropy table, or columns by name; `columns` are added, or replace its own."""
     from walop_jax.data.user_tables import in_memory, read_input_table
 
     named = {name.upper(): values for name, values in columns.items()}

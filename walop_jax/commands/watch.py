@@ -33,7 +33,7 @@ def watch(
     Four cameras have three unknowns: one number of every row is left. Rows of one MJD are an exposure group; catalogues
     without MJD are a group each, in their order. Steps, drifts and single exposures of cameras and arms are looked for,
     as a whole, growing over the field, or in a spot of it, with their size, date, and the smallest that would have been
-    seen. Stars that are seen at several settings of the plate or the rotator tell which camera it is; others hardly
+    seen. Stars that are seen at several settings of the plate or the rotator single out the camera; others hardly
     can. Changes of the optics that explain the stars as well are reported.
 
     Exit code 0 only where the calibration still holds, 3 where it does not.

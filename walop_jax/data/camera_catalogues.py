@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.coordinates import Angle
 from astropy.io import fits
 from astropy.wcs import WCS
 from jaxtyping import Float, Int
@@ -26,18 +25,18 @@ from jaxtyping import Float, Int
 from walop_jax.data.header_words import Words, of_header
 from walop_jax.data.schema import Column
 from walop_jax.data.table_files import read_table_file
-from walop_jax.data.units import Place, unit_of
+from walop_jax.data.units import Place, convert_unit, degrees_of, unit_of
 from walop_jax.data.user_tables import (
     OF_STARS,
     InputTable,
     column_of_stars,
     empty_cells,
-    hints,
     in_memory,
     numeric_column,
+    sky_positions,
 )
-from walop_jax.io.errors import DataError, rows_text
-from walop_jax.io.fits_reading import one_line, open_fits
+from walop_jax.io.errors import DataError, errors_naming, rows_text
+from walop_jax.io.fits_reading import open_fits
 from walop_jax.io.text import parse_toml, read_text, some
 from walop_jax.io.toml import Reader
 
@@ -50,7 +49,12 @@ OF_EXPOSURES = ("FILTER", "MJD", "TEMP", "HA", "CHWP_ANGLE", "CHWP_IN", "CHWP_TU
 """Columns, or words of a header, about the exposure: they go with its stars."""
 _LDAC, _HEADER = "LDAC_OBJECTS", "LDAC_IMHEAD"
 _FAINTEST_MAGNITUDE = 40.0
-_COUNTS = ("", "ct", "count", "adu", "dn", "electron")
+_NEGATIVE = 5.0  # standard errors
+_UNITS: Mapping[str, str] = {
+    "ct": "ct", "count": "ct", "counts": "ct", "adu": "ct", "dn": "ct",
+    "electron": "electron", "electrons": "electron", "e-": "electron", "e": "electron",
+}  # fmt: skip
+"""Units of fluxes by their names in catalogues."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,27 +113,21 @@ def read_map(source: str | os.PathLike[str]) -> ColumnMap:
     """
     shipped = str(source) in SHIPPED
     text = (files("walop_jax.data") / f"{source}.toml").read_text("utf-8") if shipped else read_text(source)
-    reader = Reader(str(source))
-    try:
-        table = parse_toml(text)
-    except ValueError as error:
-        raise DataError(f"{source}: {error}") from None
-    values = reader.values(typing.get_type_hints(ColumnMap), table, "")
-    for key in ("program", "flux"):
-        if not values.get(key):
-            raise reader.fault(
-                "", f"{key} is missing: it names {'the program' if key == 'program' else 'columns'}"
-            )
-    for bit, meaning in values.get("bits", {}).items():
-        if not bit.isdigit() or int(bit).bit_count() != 1:
-            raise reader.fault("bits", f"{bit!r} is no single bit: 1, 2, 4, 8, …")
-        if meaning != 0 and meaning not in BITS:
-            raise reader.fault(
-                "bits", f"{bit} = {meaning}: give a bit of FLAG ({', '.join(map(str, BITS))}), or 0"
-            )
-    for pair in values.get("sky", ()):
-        if len(pair) > 2:
-            raise reader.fault("", f"sky = {list(pair)} must be two columns, or one of coordinates")
+    with errors_naming(source):
+        reader, table = Reader(""), parse_toml(text)
+        values = reader.values(typing.get_type_hints(ColumnMap), table, "")
+        for key, what in (("program", "the program"), ("flux", "columns")):
+            if not values.get(key):
+                raise reader.fault("", f"{key} is missing: it names {what}")
+        for bit, meaning in values.get("bits", {}).items():
+            if not bit.isdigit() or int(bit).bit_count() != 1:
+                raise reader.fault("bits", f"{bit!r} is no single bit: 1, 2, 4, 8, …")
+            if meaning not in (0, *BITS):
+                listed = ", ".join(map(str, BITS))
+                raise reader.fault("bits", f"{bit} = {meaning}: give a bit of FLAG ({listed}), or 0")
+        for pair in values.get("sky", ()):
+            if len(pair) > 2:
+                raise reader.fault("", f"sky = {list(pair)} must be two columns, or one of coordinates")
     return ColumnMap(**values)
 
 
@@ -160,39 +158,40 @@ def read_camera_catalogue(
     flux, error, factor = _fluxes(source, column_map, gain, place)
     level = next((name.upper() for name in column_map.level if name.upper() in source.names), None)
     ra, dec = _positions(source, column_map, header, place)
-    flag, remark = _flags(source, column_map, place)
+    flag = _flags(source, column_map, place)
     bad = ~(np.isfinite(flux) & np.isfinite(error) & (error > 0))
-    of_stars = {}
-    for name in OF_STARS:
-        if name in source.names:
-            of_stars[name] = column_of_stars(source, name)
+    of_stars = {name: column_of_stars(source, name) for name in OF_STARS if name in source.names}
     of_exposure = {
         name: value for name in OF_EXPOSURES if (value := _of_all(source, stated, name, place)) is not None
     }
     if bad.any():
-        source.remarks.append(f"{int(bad.sum())} of {len(bad)} fluxes have no error above 0: not used")
-    unused = [name for name in source.names if name not in source.used]
+        what = "fluxes are not finite, or have no error above 0: not used"
+        source.remarks.append(f"{int(bad.sum())} of {len(bad)} {what}")
+    if low := int(np.sum(flux < -_NEGATIVE * error)):
+        source.remarks.append(f"{low} of {len(bad)} fluxes are below 0 by more than {_NEGATIVE:g} errors")
+    rows = np.sort(np.unique(np.stack([ra, dec, flux, error]), axis=1, return_index=True)[1])
+    if copies := len(ra) - len(rows):
+        source.remarks.append(f"{copies} of {len(ra)} rows are copies of another row: left out")
     return CameraCatalogue(
         path=source.path,
-        ra=ra,
-        dec=dec,
-        flux=np.where(bad, np.nan, flux),
-        error=np.where(bad, np.nan, error),
+        ra=ra[rows],
+        dec=dec[rows],
+        flux=np.where(bad, np.nan, flux)[rows],
+        error=np.where(bad, np.nan, error)[rows],
         flux_name=_pair(source, column_map.flux)[0],
-        sky=None if level is None else factor * _plain_numbers(source, level, place),
-        flag=np.where(bad, flag | BAD_PIXEL, flag),
-        of_stars=of_stars,
+        sky=None if level is None else factor * _plain_numbers(source, level, place)[rows],
+        flag=np.where(bad, flag | BAD_PIXEL, flag)[rows],
+        of_stars={name: values[rows] for name, values in of_stars.items()},
         of_exposure=of_exposure,
         pointing={name: stated.get(name) for name in POINTING},
         header=header,
-        remarks=(*source.remarks, *remark, *hints(unused, ("TEFF", "N_FLAG"), unsure=False)),
+        remarks=(*source.remarks, *source.hints({"TEFF", "SOURCE_ID", "N_FLAG"})),
     )
 
 
 def _table(path: Path) -> tuple[InputTable, Any]:
     """The table of a file, and the header of the image that it was made from, or of the table."""
     header: Any = {}
-    remarks: list[str] = []
     try:
         with open_fits(path) as opened:
             names = [hdu.name for hdu in opened.hdus]
@@ -207,9 +206,8 @@ def _table(path: Path) -> tuple[InputTable, Any]:
         if path.suffix.lower() in (".fits", ".fit", ".ldac"):
             raise
     table_path, table, how = read_table_file(path, ())
-    remarks.extend(how)
     read = in_memory(table, str(table_path))
-    read.remarks.extend(remarks)
+    read.remarks.extend(how)
     return read, header or {str(key).upper(): value for key, value in read.table.meta.items()}
 
 
@@ -232,7 +230,7 @@ def _one(source: InputTable, name: str, place: Place) -> Any:
     values = getattr(column, "shape", (0,))[1:]
     if values and values != (1,):
         if not 1 <= number <= values[0]:
-            advice = f"say which in a map of columns (--columns): {plain}[1] … {plain}[{values[0]}]"
+            advice = f"name it in a map of columns (--columns): {plain}[1] … {plain}[{values[0]}]"
             raise place.fail(f"has {values[0]} apertures", plain, advice)
         return column[:, number - 1]
     return column
@@ -261,38 +259,41 @@ def _no_flux(source: InputTable, maps: Sequence[ColumnMap], place: Place) -> Exc
 def _fluxes(
     source: InputTable, column_map: ColumnMap, gain: float | None, place: Place
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]:
-    """Fluxes and errors (electrons), and electrons per count."""
+    """Fluxes and errors (electrons), and electrons per count; an error without a unit has that of its flux."""
     names = _pair(source, column_map.flux)
     unused = [pair[0] for pair in column_map.flux if pair != names and pair[0].upper() in source.names]
-    values = []
-    for name in names:
-        column = _one(source, name, place)
-        unit = unit_of(column).strip().lower()
-        per_time = unit.endswith(("/ s", "/s", "s-1", "s**-1"))
-        if "mag" in unit or per_time or unit not in _COUNTS:
-            advice = {True: "multiply by the exposure time"}.get(
-                per_time, "counts or electrons are needed, not magnitudes"
-            )
-            raise place.fail(f"has the unit {unit}", _plain(name)[0], advice)
-        values.append(_plain_numbers(source, name, place))
-    flux, error = values
-    unit = unit_of(_one(source, names[0], place)).strip().lower() or column_map.unit
+    stated = [unit_of(_one(source, name, place)).strip() for name in names]
+    given = [unit or next(filter(None, stated), column_map.unit) for unit in stated]
+    plain = [_UNITS.get(unit.lower(), unit) for unit in given]
+    counts, of_error = (unit != "electron" for unit in plain)
+    if counts != of_error:
+        what = f"is in {given[1]}, {names[0]} in {given[0]}"
+        raise place.fail(what, _plain(names[1])[0], "give both in counts, or both in electrons")
+    flux, error = (
+        convert_unit(
+            _plain_numbers(source, name, place), unit, "ct" if counts else "electron", _plain(name)[0], place
+        )
+        for name, unit in zip(names, plain, strict=True)
+    )
     measured = np.isfinite(flux) & np.isfinite(error) & (error > 0)
+    if not measured.any():
+        what, advice = "has no flux with an error above 0", "give standard errors of the fluxes"
+        raise place.fail(what, _plain(names[1])[0], advice)
     if (
-        measured.any()
-        and np.abs(flux[measured]).max() < _FAINTEST_MAGNITUDE
+        np.abs(flux[measured]).max() < _FAINTEST_MAGNITUDE
         and np.median(error[measured] - 0.1 * np.abs(flux[measured])) < 0.0
     ):
         low, high, typical = flux[measured].min(), flux[measured].max(), np.median(error[measured])
         what = f"lies between {low:.3g} and {high:.3g} with errors of {typical:.2g}: these are magnitudes"
         raise place.fail(what, _plain(names[0])[0], "name a column of fluxes")
-    if gain is None and unit != "electron":
-        source.remarks.append(
-            f"{names[0]} is in counts: taken as electrons; --gain gives electrons per count"
-        )
+    if counts and gain is None:
+        what = "is in counts: taken as electrons; --gain gives electrons per count"
+        source.remarks.append(f"{names[0]} {what}")
+    if not counts and gain is not None:
+        source.remarks.append(f"{names[0]} is in electrons: the gain is not used")
     if unused:
         source.remarks.append(f"fluxes are {names[0]}, not {some(unused, 3)}")
-    factor = 1.0 if gain is None or unit == "electron" else gain
+    factor = gain if counts and gain is not None else 1.0
     return factor * flux, factor * error, factor
 
 
@@ -307,96 +308,48 @@ def _positions(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Right ascension and declination (deg): from the sky, or from pixels by the WCS of the header."""
     names = _pair(source, (*column_map.sky, ("RA", "DEC")))
+    pixels = _pair(source, column_map.pixel)
     if len(names) == 1:
         directions = source.column(_plain(names[0])[0])
-        if hasattr(directions, "icrs"):
-            return np.asarray(directions.icrs.ra.deg, float), np.asarray(directions.icrs.dec.deg, float)
-        raise place.fail("holds no coordinates of astropy", names[0], "name two columns, in degrees")
-    if names:
+        if not hasattr(directions, "icrs"):
+            raise place.fail("holds no coordinates of astropy", names[0], "name two columns, in degrees")
+        ra, dec = (np.asarray(angle.deg, float) for angle in (directions.icrs.ra, directions.icrs.dec))
+    elif names:
         ra, dec = sky_positions(source, [_plain(name)[0] for name in names])
-        place.refuse(
-            ~(np.isfinite(ra) & np.isfinite(dec)), "is not finite", ", ".join(names), "remove these rows"
-        )
-        place.refuse(np.abs(dec) > 90.0, "is beyond ±90°", names[1], "declinations in degrees are needed")
-        return ra, dec
-    pixels = _pair(source, column_map.pixel)
-    if not pixels or "CRVAL1" not in header:
+    elif pixels and "CRVAL1" in header:
+        plane = WCS(fits.Header(header) if not isinstance(header, fits.Header) else header)
+        x, y = (numeric_column(source, _plain(name)[0], Column("float", missing=np.nan)) for name in pixels)
+        ra, dec = plane.celestial.all_pix2world(x, y, column_map.first_pixel)
+        ra, dec = np.mod(np.asarray(ra, float), 360.0), np.asarray(dec, float)
+    else:
         expected = column_map.sky[0] if column_map.sky else ("RA", "DEC")
         what = f"has neither {' and '.join(expected)} nor pixels with the WCS of their image"
-        raise place.fail(
-            what, "", "write the positions on the sky, or a catalogue with the header (FITS_LDAC)"
-        )
-    plane = WCS(fits.Header(header) if not isinstance(header, fits.Header) else header)
-    x, y = (numeric_column(source, _plain(name)[0], Column("float", missing=np.nan)) for name in pixels)
-    ra, dec = plane.celestial.all_pix2world(x, y, column_map.first_pixel)
-    return np.mod(np.asarray(ra, float), 360.0), np.asarray(dec, float)
-
-
-_SEXAGESIMAL = re.compile(r"[+-]?\d+[:hd ]\s*\d.*")
-_FEWEST_STARS = 10  # from which on the shape of a field tells hours from degrees
-_FLAT = 0.25  # of the extent in declination: hours taken as degrees have a fifteenth
-
-
-def sky_positions(
-    source: InputTable, names: Sequence[str] = ("RA", "DEC")
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Right ascensions and declinations (deg) of a table; as sexagesimal texts they are in hours and degrees.
-
-    Raises `DataError` for values that are no angles, and for right ascensions without a unit that are hours: none
-    beyond 24, of a field that would be a fifteenth as wide as high.
-    """
-    ra, dec = (_angles(source, *pair) for pair in zip(names, "hd", strict=True))
-    column, finite = source.column(names[0]), np.isfinite(ra)
-    if unit_of(column) or column.dtype.kind not in "fiu" or not finite.any():
-        return ra, dec
-    low, high = float(ra[finite].min()), float(ra[finite].max())
-    if low >= 0.0 and high <= 24.0:
-        from_first = np.mod(ra[finite] - low + 12.0, 24.0)  # a field about 0 h is no wider than others
-        width = np.std(from_first) * np.cos(np.deg2rad(np.nanmedian(dec)))
-        if len(ra) < _FEWEST_STARS:
-            source.remarks.append(
-                f"{names[0]} has no unit: taken as degrees; hours need the unit hourangle, or texts hh:mm:ss"
-            )
-        elif width < _FLAT * np.nanstd(dec):
-            what = f"lies between {low:.4g} and {high:.4g}, has no unit, and looks like hours"
-            advice = "degrees are needed: multiply by 15, or give the unit hourangle"
-            raise Place(source.path, "").fail(what, names[0], advice)
+        advice = "write these, or a catalogue with the header (FITS_LDAC); other names go into a TOML file (--columns)"
+        raise place.fail(f"{what}; it has {some(list(source.names), 8)}", "", advice)
+    unknown = ~(np.isfinite(ra) & np.isfinite(dec))
+    place.refuse(unknown, "is not finite", ", ".join(names or pixels), "remove these rows")
     return ra, dec
 
 
-def _angles(source: InputTable, name: str, unit: str) -> Float[np.ndarray, " n"]:
-    """A column of angles in degrees; sexagesimal ones are in hours (h) or degrees (d)."""
-    column = source.column(name)
-    texts = np.asarray(column).astype(str) if column is not None and column.dtype.kind in "OSU" else []
-    if not any(_SEXAGESIMAL.match(text.strip()) for text in texts):
-        return numeric_column(source, name, Column("float", "deg"))
-    try:
-        return np.asarray(Angle(list(texts), unit={"h": "hourangle", "d": "deg"}[unit]).deg, float)
-    except ValueError as error:
-        raise Place(source.path, "").fail(one_line(error), name, "write hh:mm:ss.s and ±dd:mm:ss") from None
-
-
-def _flags(
-    source: InputTable, column_map: ColumnMap, place: Place
-) -> tuple[Int[np.ndarray, " n"], tuple[str, ...]]:
-    """Bits of FLAG, and remarks."""
+def _flags(source: InputTable, column_map: ColumnMap, place: Place) -> Int[np.ndarray, " n"]:
+    """Bits of FLAG."""
     name = next((name.upper() for name in column_map.flag if name.upper() in source.names), None)
-    flag = np.zeros(source.rows, np.int64)
+    flag, rule = np.zeros(source.rows, np.int64), Column("int", missing=0)
     if name is None:
-        return flag, ("no flags of the stars: blends and saturated ones are not known",)
-    values = numeric_column(source, name, Column("int", missing=0)).astype(np.int64)
-    empty = int(empty_cells(source, name, Column("int", missing=0)).sum())
-    undefined = values.copy()
+        source.remarks.append("no flags of the stars: blends and saturated ones are not known")
+        return flag
+    values = undefined = numeric_column(source, name, rule).astype(np.int64)
     for bit, meaning in column_map.bits.items():
         flag |= np.where(values & int(bit) > 0, meaning, 0)
-        undefined &= ~int(bit)
+        undefined = undefined & ~int(bit)
     odd = np.flatnonzero((undefined != 0) | (values < 0))
     if odd.size:
         what = f"is {values[odd[0]]} in {rows_text(odd)}, which is no flag of {column_map.program}"
-        raise place.fail(
-            what, name, "say what its bits mean in a map of columns: --columns FILE.toml, table [bits]"
-        )
-    return flag, (f"{name} is empty in {empty} rows: taken as good",) if empty else ()
+        advice = "give the meaning of its bits in a map of columns: --columns FILE.toml, table [bits]"
+        raise place.fail(what, name, advice)
+    if empty := int(empty_cells(source, name, rule).sum()):
+        source.remarks.append(f"{name} is empty in {empty} rows: taken as good")
+    return flag
 
 
 def _of_all(source: InputTable, header: Mapping[str, Any], name: str, place: Place) -> Any:
@@ -420,8 +373,7 @@ def angle_of(catalogue: CameraCatalogue, name: str) -> float | None:
     except ValueError:
         pass
     try:
-        angle: Any = Angle(str(value), unit="hourangle" if name == "RA" else "deg").deg
-        return float(angle)
+        return float(degrees_of(str(value), "hourangle" if name == "RA" else "deg"))
     except ValueError:
         advice = f"give --{name.lower()} (deg) to walop-jax gather, or the word that holds it (--words)"
         raise Place(catalogue.path, "header").fail(f"{value!r} is no angle", name, advice) from None

@@ -131,7 +131,7 @@ class FrameIntensities(Intensities):
         """Number of used (exposure, pixel) pairs; the first call reads all frames, slab by slab, and warns of many."""
         if (size := self.exposures * self.grid.pixels) > _LONG:
             what = f"counting the used pixels reads all {self.exposures} frames of every camera, {size:,} pixels each"
-            warnings.warn(f"{what}: minutes; the number of a fit is `n_data`", stacklevel=2)
+            warnings.warn(f"{what}: this takes minutes; `n_data` of a fit is that number", stacklevel=2)
         step = max(1, _SLAB // max(1, self.exposures))
         starts = range(0, self.grid.pixels, step)
         return sum(int(np.count_nonzero(self.block(start, start + step).used)) for start in starts)

@@ -68,4 +68,4 @@ def table_hdu(
 def check_ascii(value: str, column: str, place: Place) -> None:
     """Raise `DataError` for text that a FITS file cannot hold."""
     if not value.isascii() or not (value.isprintable() or not value):
-        raise place.fail(f"{value!r} is not plain ASCII", column, "FITS knows no other letters: rename it")
+        raise place.fail(f"{value!r} is not plain ASCII", column, "FITS has no other letters: rename it")

@@ -13,6 +13,7 @@ import math
 import operator
 import os
 import re
+import typing
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,18 +23,16 @@ import numpy as np
 from walop_jax.data.kinds import KINDS
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, table_of, table_rules
 from walop_jax.data.table_files import read_table_file
-from walop_jax.data.units import Place, convert_unit, sexagesimal
+from walop_jax.data.units import Place, convert_unit, degrees_of, is_sexagesimal, mjd_of
 from walop_jax.io.errors import errors_naming, fail, nearest
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.io.toml import Reader
 
-WORD: Mapping[str, Any] = {
-    "word": Any, "unit": str, "expression": str, "values": Mapping[str, Any], "value": Any, "optional": bool,
-}  # fmt: skip
-TOP: Mapping[str, Any] = {"extension": int, "rows": str, "filters": Mapping[str, int], "schedule": Any}
-"""Entries of a file of words beside its columns: extension of FITS files, where the rows of a JSON file are, numbers of
-filters and facts of schedules (`data.schedule`)."""
-_SEXAGESIMAL = re.compile(r"[+-]?\d+[: ]\d+[: ]\d+(\.\d*)?")
+FACTS = ("name", "pi", "mode", "observer")
+MODES = ("manual", "auto")
+LONGEST = 100  # characters of a fact
+MJD_1970 = 40587.0
+TOLERATED = 2.0 / 86400.0  # d: times are of whole seconds
 _MOVES = re.compile(r"[A-Z][A-Z0-9_]*_(IN|ANGLE|TURN)")
 _INSIDE = dict.fromkeys(("t", "true", "1", "in"), True) | dict.fromkeys(("f", "false", "0", "out"), False)
 _OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
@@ -44,13 +43,13 @@ _OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Word:
-    """Origin of a column: the first of `words` that is there, or a fixed `value`.
+    """Origin of a column: the first of the words in `word` that is there, or a fixed `value`.
 
     `values` replace those of the word (names of filters, kinds, positions), `unit` is that of the word, `expression`
     makes the value of the column of x, the value in the unit of the column, and of other columns by name.
     """
 
-    words: tuple[str, ...]
+    word: tuple[str, ...] = ()
     unit: str = ""
     expression: str = ""
     values: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -60,13 +59,17 @@ class Word:
 
 @dataclasses.dataclass(frozen=True)
 class Words:
-    """The words of an observatory by column of EXPOSURES, and the other entries of its file (`TOP`)."""
+    """The words of an observatory by column of EXPOSURES, and the other entries of its file.
+
+    These are the extension of FITS files, where the `rows` of a JSON file are, numbers of filters and facts of
+    schedules (`data.schedule`).
+    """
 
     columns: Mapping[str, Word]
     extension: int = 0
     rows: str = ""
     filters: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    schedule: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    schedule: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def read_words(path: str | os.PathLike[str]) -> Words:
@@ -77,27 +80,29 @@ def read_words(path: str | os.PathLike[str]) -> Words:
 
 def words_of(content: Mapping[str, Any]) -> Words:
     """The words in the tables of a TOML file."""
-    read, columns = Reader(""), {}
+    read, columns, of_word = Reader(""), {}, typing.get_type_hints(Word)
+    tops = {key: kind for key, kind in typing.get_type_hints(Words).items() if key != "columns"}
     for name, table in content.items():
-        if name in TOP:
+        if name in tops:
             continue
         if name not in EXPOSURES and not _MOVES.fullmatch(name):
-            raise read.fault("", f"EXPOSURES have no column {name!r}; {nearest(name, [*EXPOSURES, *TOP])}")
-        settings = read.values(WORD, table, name)
-        words = settings.pop("word", ())
-        words = (words,) if isinstance(words, str) else tuple(words)
-        if bool(words) == ("value" in settings) or not all(isinstance(word, str) for word in words):
-            raise read.fault(
-                name, 'needs word = "…", a list of words of which the first is taken, or value = …'
-            )
-        if settings.get("expression"):
-            names = _names(settings["expression"], read, name)
-            if odd := names - {"x", *content}:
-                raise read.fault(
-                    name, f"expression: there is no {sorted(odd)[0]!r}; {nearest(sorted(odd)[0], content)}"
-                )
-        columns[name] = Word(words, **settings)
-    top = read.values(TOP, {key: value for key, value in content.items() if key in TOP}, "")
+            raise read.fault("", f"EXPOSURES have no column {name!r}; {nearest(name, [*EXPOSURES, *tops])}")
+        table = read.table(table, name)
+        if isinstance(single := table.get("word"), str):
+            table = {**table, "word": (single,)}
+        columns[name] = word = Word(**read.values(of_word, table, name))
+        if bool(word.word) == ("value" in table):
+            what = 'needs word = "…", a list of words of which the first is taken, or value = …'
+            raise read.fault(name, what)
+        if word.expression and (odd := _names(word.expression, read, name) - {"x", *content}):
+            what = f"expression: there is no {min(odd)!r}; {nearest(min(odd), content)}"
+            raise read.fault(name, what)
+    top = read.values(tops, {key: value for key, value in content.items() if key in tops}, "")
+    read.known(facts := top.get("schedule", {}), FACTS, "schedule")
+    if (mode := facts.get("mode", MODES[0])) not in MODES:
+        raise read.fault("schedule", f"mode = {mode!r} is neither {' nor '.join(MODES)}")
+    if long := [key for key, text in facts.items() if len(text) > LONGEST]:
+        raise read.fault("schedule", f"{long[0]} has more than {LONGEST} characters")
     return Words(columns, **top)
 
 
@@ -112,46 +117,57 @@ def exposures_table(
     records = [(str(path), record) for path in map(Path, paths) for record in _records(path, words)]
     if not records:
         raise fail("no exposures in these files", advice="name FITS files, a JSON file or a table")
-    rows = [_row(record, words, file) for file, record in records]
-    names = list(dict.fromkeys(name for row in rows for name in row))
+    rows = [_row(record, words.columns, file) for file, record in records]
+    table = columns_of(rows, ", ".join(dict.fromkeys(file for file, _ in records)))
+    there = set().union(*rows, ("EXPOSURE",))
+    absent = [name for name in EXPOSURES if name not in there and not _MOVES.fullmatch(name)]
+    remarks = [f"no word for {', '.join(absent)}: taken as not known"] if absent else []
+    if early := overlapping(table["MJD"], table["EXPTIME"]):
+        what = "begin before the one ahead of them has ended: is a record there twice, or a file for each camera?"
+        remarks.append(f"{early} exposures {what} MJD is the middle, in UTC")
+    return table | {"FILE": np.array([file for file, _ in records])}, remarks
+
+
+def columns_of(rows: Sequence[Mapping[str, Any]], file: str) -> dict[str, np.ndarray]:
+    """Columns of EXPOSURES, checked, of rows by name; missing values are those of an absent column."""
+    place, names = Place(file, "EXPOSURES"), list(dict.fromkeys(name for row in rows for name in row))
     if "KIND" not in names:
-        raise Place(records[0][0], "").fail(
-            "the kind of the exposures is not known", "KIND", "add [KIND] to the words"
-        )
-    place = Place(", ".join(dict.fromkeys(file for file, _ in records)), "EXPOSURES")
-    columns = {name: _column([row.get(name) for row in rows], name) for name in names}
-    columns.setdefault("EXPOSURE", np.arange(len(rows)))
-    rules = table_rules("EXPOSURES", list(columns), place)
-    table = table_of(columns, rules, place)
+        raise place.fail("the kind of the exposures is not known", "KIND", "add [KIND] to the words")
+    rules = table_rules("EXPOSURES", names, place)
+    unknown = {"bool": False, "float": np.nan}
+    missing = {n: unknown.get(r.kind) if r.missing is None else r.missing for n, r in rules.items()}
+    columns = {name: np.array([row.get(name, missing[name]) for row in rows]) for name in names}
+    table = table_of({"EXPOSURE": np.arange(len(rows)), **columns}, rules, place)
     table["KIND"] = np.char.lower(table["KIND"])
     for kind in np.unique(table["KIND"]).tolist():
         if kind not in KINDS:
-            place.refuse(
-                table["KIND"] == kind,
-                f"{kind!r} is not a kind,",
-                "KIND",
-                f"say it in values; {nearest(kind, KINDS)}",
-            )
+            what = f"{kind!r} is not a kind,"
+            place.refuse(table["KIND"] == kind, what, "KIND", f"list it in values; {nearest(kind, KINDS)}")
     check(table, {name: rule for name, rule in rules.items() if name in table}, place)
-    absent = [name for name in EXPOSURES if name not in columns and not _MOVES.fullmatch(name)]
-    remarks = [f"no word for {', '.join(absent)}: taken as not known"] if absent else []
-    return table | {"FILE": np.array([file for file, _ in records])}, remarks
+    return table
+
+
+def overlapping(mjd: np.ndarray, exptime: np.ndarray) -> int:
+    """The number of exposures that begin before the one ahead of them, in time, has ended."""
+    order = np.argsort(mjd, kind="stable")
+    middle, half = mjd[order], np.nan_to_num(exptime[order]) / 2.0 / 86400.0
+    return int(np.sum((middle - half)[1:] < (middle + half)[:-1] - TOLERATED))
 
 
 def of_header(
     header: Mapping[str, Any], words: Words, names: Collection[str], file: str | os.PathLike[str]
 ) -> dict[str, Any]:
     """The columns `names` that `words` make of one header, those that have a word."""
-    wanted = {name: word for name, word in words.columns.items() if name in names}
-    used = {
-        other
-        for word in wanted.values()
-        if word.expression
-        for other in _names(word.expression, Reader(""), "")
-    }
-    needed = wanted | {name: word for name, word in words.columns.items() if name in used}
-    row = _row({key: header[key] for key in dict.fromkeys(header) if key}, Words(needed), str(file))
-    return {name: value for name, value in row.items() if name in wanted}
+    stated = {name: word for name, word in words.columns.items() if name in names}
+    operands = set().union(*(_names(w.expression, Reader(""), "") for w in stated.values() if w.expression))
+    needed = {name: word for name, word in words.columns.items() if name in {*stated, *operands}}
+    row = _row(_plain(header), needed, str(file))
+    return {name: value for name, value in row.items() if name in stated}
+
+
+def _plain(header: Mapping[str, Any]) -> dict[str, Any]:
+    """The words of a header, the first of each name."""
+    return {key: header[key] for key in dict.fromkeys(header) if key}
 
 
 # ------------------------------------------------------------------------------------------------ files and records
@@ -168,36 +184,36 @@ def _records(path: Path, words: Words) -> Iterator[Mapping[str, Any]]:
         try:
             header: Any = fits.getheader(path, words.extension)
         except (OSError, IndexError, KeyError) as error:
-            raise fail(
-                f"has no header to read: {error}", file=path, advice="check the name and `extension`"
-            ) from error
-        yield {key: header[key] for key in dict.fromkeys(header) if key}
+            advice = "check the name and `extension`"
+            raise fail(f"has no header to read: {error}", file=path, advice=advice) from error
+        yield _plain(header)
     else:
         _, table, _ = read_table_file(path, ())
         for row in table:
             yield {name: _unmasked(row[name]) for name in table.colnames}
 
 
-def _of_json(path: Path, rows: str) -> Iterator[Mapping[str, Any]]:
+def json_content(path: str | os.PathLike[str]) -> Any:
+    """The content of a JSON file, a list where it has a record in each line."""
     text = read_text(path)
     try:
-        content = json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as error:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
         try:
-            content = [json.loads(line) for line in text.splitlines() if line.strip()]
-        except (json.JSONDecodeError, RecursionError):
-            raise fail(f"is no JSON: {error}", file=path, advice="export the log again") from None
+            return [json.loads(line) for line in text.splitlines() if line.strip()]
+        except (ValueError, RecursionError):
+            raise fail(f"is no JSON: {error}", file=path, advice="export or write it again") from None
+
+
+def _of_json(path: Path, rows: str) -> Iterator[Mapping[str, Any]]:
+    content = json_content(path)
     for key in filter(None, rows.split(".")):
         if not isinstance(content, Mapping) or key not in content:
-            keys = list(content) if isinstance(content, Mapping) else []
-            raise fail(
-                f"rows = {rows!r}: there is no {key!r}",
-                file=path,
-                advice=nearest(key, keys) if keys else "",
-            )
+            advice = nearest(key, content) if content and isinstance(content, Mapping) else ""
+            raise fail(f"rows = {rows!r}: there is no {key!r}", file=path, advice=advice)
         content = content[key]
     if not isinstance(content, list) or not all(isinstance(record, Mapping) for record in content):
-        raise fail("holds no list of records", file=path, advice='say where it is: rows = "data.exposures"')
+        raise fail("holds no list of records", file=path, advice='give its place: rows = "data.exposures"')
     yield from content
 
 
@@ -213,42 +229,38 @@ def _found(record: Mapping[str, Any], word: str) -> Any:
     else:
         for key in word.split("."):
             value = value.get(key) if isinstance(value, Mapping) else None
-    if isinstance(value, Mapping) and len(value) == 1 and (key := next(iter(value))).startswith("$"):
-        value = value[key]  # of a document database: {"$date": …}
-    return None if isinstance(value, str) and value.strip().lower() in MISSING else value
+    while isinstance(value, Mapping) and len(value) == 1 and (key := next(iter(value))).startswith("$"):
+        value = value[key]  # of a document database: {"$date": {"$numberLong": milliseconds since 1970}}
+        if key == "$date" and not isinstance(value, str):
+            value = MJD_1970 + float(_found({"": value}, "")) / 86400e3
+    empty = isinstance(value, float) and math.isnan(value)
+    return None if empty or (isinstance(value, str) and value.strip().lower() in MISSING) else value
 
 
 # --------------------------------------------------------------------------------------------------- values of words
 
 
-def _row(record: Mapping[str, Any], words: Words, file: str) -> dict[str, Any]:
+def _row(record: Mapping[str, Any], words: Mapping[str, Word], file: str) -> dict[str, Any]:
     """The columns of one exposure."""
-    place, row, converted = Place(file, ""), {}, dict[str, Any]()
-    rules = table_rules("EXPOSURES", list(words.columns), place)
-    for name, word in words.columns.items():
-        value = (
-            word.value
-            if not word.words
-            else next((v for w in word.words if (v := _found(record, w)) is not None), None)
-        )
-        if value is None:
+    place, converted = Place(file, ""), dict[str, Any]()
+    rules = table_rules("EXPOSURES", list(words), place)
+    for name, word in words.items():
+        there = (value for of in word.word if (value := _found(record, of)) is not None)
+        if (value := next(there, word.value)) is None:
             if word.optional:
                 continue
-            listed = " or ".join(word.words)
-            there = any(name_of in record for name_of in word.words)
-            like = nearest(word.words[0], record) if record and not there else ""
-            raise place.fail(
-                f"the word {listed} is {'empty' if there else 'missing'}",
-                name,
-                f"{like}{'; ' if like else ''}optional = true where it may be absent",
-            )
+            listed = " or ".join(word.word)
+            empty = any(of in record for of in word.word)
+            like = f"{nearest(word.word[0], record)}; " if record and not empty else ""
+            what = f"the word {listed} is {'empty' if empty else 'missing'}"
+            raise place.fail(what, name, f"{like}optional = true where it may be absent")
         converted[name] = _value(value, name, rules[name], word, place)
-    for name, value in converted.items():
-        expression = words.columns[name].expression
-        row[name] = (
-            value if not expression else _evaluated(expression, {**converted, "x": value}, name, place)
-        )
-    return row
+    return {
+        name: _evaluated(expression, {**converted, "x": value}, name, place)
+        if (expression := words[name].expression)
+        else value
+        for name, value in converted.items()
+    }
 
 
 def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any:
@@ -257,17 +269,16 @@ def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any
         keys = {key.upper(): replacement for key, replacement in word.values.items()}
         text = _text(value).upper()
         if text not in keys:
-            raise place.fail(f"{word.words[0]} = {value!r} is none of its values", name, nearest(text, keys))
+            raise place.fail(f"{word.word[0]} = {value!r} is none of its values", name, nearest(text, keys))
         value = keys[text]
-    what = f"{' or '.join(word.words) or 'value'} = {value!r}"
+    what = f"{' or '.join(word.word) or 'value'} = {value!r}"
     if rule.kind == "str":
         return _text(value)
     if rule.kind == "bool":
         text = _text(value).lower()
         if text not in _INSIDE:
-            raise place.fail(
-                f"{what} is neither true nor false", name, 'give its meaning: values = { "…" = true }'
-            )
+            advice = 'give its meaning: values = { "…" = true }'
+            raise place.fail(f"{what} is neither true nor false", name, advice)
         return _INSIDE[text]
     number = _number(value, name, rule, word, place, what)
     if rule.kind == "int":
@@ -279,25 +290,25 @@ def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any
 
 def _number(value: Any, name: str, rule: Column, word: Word, place: Place, what: str) -> float:
     if isinstance(value, str) and rule.unit == "d" and not _is_number(value):
-        from astropy.time import Time
-
         try:
-            days: Any = Time(value.strip().rstrip("Z"), scale="utc").mjd
-            return float(days)
+            return mjd_of(value)
         except ValueError:
-            raise place.fail(
-                f"{what} is no date", name, "as 2026-11-26T01:02:03, or a number of days"
-            ) from None
-    if isinstance(value, str) and rule.unit in ("deg", "h") and _SEXAGESIMAL.fullmatch(value.strip()):
-        number = sexagesimal(value)
+            advice = "as 2026-11-26T01:02:03, or a number of days"
+            raise place.fail(f"{what} is no date", name, advice) from None
+    if is_sexagesimal(value) and rule.unit in ("deg", "h"):
+        with_unit = "h" in value or "d" in value
+        try:
+            value = float(degrees_of(value, "deg"))  # 6h30m is 97.5 deg, 6:30 is 6.5 of the word's unit
+        except ValueError:
+            raise place.fail(f"{what} is no angle", name, "as 06:30:12.5, minutes below 60") from None
+        if with_unit:
+            return value / 15.0 if rule.unit == "h" else value
         if not word.unit:
-            raise place.fail(
-                f"{what} may be hours or degrees", name, 'say unit = "hourangle" or unit = "deg"'
-            )
-    elif isinstance(value, bool) or not _is_number(value):
+            advice = 'give unit = "hourangle" or unit = "deg"'
+            raise place.fail(f"{what} may be hours or degrees", name, advice)
+    if isinstance(value, bool) or not _is_number(value):
         raise place.fail(f"{what} is not a number", name, "give another word, or values = { … }")
-    else:
-        number = float(value)
+    number = float(value)
     if not word.unit:
         return number
     return float(convert_unit(np.array([number]), word.unit, rule.unit, name, place)[0])
@@ -314,15 +325,6 @@ def _is_number(value: Any) -> bool:
         return False
 
 
-def _column(values: Sequence[Any], name: str) -> np.ndarray:
-    """The values of all exposures; missing ones are those of an absent column."""
-    rule = EXPOSURES.get(name)
-    missing = (
-        False if name.endswith("_IN") else 0.0 if name.endswith("_TURN") else rule.missing if rule else np.nan
-    )
-    return np.array([missing if value is None else value for value in values])
-
-
 def _names(expression: str, read: Reader, name: str) -> set[str]:
     try:
         tree = ast.parse(expression, mode="eval").body
@@ -332,9 +334,8 @@ def _names(expression: str, read: Reader, name: str) -> set[str]:
     for node in ast.walk(tree):
         number = not isinstance(node, ast.Constant) or type(node.value) in (int, float)
         if not isinstance(node, allowed) or not number:
-            raise read.fault(
-                name, f"expression = {expression!r} may hold numbers, columns, + - * / % ** and ( ) only"
-            )
+            what = f"expression = {expression!r} may hold numbers, columns, + - * / % ** and ( ) only"
+            raise read.fault(name, what)
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
 
 

@@ -308,7 +308,7 @@ def _about_angles(made: Inspection) -> Iterator[Finding]:
         yield Finding(
             "doubt",
             f"only {number} polariser angles modulo 180°",
-            "with fewer than 8, polariser errors cannot be told from instrument errors",
+            "with fewer than 8, polariser errors cannot be separated from instrument errors",
         )
 
 

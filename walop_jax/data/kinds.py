@@ -1,4 +1,4 @@
-"""Kinds of exposures, and the columns of moving elements that every calibration set knows."""
+"""Kinds of exposures, and the columns of moving elements that every calibration set may have."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ KINDS: Mapping[str, ExposureKind] = {
 """Kinds of exposures: through the polariser, lamp, full-Moon sky, standard star, known throughput, lamp of one flux."""
 
 POLARISER, CALIBRATION_PLATE = "CLP", "CHWP"
-"""Column prefixes of the moving elements that every calibration set knows."""
+"""Column prefixes of the moving elements that every calibration set may have."""
 
 PREFIX = re.compile(r"[A-Z][A-Z0-9_]*")
 """Form of the column prefix of a moving element."""

@@ -18,11 +18,12 @@ from typing import Any
 
 import numpy as np
 
+from walop_jax.data.header_words import columns_of, json_content, overlapping
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.data.records import Exposures, Position, Site
-from walop_jax.data.units import sexagesimal
+from walop_jax.data.units import degrees_of, mjd_of, sexagesimal
 from walop_jax.io.errors import fail
-from walop_jax.io.text import read_text
+from walop_jax.io.text import some
 from walop_jax.io.toml import Reader
 
 TYPES: Mapping[str, str] = {"clp": "CAL-CAL", "lamp": "CAL-CAL", "moon": "CAL-MOO"}
@@ -39,7 +40,6 @@ FASTEST = 3.0  # turns per minute
 MOST_FILTERS = 4
 MOST_EXPOSURES = 10_000
 """Of an acquisition."""
-TOLERATED = 2.0 / 86400.0  # d: times are of whole seconds
 SLACK = 30.0  # minutes that a window is longer than its exposures, on both sides
 ALIKE = 180.0  # deg after which a wave plate is the same again
 ELEMENTS = {CALIBRATION_PLATE: "hwp", POLARISER: "polarizer"}
@@ -87,9 +87,8 @@ def schedule_of(
             acquisitions.append({"window": window, "guider": False, **setting, "exposure": exposure})
             ra, dec = float(exposures.ra[which[0]]), float(exposures.dec[which[0]])
             if math.isfinite(ra) and math.isfinite(dec):
-                objects.setdefault(
-                    target, {"name": target, "ra": _sexagesimal(ra / 15.0, 24), "dec": _signed(dec)}
-                )
+                place = {"ra": sexagesimal(ra, "hourangle"), "dec": sexagesimal(dec, "deg")}
+                objects.setdefault(target, {"name": target, **place})
         targets.append({"target": target, "type": kind, "acquisition": acquisitions})
     mjd = exposures.mjd[np.isfinite(exposures.mjd)]
     evening = _local(float(mjd.min()) if mjd.size else 51544.0, site) - datetime.timedelta(hours=12)
@@ -107,17 +106,14 @@ def schedule_of(
 
 def read_schedule(
     path: str | os.PathLike[str], filters: Mapping[str, int]
-) -> tuple[Exposures, tuple[str, ...], list[str]]:
-    """The exposures of a schedule, the names of their targets, and remarks.
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns of EXPOSURES of a schedule, the names of their targets in TARGET, and remarks.
 
     An acquisition that was executed may hold `executed`, the UTC at which each exposure began. Without it times are not
     known. Raises `DataError`, with target and acquisition, for missing entries and for states that an exposure cannot
     have.
     """
-    try:
-        content = json.loads(read_text(path))
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise fail(f"is no JSON: {error}", file=path, advice="write it again") from None
+    content = json_content(path)
     if not is_schedule(content):
         raise fail("is no schedule: it has no objects and targets", file=path, advice="give one of format v4")
     where = {str(entry.get("name")): entry for entry in _tables(content["objects"], path, "objects")}
@@ -128,27 +124,18 @@ def read_schedule(
         remarks.append(f"{path}: {', '.join(science)}: no calibration ({' and '.join(OF_SCIENCE)}), left out")
     if not rows:
         raise fail("has no exposures", file=path, advice="nothing to be read")
-    if unknown := sum(not math.isfinite(row["mjd"]) for row in rows):
+    targets = np.array([row.pop("TARGET") for row in rows])
+    table = columns_of(rows, str(path))
+    if unknown := int(np.sum(np.isnan(table["MJD"]))):
         remarks.append(f"{path}: {unknown} exposures without `executed`: their time is not known")
-    begin, end = (np.array([row["mjd"] + k * row["exptime"] / 2 / 86400.0 for row in rows]) for k in (-1, 1))
-    if early := int(np.sum(begin[1:] < end[:-1] - TOLERATED)):
+    unplaced = np.isin(table["KIND"], ("moon", "standard")) & np.isnan(table["RA"])
+    if unplaced.any():
+        names = some(list(dict.fromkeys(targets[unplaced].tolist())), 5)
+        remarks.append(f"{path}: {names}: no object with RA and DEC, where these are is not known")
+    if early := overlapping(table["MJD"], table["EXPTIME"]):
         what = "begin before the one ahead of them has ended"
         remarks.append(f"{path}: {early} exposures {what}: are `executed` their begins, in UTC?")
-    columns = {
-        name: np.array([row[name] for row in rows]) for name in rows[0] if name not in ("positions", "target")
-    }
-    nothing = np.full(len(rows), np.nan)
-    places = {}
-    for prefix in ELEMENTS:
-        inside, angle, turn = (
-            np.array(column) for column in zip(*(row["positions"][prefix] for row in rows), strict=True)
-        )
-        places[prefix] = Position(inside.astype(bool), angle.astype(float), turn.astype(float))
-    exposures = Exposures(
-        exposure=np.arange(len(rows)), **columns, temp=nothing, ha=nothing, rotator=nothing, teff=nothing,
-        positions=places,
-    )  # fmt: skip
-    return exposures, tuple(row["target"] for row in rows), remarks
+    return table | {"TARGET": targets}, remarks
 
 
 # --------------------------------------------------------------------------------------------------------- writing
@@ -161,15 +148,11 @@ def _check(exposures: Exposures, filters: Mapping[str, int]) -> None:
             what = f"filter {name} has no number from 1 to {MOST_FILTERS}"
             raise fail(what, column="FILTER", advice=f'give it: filters = {{ "{name}" = 1 }} in the words')
     if numbers := [n for n in filters.values() if list(filters.values()).count(n) > 1]:
-        raise fail(
-            f"two filters have the number {numbers[0]}",
-            column="FILTER",
-            advice="correct filters of the words",
-        )
+        what = f"two filters have the number {numbers[0]}"
+        raise fail(what, column="FILTER", advice="correct filters of the words")
     if inside := [prefix for prefix, at in exposures.further.items() if at.inside.any()]:
-        raise fail(
-            f"a schedule cannot set {inside[0]}", column=f"{inside[0]}_ANGLE", advice="take these by hand"
-        )
+        what, column = f"a schedule cannot set {inside[0]}", f"{inside[0]}_ANGLE"
+        raise fail(what, column=column, advice="take these by hand")
     if not np.isfinite(exposures.exptime).all():
         raise fail("is not known", column="EXPTIME", advice="a schedule needs the time of every exposure")
 
@@ -227,16 +210,6 @@ def _window(mjd: np.ndarray, exptime: np.ndarray, site: Site) -> dict[str, str]:
     return dict(zip(("start", "end"), (f"{_local(float(t), site):%H:%M:%S}" for t in edges), strict=True))
 
 
-def _sexagesimal(value: float, most: int) -> str:
-    hundredths = round(value * 360000.0) % (most * 360000)
-    seconds, fraction = divmod(hundredths, 100)
-    return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}.{fraction:02d}"
-
-
-def _signed(value: float) -> str:
-    return ("-" if value < 0 else "+") + _sexagesimal(abs(value), 91)
-
-
 # --------------------------------------------------------------------------------------------------------- reading
 
 
@@ -256,14 +229,15 @@ def _read(
                 exposure, plate, polariser = (
                     read.table(acquisition[key], "", f"{key} = ") for key in ("exposure", "hwp", "polarizer")
                 )
-                count, time, number_of_filter = exposure["multiples"], exposure["T"], acquisition["filter"]
+                count = read.whole(exposure["multiples"], "multiples", "exposure")
+                number_of_filter = read.whole(acquisition["filter"], "filter", "")
                 inside = read.flag(polariser["engage"], "engage", "polarizer")
-                positions = {CALIBRATION_PLATE: plate, POLARISER: polariser}
-                seconds = read.positive(time, "T", "exposure")
-                settings = {p: _position(state, p, seconds, read) for p, state in positions.items()}
+                seconds = read.positive(exposure["T"], "T", "exposure")
+                settings = _position(plate, CALIBRATION_PLATE, seconds, read)
+                settings |= _position(polariser, POLARISER, seconds, read)
             except KeyError as error:
                 raise fail(f"has no {error}", file=place, advice="see the format v4") from None
-            if not 1 <= read.whole(count, "multiples", "exposure") <= MOST_EXPOSURES:
+            if not 1 <= count <= MOST_EXPOSURES:
                 raise read.fault("exposure", f"multiples = {count} must be between 1 and {MOST_EXPOSURES}")
             if number_of_filter not in name_of:
                 advice = f'give its name: filters = {{ "SDSS-r" = {number_of_filter} }} in the words'
@@ -272,17 +246,17 @@ def _read(
             if began and len(began) != count:
                 raise fail(f"has {len(began)} times of {count} exposures", file=place, advice="one for each")
             kind = "clp" if inside else KINDS_OF.get(form, "lamp").replace("clp", "lamp")
-            coordinates = where.get(name, {})
+            place_of = where.get(name, {})
             for k in range(count):
                 yield {
-                    "target": name,
-                    "kind": kind,
-                    "mjd": _mjd(began[k], place) + seconds / 2 / 86400.0 if began else math.nan,
-                    "exptime": seconds,
-                    "filter": name_of[number_of_filter],
-                    "ra": 15.0 * _angle(coordinates.get("ra"), name, path),
-                    "dec": _angle(coordinates.get("dec"), name, path),
-                    "positions": settings,
+                    "TARGET": name,
+                    "KIND": kind,
+                    "MJD": _mjd(began[k], place) + seconds / 2 / 86400.0 if began else math.nan,
+                    "EXPTIME": seconds,
+                    "FILTER": name_of[number_of_filter],
+                    "RA": _angle(place_of.get("ra"), "hourangle", name, path),
+                    "DEC": _angle(place_of.get("dec"), "deg", name, path),
+                    **settings,
                 }
 
 
@@ -292,41 +266,36 @@ def _tables(value: Any, path: Any, what: str) -> list[Mapping[str, Any]]:
     return value
 
 
-def _angle(text: Any, name: str, path: Any) -> float:
+def _angle(text: Any, unit: str, name: str, path: Any) -> float:
     try:
-        return sexagesimal(text)
+        return math.nan if text is None else float(degrees_of(text.strip(), unit))
     except (ValueError, AttributeError):
         raise fail(f"object {name}: {text!r} is no angle", file=path, advice="as 06:30:12.5") from None
 
 
-def _position(
-    state: Mapping[str, Any], prefix: str, seconds: float, read: Reader
-) -> tuple[bool, float, float]:
+def _position(state: Mapping[str, Any], prefix: str, seconds: float, read: Reader) -> dict[str, float]:
+    """The columns of an element: whether it is in, its angle and, where it turns, its turn."""
     word = ELEMENTS[prefix]
     if not read.flag(state["engage"], "engage", word):
-        return False, math.nan, 0.0
+        return {f"{prefix}_IN": False, f"{prefix}_ANGLE": math.nan}
     if not state.get("continuous"):
         if "angle" not in state:
             raise fail("is in the beam without an angle", file=read.where, column=prefix, advice="give it")
         if not 0.0 <= (angle := read.number(state["angle"], "angle", word)) <= 360.0:
             raise read.fault(word, f"angle = {angle:g} must be between 0 and 360 degrees")
-        return True, angle, 0.0
-    turn = 6.0 * read.positive(state.get("speed"), "speed", word) * seconds
+        return {f"{prefix}_IN": True, f"{prefix}_ANGLE": angle}
+    if (speed := read.positive(state.get("speed"), "speed", word)) > FASTEST:
+        raise read.fault(word, f"speed = {speed:g} must be at most {FASTEST:g} turns a minute")
+    turn = 6.0 * speed * seconds
     if prefix == POLARISER:
-        raise fail(
-            "turns during the exposure",
-            file=read.where,
-            column=prefix,
-            advice="leave it out, or take it at angles",
-        )
+        what, advice = "turns during the exposure", "leave it out, or take it at angles"
+        raise fail(what, file=read.where, column=prefix, advice=advice)
     _check_half_turns(turn, prefix, read.where)
-    return True, 0.0, turn
+    return {f"{prefix}_IN": True, f"{prefix}_ANGLE": 0.0, f"{prefix}_TURN": turn}
 
 
 def _mjd(text: Any, place: str) -> float:
     try:
-        began = datetime.datetime.fromisoformat(str(text).replace("Z", "+00:00"))
+        return mjd_of(str(text))
     except ValueError:
         raise fail(f"executed: {text!r} is no time", file=place, advice="as 2026-11-26T01:02:03Z") from None
-    began = began.astimezone(datetime.UTC).replace(tzinfo=None) if began.tzinfo else began
-    return (began - datetime.datetime(1858, 11, 17)) / datetime.timedelta(days=1)

@@ -178,7 +178,7 @@ class Settings:
         return self._grouped([self.filter, *self._moved(), self.temperature, self.hour_angle])
 
     def distinct(self) -> list[tuple[Settings, Int[np.ndarray, " r"]]]:
-        """One setting for each that differs in anything, and the rows that have it."""
+        """Each distinct setting once, with the rows that have it."""
         return self._grouped([*self._plain(), *self._moved()])
 
     def _grouped(self, columns: list[np.ndarray]) -> list[tuple[Settings, Int[np.ndarray, " r"]]]:
@@ -192,7 +192,7 @@ class Settings:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Key that tells the optics of a single row from those of others; ValueError for several rows."""
+        """Key that distinguishes the optics of a single row; ValueError for several rows."""
         if len(self) != 1:
             raise ValueError(f"one setting is asked for, {len(self)} are given")
         inside = tuple(sorted(self.inside().items()))

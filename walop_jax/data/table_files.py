@@ -262,11 +262,12 @@ def _body(text: str) -> tuple[str, list[str], str]:
 
 def _separator_of(header: str, needed: Collection[str]) -> str:
     """Separator of the names in a line such that those needed are among them; else one that occurs, a comma first."""
-    for separator in _SEPARATORS:
+    occurring = [separator for separator in _SEPARATORS if separator in header]
+    for separator in occurring:
         if set(needed) <= {name.strip(" \"'").upper() for name in header.split(separator)}:
             return separator
-    occurring = [separator for separator in _SEPARATORS if separator in header]
-    blank = not occurring and set(needed) <= {name.upper() for name in header.split()}
+    names = {name.upper() for name in header.split()}
+    blank = not occurring and len(names) > 1 and set(needed) <= names
     return " " if blank else (occurring or [","])[0]
 
 

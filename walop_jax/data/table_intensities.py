@@ -46,6 +46,9 @@ class TableIntensities(Intensities):
     used: Bool[np.ndarray, " r"]
     sky: Float[np.ndarray, "r k"] | None = None
 
+    def __repr__(self) -> str:
+        return f"{self.rows} rows of {len(self.points)} field points and {self.exposures} exposures; see to_arrays()"
+
     @functools.cached_property
     def _by_point(self) -> tuple[Int[np.ndarray, " u"], Int[np.ndarray, " b"]]:
         """Used rows in the order of the points, and where each point begins among them."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,12 +36,38 @@ class Place:
         return f"{self.file} [{self.extension}] {column}: {what}"
 
 
-def sexagesimal(text: str | None) -> float:
-    """The number of a text ±d:m:s, in the unit of d; NaN for None."""
-    if text is None:
-        return float("nan")
-    digits = [float(part) for part in re.split("[: ]", text.strip().strip("+-"))]
-    return (-1.0 if text.strip().startswith("-") else 1.0) * sum(d / 60.0**k for k, d in enumerate(digits))
+_SEXAGESIMAL = re.compile(r"\s*[+-]?\d+\s*[:hd ]\s*\d.*")
+
+
+def is_sexagesimal(value: Any) -> bool:
+    """True for a text that looks like 06:30:12.5, 6 30 12.5 or 6h30m12.5s."""
+    return isinstance(value, str) and _SEXAGESIMAL.fullmatch(value) is not None
+
+
+def degrees_of(text: str | Sequence[str], unit: str) -> Any:
+    """The angle (deg) of a text, or those of several; `unit` (hourangle, deg) is that of one that has none in it.
+
+    Raises ValueError for what is no angle, minutes beyond 60 included.
+    """
+    from astropy.coordinates import Angle  # imported here: it takes a seventh of a second
+
+    return Angle(text, unit=unit).deg
+
+
+def sexagesimal(degrees: float, unit: str) -> str:
+    """An angle (deg) as hh:mm:ss.ss, or ±dd:mm:ss.ss where `unit` is deg."""
+    from astropy.coordinates import Angle
+
+    hours = unit == "hourangle"
+    turned = round(degrees * 24000.0) / 24000.0 % 360.0 if hours else degrees  # hundredths of seconds
+    return str(Angle(turned, "deg").to_string(unit, sep=":", precision=2, pad=True, alwayssign=not hours))
+
+
+def mjd_of(text: str) -> float:
+    """The MJD (UTC, d) of a text of ISO 8601, with the offset of its zone if it has one; ValueError for others."""
+    time = datetime.datetime.fromisoformat(text.strip().replace("Z", "+00:00"))
+    utc = time.astimezone(datetime.UTC).replace(tzinfo=None) if time.tzinfo else time
+    return (utc - datetime.datetime(1858, 11, 17)) / datetime.timedelta(days=1)
 
 
 def unit_of(column: Any) -> str:
@@ -98,7 +125,7 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
         return values  # no arithmetic: values come back bit for bit
     if _is_logarithmic(unit_given):
         advice = f"give the column in {wanted or 'fractions'}"
-        if wanted == "electron":
+        if wanted in ("electron", "ct"):
             advice = (
                 "counts in electrons are needed: 10^(−0.4 (m − m₀)) of magnitudes m, m₀ that of one electron, and "
                 "N_ERR = 0.921 N · error of m; 10^d of dex"
@@ -112,8 +139,8 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
         )
     except units.UnitConversionError as error:
         advice = f"convert the column to {wanted or 'a fraction without unit'}"
-        if wanted == "electron":
-            per_time = unit_given.is_equivalent(units.electron / units.s)
+        if wanted in ("electron", "ct"):
+            per_time = unit_given.is_equivalent(target / units.s)
             advice += f" (multiply by the {'exposure time' if per_time else 'gain'})"
         raise place.fail(
             f"the unit {unit!r} cannot be converted to {wanted or 'none'!r}", name, advice

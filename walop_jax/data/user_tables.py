@@ -10,16 +10,16 @@ import dataclasses
 import difflib
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from walop_jax.data.schema import MISSING, Column, distinct, plain_column, values_of
 from walop_jax.data.table_files import read_table_file, table_of_hdu
-from walop_jax.data.units import Place, check_units, partner_of, unit_of
+from walop_jax.data.units import Place, check_units, degrees_of, is_sexagesimal, partner_of, unit_of
 from walop_jax.io.errors import fail
 from walop_jax.io.fits_reading import one_line
 from walop_jax.io.text import in_ascii, some
@@ -27,9 +27,10 @@ from walop_jax.io.text import in_ascii, some
 _LISTED = 12  # columns, in a message
 _LIKE = 0.7  # of names, for "did you mean"
 _COLOUR = re.compile(
-    r"T_?EFF|TEMPERATURE|COLOU?R|BP.?RP|SP(EC(TRAL)?)?_?TYPE|(?<![A-Z])[UBVRIGZYJHK]([-_]|_M_)[UBVRIGZYJHK](?![A-Z])"
+    r"T_?EFF|TEMPERATURE|COLOU?R|BP.?RP|PHOT_(BP|RP)_MEAN_MAG|SP(EC(TRAL)?)?_?TYPE|(?<![A-Z])[UBVRIGZYJHK]([-_]|_M_)[UBVRIGZYJHK](?![A-Z])"
 )
 """Names, in capitals, of columns that say which colour a star has."""
+_IDENTITY = re.compile(r"SOURCE_?ID|GAIA_?(E?DR\d)?_?(ID|NAME)?$|ID_?GAIA|DR\d_?(ID|NAME)$")
 
 OF_STARS: Mapping[str, tuple[str, str]] = {
     "SOURCE_ID": ("", "source identifier, of Gaia"),
@@ -83,10 +84,23 @@ class InputTable:
         if gone := [name for name in replaced if name not in self.used]:
             sentences.append(f"{_columns(gone)} replaced by the result")
         if unused:
-            lacking = self.lacking - {"TEFF"} if "BP_RP" in self.used else self.lacking
-            about = some(hints(unused, lacking), 3, "; ")
+            about = some(self.hints(self.lacking, unused), 3, "; ")
             sentences.append(f"{_columns(unused)} not used{f' ({about})' if about else ''}")
         return tuple(sentences)
+
+    def hints(self, lacking: Set[str], names: Collection[str] | None = None) -> list[str]:
+        """Names of `lacking` that unused columns may have been meant to have; of `names` those alike as well."""
+        sure, alike = [], []
+        for name in [n for n in self.names if n not in self.used] if names is None else names:
+            if {"TEFF", "BP_RP"}.isdisjoint(self.used) and "TEFF" in lacking and _COLOUR.search(name):
+                sure.append(f"{name}: the colour of a star is read from TEFF (K) or BP_RP (mag, of Gaia)")
+            elif "SOURCE_ID" in lacking - self.used and _IDENTITY.search(name):
+                sure.append(f"{name}: the identity of a star is read from SOURCE_ID")
+            elif "FLAG" in name and "N_FLAG" in lacking:
+                alike.append(f"{name}: flags are read from N_FLAG or FLAG, any bit means not used")
+            elif names is not None and (like := difflib.get_close_matches(name, sorted(lacking), 1, _LIKE)):
+                alike.append(f"{name}: did you mean {like[0]}?")
+        return [*sure, *alike]
 
     def new_name(self, name: str) -> str:
         """The name of a column of the user's that is used and has the name of one that is added."""
@@ -98,19 +112,6 @@ class InputTable:
 
 def _columns(names: Sequence[str]) -> str:
     return f"column{'s' if len(names) > 1 else ''} {', '.join(names)} {'are' if len(names) > 1 else 'is'}"
-
-
-def hints(names: Sequence[str], lacking: Collection[str], *, unsure: bool = True) -> list[str]:
-    """Names that columns that are not used may have been meant to have: colours, flags, and (`unsure`) those alike."""
-    colours, flags = [], []
-    for name in names:
-        if "TEFF" in lacking and _COLOUR.search(name):
-            colours.append(f"{name}: the colour of a star is read from TEFF (K) or BP_RP (mag, of Gaia)")
-        elif "FLAG" in name and "N_FLAG" in lacking:
-            flags.append(f"{name}: flags are read from N_FLAG or FLAG, any bit means not used")
-        elif unsure and (like := difflib.get_close_matches(name, sorted(lacking), n=1, cutoff=_LIKE)):
-            flags.append(f"{name}: did you mean {like[0]}?")
-    return [*colours, *flags]
 
 
 def read_input_table(path: str | os.PathLike[str], needed: Collection[str] = ("X", "Y")) -> InputTable:
@@ -182,6 +183,53 @@ def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
     return np.full(source.rows, rule.missing)
 
 
+_FEWEST_STARS = 10  # from which on the shape of a field tells hours from degrees
+_FLAT = 0.25  # of the extent in declination: hours taken as degrees have a fifteenth
+
+
+def sky_positions(
+    source: InputTable, names: Sequence[str] = ("RA", "DEC")
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Right ascensions and declinations (deg) of a table; as sexagesimal texts they are in hours and degrees.
+
+    Empty cells are NaN. Raises `DataError` for values that are no angles or out of range, and for right ascensions
+    without a unit that are hours: none beyond 24, of a field that would be a fifteenth as wide as high.
+    """
+    ra, dec = (_angles(source, *pair) for pair in zip(names, ("hourangle", "deg"), strict=True))
+    place = Place(source.path, "")
+    place.refuse(np.abs(ra) > 360.0, "is beyond ±360°", names[0], "right ascensions in degrees are needed")
+    place.refuse(np.abs(dec) > 90.0, "is beyond ±90°", names[1], "declinations in degrees are needed")
+    column, stated = source.column(names[0]), ra[np.isfinite(ra)]
+    with_unit = unit_of(column) or column.dtype.kind not in "fiu"
+    if with_unit or not stated.size or np.abs(stated - 12.0).max() > 12.0:
+        return ra, dec
+    from_first = np.mod(stated - stated.min() + 12.0, 24.0)  # a field about 0 h is no wider than others
+    width = np.std(from_first) * np.cos(np.deg2rad(np.nanmedian(dec)))
+    if len(ra) < _FEWEST_STARS:
+        what = "has no unit: taken as degrees; hours need the unit hourangle, or texts hh:mm:ss"
+        source.remarks.append(f"{names[0]} {what}")
+    elif width < _FLAT * np.nanstd(dec):
+        what = f"lies between {stated.min():.4g} and {stated.max():.4g}, has no unit, and looks like hours"
+        raise place.fail(what, names[0], "degrees are needed: multiply by 15, or give the unit hourangle")
+    return ra, dec
+
+
+def _angles(source: InputTable, name: str, unit: str) -> Float[np.ndarray, " n"]:
+    """A column of angles in degrees; `unit` (hourangle, deg) is that of sexagesimal ones."""
+    column = source.column(name)
+    if column is not None and column.dtype.kind in "OSU":
+        texts = np.char.strip(np.ma.filled(np.ma.asarray(column).astype(str), ""))
+        if any(map(is_sexagesimal, texts.tolist())):
+            angles, stated = np.full(len(texts), np.nan), texts != ""
+            try:
+                angles[stated] = degrees_of(texts[stated].tolist(), unit)
+                return angles
+            except ValueError as error:
+                advice = "write hh:mm:ss.s and ±dd:mm:ss"
+                raise Place(source.path, "").fail(one_line(error), name, advice) from None
+    return numeric_column(source, name, Column("float", "deg"))
+
+
 def column_of_stars(source: InputTable, name: str) -> np.ndarray:
     """A column of `OF_STARS`: numbers (NaN: unknown), identifiers as texts ("": unknown)."""
     unit, _ = OF_STARS[name]
@@ -214,8 +262,9 @@ def vector_columns(
     """Columns with `rule.width` numbers in a row, or that many columns side by side, which text formats need.
 
     Those of N and N_ERR are N0, N1, … and N0_ERR, N1_ERR, … (or N_ERR0, …), or go by the names of the `cameras`: O1,
-    E1, … and O1_ERR, E1_ERR, … Raises `DataError` as `numeric_column` does, for a row of another width, and where only
-    some of them have a unit that is converted.
+    E1, … and O1_ERR, E1_ERR, …; those of another column, such as SKY, are SKY0, … or O1_SKY, E1_SKY, … Raises
+    `DataError` as `numeric_column` does, for a row of another width, and where only some of them have a unit that is
+    converted.
     """
     single = dataclasses.replace(rule, width=1)
     columns_of = {name: _side_by_side(source, name, rule.width or 1, cameras) for name in names}
@@ -233,19 +282,23 @@ def vector_columns(
 
 def _side_by_side(source: InputTable, name: str, width: int, cameras: Sequence[str]) -> list[str]:
     """The columns that hold `width` numbers in a row: one of that name, or one for each number."""
-    if name in source.names:
-        return [name]
-    head, _, tail = name.partition("_")
-    end = f"_{tail}" if tail else ""
-    spelled = [f"{head}{k}{end}" for k in range(width)], [f"{camera.upper()}{end}" for camera in cameras]
-    forms = (*spelled, [f"{name}{k}" for k in range(width)])
+    forms = spellings(name, width, cameras)
     spelling = next((form for form in forms if any(column in source.names for column in form)), None)
     if spelling is None:
-        source.lacking.update((name, *spelled[0], *spelled[1]))
-        listed = ", or ".join(f"{form[0]} … {form[-1]}" for form in spelled)
+        source.lacking.update(name for form in forms[:3] for name in form)
+        listed = ", or ".join(f"{form[0]} … {form[-1]}" for form in forms[1:3])
         advice = f"add it, or {listed}; {_what_is_there(source)}"
         raise Place(source.path, "").fail("the column is missing", name, advice)
     return spelling
+
+
+def spellings(name: str, width: int, cameras: Sequence[str]) -> list[list[str]]:
+    """The forms in which a column with `width` numbers in a row may be there: whole, or a column for each number."""
+    head, _, tail = name.partition("_")
+    end = f"_{tail}" if tail else ""
+    of_camera = end if head == "N" else f"_{name}"
+    numbered = [f"{head}{k}{end}" for k in range(width)], [f"{name}{k}" for k in range(width)]
+    return [[name], numbered[0], [f"{camera.upper()}{of_camera}" for camera in cameras], numbered[1]]
 
 
 def empty_cells(source: InputTable, name: str, rule: Column) -> Bool[np.ndarray, " n"]:

@@ -11,7 +11,7 @@ Layout as in github.com/HeisenbergK/NewWALOPCalibrate2Dens (README).
 State       `X-Field` and `Y-Field` of an export are the amplitudes of the electric vector along X and Y, hence
             CLP_ANGLE = atan2(Y, X), good to four decimals of the amplitudes: 11.25° is 11.25038°. `Field is
             unpolarized.` means polariser out. Transmissions are those of light of unit intensity in either case;
-            N = 10⁶ × transmission. MJD has no meaning, it tells exposures apart.
+            N = 10⁶ × transmission. MJD has no meaning, it distinguishes exposures.
 Cameras     O1, E1, O2, E2 are the configurations 1, 3, 2, 4 of the WALOP-North design. Its data say that 1 and 3
             are the beams of one prism (extinct at 90° and 0°), 2 and 4 those of the other. That O2 is 2 and not 4
             is the choice of the set named below: with it m33 is negative over nine tenths of the field, while a
@@ -139,7 +139,7 @@ def _header(lines: list[str], offset: int, path: Path) -> tuple[str, int, float]
              for key, colon, text in [line.partition(":")] if colon}  # fmt: skip
     configurations = [int(match[1]) for line in lines if (match := _CONFIGURATION.fullmatch(line))]
     if len(configurations) != 1:
-        raise _fault(path, offset + 1, "does not say which configuration it is of", _AGAIN)
+        raise _fault(path, offset + 1, "does not name its configuration", _AGAIN)
     folder = _FOLDER.fullmatch(path.parent.name)
     if folder and int(folder[1]) != configurations[0]:
         raise fail(
@@ -247,11 +247,11 @@ def import_transmissions(
     """Make a calibration set (KIND `flux`) of all text exports in a folder and its subfolders.
 
     An exposure is a wavelength (a filter MONO-<Ångström>) and a state, unpolarised light first; rows that lack a
-    camera are left out, exposures and points without any row too. MJD has no meaning, but tells exposures apart.
+    camera are left out, exposures and points without any row too. MJD has no meaning, but distinguishes exposures.
     N_ERR is the share `error` of N, at least the rounding of the printed values. `remarks` list the rows left out.
 
     `instrument` is a shipped one, by default that which the titles of the exports name; `configurations` are those of
-    the four cameras O1, E1, O2, E2; `tell` is told of the progress. Each file is read once.
+    the four cameras O1, E1, O2, E2; `tell` receives the progress. Each file is read once.
 
     Raises `DataError` as `read_export` does, for data that are there twice, and if nothing can be made of them.
     """

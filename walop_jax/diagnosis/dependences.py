@@ -125,6 +125,11 @@ class Dependences:
         ):
             yield ("order",)
 
+    def _night_hours(self) -> Iterator[tuple[str, ...]]:
+        """The time since the beginning of a night, where there are several."""
+        if varies(self.exposures.mjd) and len(first_of_nights(np.sort(self.exposures.mjd))) > 1:
+            yield ("night hours",)
+
     def _side(self) -> Iterator[tuple[str, ...]]:
         """The side from which a moving element came, where it came from both."""
         for prefix in self.prefixes:

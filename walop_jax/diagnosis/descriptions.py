@@ -88,7 +88,7 @@ def other_descriptions(
         except ValueError:  # a free parameter of a removed element has no prior and is undetermined
             continue
         assert trial.fit is not None
-        gain = (result.posterior.objective - trial.fit.posterior.objective) * result.noise_scale**2
+        gain = (result.expansion.objective - trial.fit.expansion.objective) * result.noise_scale**2
         compared[choice.change] = dataclasses.replace(choice, better_by=float(gain))
         trials.append(trial)
     return trials, compared

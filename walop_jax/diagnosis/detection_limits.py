@@ -7,7 +7,7 @@ Detected    An effect of amplitude ε has the statistic T ~ χ'²_k(λ) with λ 
             does with probability `thresholds.ALARM`; ε is that for which T does so with `thresholds.PROBABILITY`.
 Named       A rival that does its best to follow the effect stays √S ε from it (`score.separations`). The effect is
             named alone where the amplitude found, ε ± 1/√G, leaves every rival `thresholds.SEPARATION` or more away
-            with `thresholds.PROBABILITY`: ε ≥ d/√S + z/√G with d that separation; below it is told with those for
+            with `thresholds.PROBABILITY`: ε ≥ d/√S + z/√G with d that separation; below it is reported with those for
             which it may be taken.
 Protection  A calibration without the effect takes up a part of it: δθ = (JᵀJ)⁻¹JᵀC ε. Stars are seen through
             m + ε ∂m/∂ε and calibrated with m + δθ ∂m/∂θ; the difference at the amplitude that is just detected is the

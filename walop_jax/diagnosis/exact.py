@@ -78,7 +78,7 @@ class Trial:
 
 
 def _log_determinant(result: FitResult) -> float:
-    return float(np.linalg.slogdet(result.posterior.matrix)[1])
+    return float(np.linalg.slogdet(result.expansion.matrix)[1])
 
 
 def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
@@ -94,7 +94,7 @@ def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
     ]
     amplitudes = [i for effect in model.effect_names for i in amplitude_positions(model, effect)]
     at = [i for i in amplitudes if model.names[i] not in base_names]
-    gain = 0.5 * (base.posterior.objective - extended.posterior.objective)
+    gain = 0.5 * (base.expansion.objective - extended.expansion.objective)
     occam = 0.5 * (_log_determinant(extended) - _log_determinant(base))
     at_all_scales = _of_amplitudes(extended, at) - _of_amplitudes(extended, at, np.ones(1))
     return gain - occam - float(np.sum(np.log(widths))) + at_all_scales
@@ -141,10 +141,10 @@ def try_model(
         likelihood,
         start=np.array([start.get(p.name, p.start) for p in model.parameters]),
         noise_scale=base.noise_scale,
-        worth=base.posterior.objective,
+        worth=base.expansion.objective,
     )
     bayes = -np.inf  # of a diverged fit
-    if np.isfinite(result.posterior.matrix).all():
+    if np.isfinite(result.expansion.matrix).all():
         bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
     return Trial(effect, bayes, result.chi2, result.explains_data, fit=result)
 

@@ -114,8 +114,8 @@ class Evidence:
     """The part of one set of residuals that each candidate explains beyond the base parameters.
 
     `space` is that of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
-    `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are told as the
-    effects that hold them (`grammar.beside_names`), `patterns` the names of patterns without a name. `chi2` and
+    `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are reported as
+    the effects that hold them (`grammar.beside_names`), `patterns` the names of patterns without a name. `chi2` and
     `dof` are those of the fit, `scale` the factor on the errors with which it was made.
     """
 

@@ -72,7 +72,7 @@ def _field_words(design: Design, field: Float[np.ndarray, " p"]) -> str:
     basis = legendre.basis(points.x, points.y, 4, design.fit.model.template.units.field)
     degree = np.array([i + j for i, j in legendre.terms(4)])
     if len(field) <= len(degree):
-        return "too few points to tell"
+        return "too few points to decide"
     total = float(field @ field) or 1.0
     explained, words = 0.0, {}
     for d in range(5):

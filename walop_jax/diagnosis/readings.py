@@ -10,10 +10,10 @@ alternative is worth the χ² of a fit of the rewritten set at a few field point
 after one Gauss–Newton step from the model as designed, the errors of the data scaled by s as the fit of the set as it
 stands asks for, so that priors hold what residuals of a wrong model would bend. The best ones take more steps. What
 brings χ²/dof − 1 below a tenth of what the fit of the set as it stands has left, and below what a fit would call far
-off, is told.
+off, is reported.
 
 Symbols     J, r Jacobian and whitened residuals; P inverse prior variances; θ₀ start values.
-Limits      One mix-up at a time. Two that do the same to these data are told together.
+Limits      One mix-up at a time. Two that do the same to these data are reported together.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def _of_the_result(document: Document, name: str) -> Iterator[str]:
         yield "it was added, and taken out again: the final model does not need it"
     for text in partial:
         if text.startswith(name):
-            yield f"it explains a part only, and may stand in for something else: {text}"
+            yield f"it explains a part only, and may imitate something else: {text}"
 
 
 def _of_the_first_look(document: Document, name: str) -> Iterator[str]:
@@ -48,7 +48,7 @@ def _of_the_first_look(document: Document, name: str) -> Iterator[str]:
     if reason := document.get("not_scored", {}).get(name):
         yield reason
     if name in document.get("cannot_be_tested", ()):
-        yield "these data cannot show it at any plausible size, so they say nothing about it"
+        yield "these data are insensitive to it at any plausible size"
     for entry in document["candidates"]:
         if entry["effect"] == name:
             p, least = probability(entry["p_value"]), f"{thresholds.ALARM:g}"

@@ -147,10 +147,10 @@ class Refits:
         exact = [
             fit(trial.fit.likelihood, start=trial.fit.values, noise_scale=1.0) for trial in even if trial.fit
         ]
-        best = min(trial.posterior.objective for trial in exact)
+        best = min(trial.expansion.objective for trial in exact)
         clearly = [
             dataclasses.replace(
-                trial, fit=again, evidence=trial.evidence - 0.5 * (again.posterior.objective - best)
+                trial, fit=again, evidence=trial.evidence - 0.5 * (again.expansion.objective - best)
             )
             for trial, again in zip(even, exact, strict=True)
         ]

@@ -26,7 +26,7 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
     """The state without unneeded additions, and its unidentified remainder (None: nothing).
 
     A model that predicts exposures worse than the first one is not adopted. More descriptions than
-    `thresholds.MOST_SENTENCES` can be one thing that none of them holds.
+    `thresholds.MOST_SENTENCES` count as a single cause that none of them describes: they become the remainder.
     """
     state, remainder = _leftover(first, prune(first, state, judge), judge)
     if state.steps and (worse := _worse(first.evidence, state.evidence)):
@@ -37,7 +37,7 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
         return state, dataclasses.replace(remainder, parts=(*remainder.parts, *against))
     if len(added) <= thresholds.MOST_SENTENCES:
         return state, None
-    text = f"{len(added)} descriptions were needed: they say where it sits, no single one of them what it is"
+    text = f"{len(added)} descriptions were needed: they show its place, no single one its nature"
     remainder = Unexplained(state.evidence.table.p_global, f"{text} ({' | '.join(added)})", ())
     columns = [first.evidence.candidates[name] for name in added]
     if predicts_unseen(first.evidence.design, columns, thresholds.USEFUL):
@@ -104,7 +104,7 @@ def _leftover(first: State, state: State, judge: Refits) -> Remainder:
             continue
         remainder, with_term = _with_free_form(state, judge)
         if partial:
-            text = "explains a part and may stand in for something else, not added"
+            text = "explains a part and may imitate something else, not added"
             remainder = dataclasses.replace(_and(remainder, f"{text}: {'; '.join(partial)}"), parts=partial)
         if with_term is None:
             return state, remainder
@@ -170,7 +170,7 @@ def _unexplained(evidence: Examination, patterns: tuple[tuple[str, float], ...])
     """Unidentified remainder of an examination: its patterns, and the location of the residuals."""
     if not evidence.alarm:
         ratio = evidence.chi2 / evidence.dof
-        text = f"residuals scatter more than N_ERR says (χ²/dof = {ratio:.3g}) without a known pattern"
+        text = f"residuals scatter more than N_ERR (χ²/dof = {ratio:.3g}) without a known pattern"
     elif patterns:
         text = f"unidentified patterns: {'; '.join(f'{name} (p = {p:.1g})' for name, p in patterns)}"
     else:

@@ -25,7 +25,7 @@ from walop_jax.diagnosis.score import local_p
 from walop_jax.io.text import some
 
 LEAST = 0.25
-"""Correlation below which a common pattern of the optics cannot be told from common noise."""
+"""Correlation below which a common pattern of the optics cannot be separated from common noise."""
 
 
 def repeated_noise(design: Design) -> Iterator[str]:

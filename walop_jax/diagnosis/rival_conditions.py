@@ -44,8 +44,8 @@ def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
 def instead_of_names(before: FitResult, after: FitResult) -> str:
     """The number that the set states which, if wrong, explains the data better than names do; empty: none.
 
-    Numbers that are as probable are told together. Where nothing was added (`after` is `before`) only what explains the
-    data is told.
+    Numbers that are as probable are reported together. Where nothing was added (`after` is `before`) only what explains
+    the data is reported.
 
     Compared are the evidence of the names, ln B of `after` against `before`, and that of the number, fitted exactly,
     with its width as prior: ½ (χ² − χ²_c) − ½ ln(1 + w² C̃ᵀC̃). One number may so come before sixteen.
@@ -69,7 +69,7 @@ def instead_of_names(before: FitResult, after: FitResult) -> str:
                 break
             (current,) = rescored
         score, square = current.score, current.square
-        worth = 0.5 * (before.posterior.objective - result.posterior.objective)
+        worth = 0.5 * (before.expansion.objective - result.expansion.objective)
         worth -= 0.5 * float(np.log1p(square * stated.width**2))
         explained = result.explains_data or result.nearly_explains_data
         if result.converged and abs(size) < stated.width and worth > least and (added or explained):

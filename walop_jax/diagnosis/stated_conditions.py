@@ -14,7 +14,7 @@ The coordinates and times of sky exposures, the site and ROTATOR are asked in th
 (SKY) that is left in the counts. A number of the instrument that is thought to be known, and is not, looks much like
 these: the prior of each parameter, and those of each element together, are rivals with the column (mean −
 value)/width. So are terms of one camera with one amplitude: a non-linearity (its counts squared), a pedestal, scattered
-light (the median counts of an exposure), light of another camera. What cannot be told apart is told together.
+light (the median counts of an exposure), light of another camera. What cannot be separated is reported together.
 
 Limits      Mistakes that free parameters absorb whole show in no residual: with a single filter its displacement, the
             thicknesses of the plates look the same. One number at a time, by a linear step: the size is a hint.
@@ -43,7 +43,7 @@ from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import effect_context
 
-ALIKE = 25.0  # in χ², within which conditions are told together
+ALIKE = 25.0  # in χ², within which conditions are reported together
 _PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
 _ASKED_OTHERWISE = (*thresholds.ASKED_BY_CAMERA, "standard_outlier")  # camera by camera, and as priors
 _LEVELS = "exposures at a second light level"
@@ -222,7 +222,7 @@ def _priors(design: Design) -> Iterator[_Single]:
             p, mean, width = parameters[rows.index[i]], float(rows.mean[i]), float(rows.width[i])
             text = _worded(p.name, score, number, p.unit, mean, width)
             texts.append(f"{text}, not {mean:g} ± {width:g}")
-        return " with ".join(texts) + " (check what the model file knows of it)"
+        return " with ".join(texts) + " (check its value in the model file)"
 
     for name, members in elements.items():
         columns = np.zeros((len(design.residual), len(members)))

@@ -55,7 +55,7 @@ LEAST_SHARE_OF_NAME = 0.25
 """Of what is surely missing (2 σ of χ²) a name, where the fit is not poor: else it stands in for what has none.
 Ablation."""
 PART = 10.0
-"""Factor by which names must bring down χ²/dof − 1 of a poor fit; else they are told as parts, and not added. Not
+"""Factor by which names must bring down χ²/dof − 1 of a poor fit; else they are reported as parts, and not added. Not
 measured."""
 HOPEFUL = 1.0
 """Standard errors by which a sentence must predict unseen settings better, by its linear step, to be fitted. Not

@@ -57,7 +57,7 @@ from walop_jax.fit.search import FAR_OFF
 from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixels
 from walop_jax.fit.verdict import NOT_MEASURED, Structure
 from walop_jax.io.text import some
-from walop_jax.likelihood.frames import PixelPosterior
+from walop_jax.likelihood.frames import PixelExpansion
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 
@@ -131,7 +131,7 @@ def examined(
 
 def _of_pixels(result: FitResult) -> list[VarianceComponent]:
     """Variance components common to exposures in single pixels of whole frames, of a sample of them."""
-    if not isinstance(result.posterior, PixelPosterior):
+    if not isinstance(result.expansion, PixelExpansion):
         return []
     return variance_components(Design.of(sampled(result, _most(result))), pixels=True)
 

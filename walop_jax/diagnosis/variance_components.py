@@ -23,7 +23,7 @@ Symbols     r whitened residuals; w expected counts / errors of what has a flux 
             basis of the derivatives with respect to the free parameters; τ a share of the counts
 Sources     score test of a variance component: Rao 1948; Lin 1997, Biometrika 84, 309. Three moments: Imhof 1961,
             Biometrika 48, 419 (after Pearson 1959). Many questions: Šidák 1967
-Limits      Which place is off is not told, only how much places differ. The mean square of the noise is taken from
+Limits      Which place is off is not reported, only how much places differ. The mean square of the noise is taken from
             the residuals themselves, so that structure in all of them counts a little less.
 """
 

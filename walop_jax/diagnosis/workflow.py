@@ -3,11 +3,11 @@
 1. Fit the model. 2. Score every effect of the catalogue, every sentence (`grammar`) and every pattern without a
 name; global p by Monte Carlo. 3. Below `thresholds.ALARM`: add names one after the other (`search`), each fitted
 together with everything before it is added (`refits`). 4. Drop names that are not needed beside the others. 5. Names
-that leave a poor fit nearly as poor are told as parts of what is missing, and taken out again. 6. What no name explains
-is described, and the verdict is `unexplained`; a free-form term for it stays in the model where it predicts settings
-and parts of the field that it has not seen, and names that only stood in for it are dropped (`remainder`). 7. List for
-each name what the data cannot tell from it, and give the verdict. Names are given at any size; `Step.negligible` says
-when it does not matter for q and u.
+that leave a poor fit nearly as poor are reported as parts of what is missing, and taken out again. 6. What no name
+explains is described, and the verdict is `unexplained`; a free-form term for it stays in the model where it predicts
+settings and parts of the field that it has not seen, and names that only stood in for it are dropped (`remainder`). 7.
+List for each name what the data cannot separate from it, and give the verdict. Names are given at any size;
+`Step.negligible` says when it does not matter for q and u.
 
 Work is bounded by counts of fits, so that one set has one answer however busy the machine is; whoever asks for
 `minutes` gets the best found so far when they are over, and a note that says so.
@@ -70,7 +70,7 @@ def diagnose(
 ) -> Diagnosis:
     """Find what `model` (default: the base model) lacks to explain a calibration set.
 
-    `catalogue` are the effects that may be named (default: those that the model knows). Of a set with more than
+    `catalogue` are the effects that may be named (default: those of the model). Of a set with more than
     `limits.DIAGNOSED_ROWS` (exposure, point) pairs, or whose columns would be more than `limits.DIAGNOSED_NUMBERS`,
     points spread over the field are looked at. Nothing further is tried after `thresholds.MOST_FITS` fits of additions
     (fewer where the model is far from the data), nor after `minutes`, if given; what is left then has no name, and
@@ -198,7 +198,7 @@ def _promise(choice: Choice) -> tuple[float, float]:
 
 
 def _finished(trial: Trial, evidence: Examination, context: Context, added: Sequence[str]) -> Step:
-    """An addition with its final parameters, what cannot be told from it, and where it sits."""
+    """An addition with its final parameters, what cannot be separated from it, and where it sits."""
     result, name = evidence.result, trial.effect.name
     change = signature(result, name, context)
     separation = evidence.separation(name, change)

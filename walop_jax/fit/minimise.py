@@ -10,8 +10,8 @@ Stop        `TOLERANCE`: the scaled gradient d = ‖(JᵀJ)^(−½) Jᵀr‖, th
             (d₋₁: the distance at the place before).
             `ROUGH`: a model that is far from the data (`far_off`) has errors made from its residuals anyway, and is
             near enough with d below this, at the second such place in a row if it may look at another.
-            `ROUNDING`: a step that did not lower the objective is the last where the next could not be told from it.
-            `MAXIMUM_STEPS`: places looked at.
+            `ROUNDING`: a step that did not lower the objective is the last where the next could not be separated from
+            it. `MAXIMUM_STEPS`: places looked at.
 Source      `SOURCE`: the method and its trust region.
 """
 
@@ -51,7 +51,7 @@ BADLY_PREDICTED, WELL_PREDICTED = 0.25, 0.75
 
 
 @runtime_checkable
-class Expansion(Protocol):
+class Quadratic(Protocol):
     """Value, and half the gradient and Hessian, of the objective, at one place."""
 
     @property
@@ -79,7 +79,7 @@ class Minimum:
     """
 
     x: Vector
-    expansion: Expansion
+    expansion: Quadratic
     result: optx.RESULTS
     message: str
     steps: int
@@ -94,7 +94,7 @@ class Minimum:
 
 
 def minimise(
-    evaluate: Callable[[Vector], Expansion],
+    evaluate: Callable[[Vector], Quadratic],
     start: Vector,
     scale: Vector,
     *,
@@ -169,7 +169,7 @@ def _in_words(result: optx.RESULTS, steps: int, distance: float, condition: floa
     return f"not converged after {steps} steps, scaled gradient {distance:.1e}"
 
 
-def distance_to_minimum(expansion: Expansion) -> tuple[float, float]:
+def distance_to_minimum(expansion: Quadratic) -> tuple[float, float]:
     """‖(JᵀJ)^(−½) Jᵀr‖ in scaled parameters, and the condition number of JᵀJ with a diagonal of ones.
 
     How well each parameter is known by itself is no matter of telling them apart: the best scaling is by that, up to
@@ -191,7 +191,7 @@ def distance_to_minimum(expansion: Expansion) -> tuple[float, float]:
     return float(np.sqrt(np.sum(along[positive] ** 2 / value[positive]))), condition
 
 
-def _step(here: Expansion, scale: Vector, damping: float) -> Vector:
+def _step(here: Quadratic, scale: Vector, damping: float) -> Vector:
     """−(JᵀJ + λ)⁻¹ Jᵀr; not a number where that matrix is singular."""
     if not len(scale):  # before SciPy 1.14 nothing was solved for nothing
         return np.zeros(0)
@@ -202,12 +202,12 @@ def _step(here: Expansion, scale: Vector, damping: float) -> Vector:
     return -scipy.linalg.cho_solve(factors, here.gradient, check_finite=False)
 
 
-def _change(step: Vector, here: Expansion) -> float:
+def _change(step: Vector, here: Quadratic) -> float:
     """Change of the objective by a step, as predicted."""
     return float(2.0 * here.gradient @ step + step @ here.matrix @ step)
 
 
-def _judged(step: Vector, here: Expansion | None, there: Expansion, size: float) -> tuple[float, bool]:
+def _judged(step: Vector, here: Quadratic | None, there: Quadratic, size: float) -> tuple[float, bool]:
     """Size of the trust region after a step from here to there, and whether it is taken."""
     if here is None:
         return size, True

@@ -114,7 +114,7 @@ def parse(text: str, build: Callable[[ModelTable], Model]) -> Model:
     for name, entry in content.get("parameters", {}).items():
         parameter = model[name]
         if not isinstance(entry, Mapping):
-            raise ValueError(f'[parameters."{name}"] must be a table; names with dots stand in quotes')
+            raise ValueError(f'[parameters."{name}"] must be a table; put names with dots in quotes')
         changes[name] = _changes(parameter, entry)
     changed = tuple(dataclasses.replace(p, **changes.get(p.name, {})) for p in model.parameters)
     laws = {name: law.document() for name, law in laws_of(content.get("law", {})).items()}

@@ -31,7 +31,7 @@ from walop_jax.io.display import Display
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.layout import curves_of
-from walop_jax.likelihood.likelihood import Likelihood, Posterior
+from walop_jax.likelihood.likelihood import Expansion, Likelihood
 from walop_jax.likelihood.runner import Progress, Runner
 from walop_jax.model.planning import extrapolations
 from walop_jax.model.specification import Model
@@ -68,7 +68,7 @@ class FitResult(Fitted):
     likelihood: Likelihood
     values: Vector
     covariance: Matrix
-    posterior: Posterior
+    expansion: Expansion
     minimum: Minimum
     starts: int
     seconds: float
@@ -99,17 +99,17 @@ class FitResult(Fitted):
     @property
     def n_data(self) -> int:
         """Number of intensities used."""
-        return self.posterior.n_data
+        return self.expansion.n_data
 
     @property
     def dof(self) -> int:
         """Degrees of freedom: data and priors less fluxes and free parameters."""
-        return self.posterior.dof
+        return self.expansion.dof
 
     @property
     def chi2(self) -> float:
         """χ² of data and priors."""
-        return self.posterior.chi2
+        return self.expansion.chi2
 
     @property
     def excess(self) -> float:
@@ -124,7 +124,7 @@ class FitResult(Fitted):
     @property
     def noise_scale(self) -> float:
         """Factor on the errors of the data under which the minimum was sought; 1 unless the model is far off."""
-        return self.posterior.noise_scale
+        return self.expansion.noise_scale
 
     @property
     def explains_data(self) -> bool:
@@ -244,9 +244,9 @@ class FitResult(Fitted):
         )
 
 
-def check_constrained(model: Model, posterior: Posterior) -> None:
+def check_constrained(model: Model, expansion: Expansion) -> None:
     """Raise ValueError for a free parameter without data and without a prior."""
-    idle = [model.parameters[i].name for i in model.free[np.diag(posterior.matrix) == 0.0]]
+    idle = [model.parameters[i].name for i in model.free[np.diag(expansion.matrix) == 0.0]]
     if idle:
         raise ValueError(
             f"nothing in the data depends on {', '.join(idle)}, free and without a prior: freeze "
@@ -254,9 +254,9 @@ def check_constrained(model: Model, posterior: Posterior) -> None:
         )
 
 
-def covariance(model: Model, posterior: Posterior) -> Matrix:
+def covariance(model: Model, expansion: Expansion) -> Matrix:
     """Covariance of all parameters: the inverse of JᵀJ, priors included, ties expanded."""
-    root = model.selection() @ whitening(posterior.matrix, 1e-15)
+    root = model.selection() @ whitening(expansion.matrix, 1e-15)
     return root @ root.T
 
 
@@ -287,12 +287,12 @@ def fit(
         if likelihood is before:
             break
         best = find_minimum(likelihood, best.values, noise_scale, worth)
-    check_constrained(model, best.posterior)
+    check_constrained(model, best.expansion)
     return FitResult(
         likelihood=likelihood,
         values=best.values,
-        covariance=covariance(model, best.posterior),
-        posterior=best.posterior,
+        covariance=covariance(model, best.expansion),
+        expansion=best.expansion,
         minimum=best.minimum,
         starts=best.starts,
         seconds=time.perf_counter() - began,
@@ -315,7 +315,7 @@ def with_honest_errors(result: FitResult) -> FitResult:
     """
     if result.explains_data or result.errors_from != STATED or result.dof <= 0 or not result.converged:
         return result
-    robust = robust_errors(result.likelihood, result.values, result.posterior)
+    robust = robust_errors(result.likelihood, result.values, result.expansion)
     select = result.model.selection()
     return dataclasses.replace(
         result,

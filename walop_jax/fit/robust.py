@@ -25,9 +25,9 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.search import free_scales
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.compressed import compressed
-from walop_jax.likelihood.frames import PixelPosterior, Vector
+from walop_jax.likelihood.frames import PixelExpansion, Vector
 from walop_jax.likelihood.layout import thinned
-from walop_jax.likelihood.likelihood import Likelihood, Matrix, Posterior
+from walop_jax.likelihood.likelihood import Expansion, Likelihood, Matrix
 
 ROBUST_POINTS = 4096
 """Field points whose residuals give the errors of a fit that does not explain its data."""
@@ -43,25 +43,25 @@ class RobustErrors(NamedTuple):
     made_from: str
 
 
-def robust_errors(likelihood: Likelihood, values: Vector, posterior: Posterior) -> RobustErrors:
-    """Errors from the residuals at a minimum; `posterior` is the expansion there, `values` a full vector.
+def robust_errors(likelihood: Likelihood, values: Vector, expansion: Expansion) -> RobustErrors:
+    """Errors from the residuals at a minimum; `expansion` is the expansion there, `values` a full vector.
 
     Of whole frames the blocks are those of the field points that stand for all pixels; of another large set those of
     a sample of its points, as if the others had residuals like them.
     """
     rows = likelihood.priors
-    model, scale = likelihood.model, posterior.noise_scale
+    model, scale = likelihood.model, expansion.noise_scale
     unit = free_scales(model)
     prior = np.zeros((len(values), len(values)))
     prior[rows.index, rows.index] = rows.width**-2
     prior = model.selection().T @ prior @ model.selection()
-    square = max(posterior.data / max(posterior.dof, 1), 1.0)
-    bread = np.linalg.pinv(posterior.matrix * np.outer(unit, unit), hermitian=True, rcond=1e-15)
-    independent = (posterior.matrix - prior) * square / scale**2 + prior
+    square = max(expansion.data / max(expansion.dof, 1), 1.0)
+    bread = np.linalg.pinv(expansion.matrix * np.outer(unit, unit), hermitian=True, rcond=1e-15)
+    independent = (expansion.matrix - prior) * square / scale**2 + prior
     covariance = bread @ (independent * np.outer(unit, unit)) @ bread
     ways = []
-    if isinstance(posterior, PixelPosterior):
-        likelihood = Likelihood.of(compressed(posterior), model, interpolate=False)
+    if isinstance(expansion, PixelExpansion):
+        likelihood = Likelihood.of(compressed(expansion), model, interpolate=False)
     for name, gradients in _gradients(likelihood, values):
         count = len(gradients)
         if count < FEWEST_BLOCKS:

@@ -18,7 +18,7 @@ from walop_jax.io.errors import fail
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.frames import expand_pixels, stands_for_pixels, strips_of
 from walop_jax.likelihood.layout import thinned
-from walop_jax.likelihood.likelihood import Likelihood, Posterior
+from walop_jax.likelihood.likelihood import Expansion, Likelihood
 from walop_jax.model import materials
 from walop_jax.model.specification import Model, Vector
 
@@ -28,7 +28,7 @@ FIRST_STRIPS = 8
 PIXEL_SAMPLE = 1024
 """Pixels of whole frames on which their fit begins: the optics of so few are soon solved one by one."""
 
-Expand = Callable[[Vector, float, Posterior | None], Posterior]
+Expand = Callable[[Vector, float, Expansion | None], Expansion]
 
 FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
 MAXIMUM_RESCALINGS = 4
@@ -48,19 +48,19 @@ class FoundMinimum:
     starts: int = 1
 
     @property
-    def posterior(self) -> Posterior:
+    def expansion(self) -> Expansion:
         """The expansion at the minimum."""
-        assert isinstance(self.minimum.expansion, Posterior)
+        assert isinstance(self.minimum.expansion, Expansion)
         return self.minimum.expansion
 
     @property
     def misfit(self) -> float:
         """χ² of the data with their errors as given, per degree of freedom."""
-        return _misfit(self.posterior)
+        return _misfit(self.expansion)
 
 
-def _misfit(posterior: Posterior) -> float:
-    return posterior.data / max(posterior.dof, 1)
+def _misfit(expansion: Expansion) -> float:
+    return expansion.data / max(expansion.dof, 1)
 
 
 def free_scales(model: Model) -> Vector:
@@ -78,7 +78,7 @@ def _search(
     label: str,
     first: Vector,
     noise_scale: float,
-    near: Posterior | None = None,
+    near: Expansion | None = None,
     expand: Expand | None = None,
     maximum_steps: int = MAXIMUM_STEPS,
     **how: Any,
@@ -89,12 +89,12 @@ def _search(
     """
     expand, model = expand or likelihood.expand, likelihood.model
 
-    def evaluate(x: Vector) -> Posterior:
+    def evaluate(x: Vector) -> Expansion:
         nonlocal near
         near = expand(model.full(x, first), noise_scale, near)
         return near
 
-    def tell(step: int, best: Posterior) -> None:
+    def tell(step: int, best: Expansion) -> None:
         likelihood.runner.tell(f"{label}: step {step} of at most {maximum_steps}, χ²/dof {_misfit(best):.6g}")
 
     minimum = minimise(
@@ -136,13 +136,13 @@ def find_minimum(
     sample_set, runner = thinned(likelihood.calset, points), likelihood.runner
     sample = Likelihood.of(sample_set, likelihood.model, memory=layout.allowed, runner=runner)
     best = find_minimum(sample, first, noise_scale, worth)
-    scale, starts = best.posterior.noise_scale, best.starts
+    scale, starts = best.expansion.noise_scale, best.starts
     stride = strips_of(likelihood) // FIRST_STRIPS if on_pixels else 0
     passes = [("fit of some image rows", stride, 1.0)] if stride > 1 else []
     passes.append((f"fit of all {'pixels' if on_pixels else 'points'}", 1, LARGE_TOLERANCE))
     for label, step, tolerance in passes:
 
-        def of_pixels(values: Vector, scale: float, _: Posterior | None, stride: int = step) -> Posterior:
+        def of_pixels(values: Vector, scale: float, _: Expansion | None, stride: int = step) -> Expansion:
             return expand_pixels(likelihood, values, scale, stride)
 
         how = {"expand": of_pixels if on_pixels else None, "tolerance": tolerance, "damping": 0.0}
@@ -166,10 +166,10 @@ def _best_gaps(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
                 if start[gap] <= 0:
                     continue
                 label = f"checking for another order of fringes ({model.names[gap]} = {start[gap]:.4g} µm)"
-                scale = before.posterior.noise_scale
-                trial = _search(likelihood, label, start, scale, before.posterior, maximum_steps=OTHER_STEPS)
+                scale = before.expansion.noise_scale
+                trial = _search(likelihood, label, start, scale, before.expansion, maximum_steps=OTHER_STEPS)
                 best = dataclasses.replace(best, starts=best.starts + 1)
-                if trial.minimum.converged and trial.posterior.objective < best.posterior.objective:
+                if trial.minimum.converged and trial.expansion.objective < best.expansion.objective:
                     best = dataclasses.replace(trial, starts=best.starts)
             if best.minimum is before.minimum:
                 break
@@ -183,9 +183,9 @@ def _from_afar(
     check_identifiable(likelihood)
     scale = noise_scale or 1.0
     best = _search(likelihood, "fit", first, scale, maximum_steps=FIRST_STEPS)
-    promising = best.posterior.objective < worth if worth is not None else best.misfit < FAR_OFF
+    promising = best.expansion.objective < worth if worth is not None else best.misfit < FAR_OFF
     if not best.minimum.converged and promising:
-        best = _search(likelihood, "fit, continued", best.values, scale, best.posterior, damping=0.0)
+        best = _search(likelihood, "fit, continued", best.values, scale, best.expansion, damping=0.0)
     if noise_scale is not None or best.misfit < FAR_OFF:
         return best
     return _far_off(likelihood, best)
@@ -198,14 +198,14 @@ def _far_off(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
     def search(label: str, values: Vector, scale: float, maximum_steps: int) -> FoundMinimum:
         nonlocal budget
         maximum_steps = max(1, min(maximum_steps, budget))
-        attempt = _search(likelihood, label, values, scale, best.posterior, maximum_steps=maximum_steps)
+        attempt = _search(likelihood, label, values, scale, best.expansion, maximum_steps=maximum_steps)
         budget -= attempt.minimum.steps
         return attempt
 
     def rescaled(best: FoundMinimum) -> FoundMinimum:
         for _ in range(MAXIMUM_RESCALINGS):
             scale = float(np.sqrt(best.misfit)) if best.misfit > FAR_OFF else 1.0
-            if budget <= 0 or abs(scale / best.posterior.noise_scale - 1.0) < 0.1:
+            if budget <= 0 or abs(scale / best.expansion.noise_scale - 1.0) < 0.1:
                 break
             # Half of the budget at most: the other orders are to be tried as well.
             label = f"the model is far off; errors × {scale:.3g}"
@@ -218,11 +218,11 @@ def _far_off(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
         if budget <= 0:
             break
         label = f"start {number} of {len(starts_left) + 1}, {label}"
-        trial, starts = search(label, first_values, best.posterior.noise_scale, OTHER_STEPS), starts + 1
-        if trial.posterior.objective < best.posterior.objective:
+        trial, starts = search(label, first_values, best.expansion.noise_scale, OTHER_STEPS), starts + 1
+        if trial.expansion.objective < best.expansion.objective:
             best = rescaled(trial)
     if not best.minimum.converged and budget > 0:
-        best = search("the best of them", best.values, best.posterior.noise_scale, budget)
+        best = search("the best of them", best.values, best.expansion.noise_scale, budget)
     minimum = best.minimum
     if not minimum.converged and best.misfit > FAR_OFF:
         passes = most_passes(likelihood.model) - budget

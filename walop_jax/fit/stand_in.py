@@ -12,7 +12,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.fit.verdict import Structure
 from walop_jax.likelihood.compressed import compressed
-from walop_jax.likelihood.frames import PixelPosterior, stands_for_pixels
+from walop_jax.likelihood.frames import PixelExpansion, stands_for_pixels
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.runner import Progress, Runner
 from walop_jax.model.specification import Model
@@ -24,11 +24,11 @@ way is left."""
 
 def on_field_points(result: FitResult) -> FitResult:
     """The same values and errors beside a set that stands for all pixels; any other fit is unchanged."""
-    if not isinstance(result.posterior, PixelPosterior):
+    if not isinstance(result.expansion, PixelExpansion):
         return result
-    likelihood = Likelihood.of(compressed(result.posterior), result.model, interpolate=False)
-    posterior = likelihood.expand(result.values, result.noise_scale)
-    return dataclasses.replace(result, likelihood=likelihood, posterior=posterior)
+    likelihood = Likelihood.of(compressed(result.expansion), result.model, interpolate=False)
+    expansion = likelihood.expand(result.values, result.noise_scale)
+    return dataclasses.replace(result, likelihood=likelihood, expansion=expansion)
 
 
 def in_field_points(
@@ -71,9 +71,9 @@ def with_pixels(result: FitResult) -> FitResult:
     beside = np.where(summed, 0, likelihood.used.sum(axis=0)) @ likelihood.data_per_row
     new = [result.model.parameters[i] for i in result.model.free]
     further = sum((p.prior is not None) - 1 for p in new if p.name not in compression.values)
-    data = compression.chi2 + result.posterior.data - before
+    data = compression.chi2 + result.expansion.data - before
     dof = compression.dof + round(float(beside)) + further
-    return dataclasses.replace(result, posterior=dataclasses.replace(result.posterior, data=data, dof=dof))
+    return dataclasses.replace(result, expansion=dataclasses.replace(result.expansion, data=data, dof=dof))
 
 
 def values_then(result: FitResult) -> Float[np.ndarray, " n"]:
@@ -100,4 +100,4 @@ def moved(result: FitResult) -> float:
     unseen = [source.name for source in model.template.sources if source.kind not in kinds]
     step = (result.values - values_then(result))[model.free]
     step[[model.parameters[i].part in unseen for i in model.free]] = 0.0
-    return float(np.sqrt(max(step @ result.posterior.matrix @ step, 0.0)))
+    return float(np.sqrt(max(step @ result.expansion.matrix @ step, 0.0)))

@@ -1,6 +1,6 @@
 """Files that appear whole or not at all: written beside their place, flushed to disk, then renamed.
 
-The temporary name tells for what, on which machine and by which process it was made, so that the next writer of the
+The temporary name has the purpose, the machine and the process by which it was made, so that the next writer of the
 same result can remove the remains of a killed one. Messages never show it: users have not chosen it.
 """
 

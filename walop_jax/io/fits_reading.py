@@ -3,7 +3,7 @@
 A file is read once from end to end: for its SHA-256, for the FITS checksums (Seaman, Pence & Rots 2012, an
 appendix of the FITS standard: the 32-bit words of an HDU, summed in ones' complement, are all ones), and
 for its length. astropy would check the sums too, but in small blocks, and would only warn. The sums find
-every damaged byte, but not two changes that cancel each other; the SHA-256 is what tells two files apart.
+every damaged byte, but not two changes that cancel each other; the SHA-256 is what distinguishes two files.
 
 Before astropy makes anything of the header cards, the sizes in them (number of axes, rows, columns, groups) are held
 against the length of the file: a count that is negative or beyond all bounds makes readers loop or ask for any amount

@@ -1,6 +1,6 @@
 """Folders of results: several files of one run, written by one process at a time.
 
-Whoever comes second is told at once who is writing there. The lock (flock) is the system's and ends with the process
+Whoever comes second learns at once who is writing there. The lock (flock) is the system's and ends with the process
 that holds it, however that ends. The file that it is on says who holds it, and goes when the lock is given back; a
 killed process leaves the file, without a lock on it.
 """
@@ -132,7 +132,7 @@ def output_folder(
 
 try:
     import fcntl
-except ImportError:  # a system without flock: two writers are not told of each other there
+except ImportError:  # a system without flock: two writers are not notified of each other there
     fcntl = None
 
 
@@ -140,7 +140,7 @@ except ImportError:  # a system without flock: two writers are not told of each 
 def locked(place: Path, output: object) -> Iterator[None]:
     """Hold the lock file `place` while the block writes `output`, the name that messages show.
 
-    Where the file system knows no locks, nothing is locked. Raises `DataError`, naming the holder, if another process
+    Where the file system has no locks, nothing is locked. Raises `DataError`, naming the holder, if another process
     (or another thread of this one) holds it.
     """
     descriptor = None

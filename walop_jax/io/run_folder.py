@@ -32,7 +32,7 @@ class RunFolder:
         if not self.folder.is_dir():
             raise fail("is not the folder of a run", file=self.folder, advice=OF_A_FIT)
         if name in (SUMMARY, PRODUCT) and name not in self and FAILED in self:
-            what = f"the fit of this run did not converge; {FAILED} says how it ended"
+            what = f"the fit of this run did not converge; its end is described in {FAILED}"
             raise fail(what, file=self.folder, advice="look at the data with walop-jax inspect, then refit")
         if name not in self:
             raise fail(f"holds no {name}", file=self.folder, advice=advice)

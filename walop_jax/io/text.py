@@ -106,11 +106,11 @@ _LARGEST = 1 << 24
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """The text of a file; `DataError`, with the name, if it is missing, beyond 16 MiB or not text in UTF-8."""
+    """The text of a file, without its byte-order mark; `DataError` if it is missing, beyond 16 MiB or not in UTF-8."""
     try:
         if check_input(path).stat().st_size > _LARGEST:
             raise fail("is larger than 16 MiB", file=path, advice="is this the right file?")
-        return Path(path).read_text(encoding="utf-8")
+        return Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
         raise fail(f"cannot be read: {error.strerror or error}", file=path) from None
     except UnicodeDecodeError:

@@ -96,7 +96,7 @@ class Reader:
         return value
 
     def values(self, hints: Table, table: Any, place: str) -> dict[str, Any]:
-        """The values of a table, each as the annotation of its key wants it; keys are those of `hints`."""
+        """The values of a table, each converted to the type annotated for its key; keys are those of `hints`."""
         self.known(self.table(table, place), hints, place)
         return {key: self.value(hints[key], value, key, place) for key, value in table.items()}
 

@@ -26,7 +26,7 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.frames import (
     FrameSums,
-    PixelPosterior,
+    PixelExpansion,
     Vector,
     half_gradient,
     information_of,
@@ -53,12 +53,12 @@ def _shares(edges: Vector) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "
     return np.concatenate(places), shares
 
 
-def compressed(posterior: PixelPosterior) -> CalibrationSet:
-    """The calibration set of field points that stands for all pixels, near the values of a posterior.
+def compressed(expansion: PixelExpansion) -> CalibrationSet:
+    """The calibration set of field points that stands for all pixels, near the values of an expansion.
 
     The rows of a table beside the frames are in it as they are.
     """
-    sums = posterior.sums
+    sums = expansion.sums
     cells, likelihood = sums.cells, sums.likelihood
     (s, over), (t, up) = (_shares(edges) for edges in cells.edges())
 
@@ -88,8 +88,8 @@ def compressed(posterior: PixelPosterior) -> CalibrationSet:
     names = [parameter.name for parameter in likelihood.model.parameters]
     record = Compression(
         pixels=cells.grid.pixels,
-        chi2=posterior.data,
-        dof=posterior.dof,
+        chi2=expansion.data,
+        dof=expansion.dof,
         values=dict(zip(names, sums.values.tolist(), strict=True)),
         frames=calset.inputs,
     )

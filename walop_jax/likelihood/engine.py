@@ -204,11 +204,13 @@ def _star_responses(
     return jax.vmap(at)(data)
 
 
-def unit_slopes(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e k n"]:
-    """Derivatives of the counts of one point for light of unit flux with respect to all parameters."""
-    derivatives = _linear_unit_counts(instrument, plan, point, None)
+def unit_slopes(
+    instrument: Instrument, plan: Plan, point: PointData
+) -> tuple[Float[Array, "e k"], Float[Array, "e k n"]]:
+    """Counts of one point for light of unit flux, and their derivatives with respect to all parameters."""
+    unit, plain, local = _linear_unit_counts(instrument, plan, point, None)
     basis = instrument.throughput.basis(*field_sites(instrument, point))
-    return to_all(instrument, derivatives.plain, derivatives.local, basis)
+    return unit, to_all(instrument, plain, local, basis)
 
 
 def _point_jacobian(

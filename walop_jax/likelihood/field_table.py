@@ -89,7 +89,7 @@ def _terms(count: int, total: bool) -> tuple[Int[np.ndarray, " t"], Int[np.ndarr
 def held_out(rectangle: Rectangle) -> tuple[Vector, Vector]:
     """Places at which a table is checked: the corners, the middles of the sides, and a spread of others.
 
-    The others follow the sequence of Roberts 2018 (multiples of 1/φ and 1/φ², φ³ = φ + 1), which meets no grid.
+    The others follow the sequence of Roberts 2018 (multiples of 1/φ and 1/φ², φ³ = φ + 1), which falls on no grid.
     """
     corners = [(a, b) for a in (0.0, 0.5, 1.0) for b in (0.0, 0.5, 1.0)]
     plastic = 1.324717957244746

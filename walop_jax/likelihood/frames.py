@@ -44,7 +44,7 @@ from walop_jax.data.records import Block
 from walop_jax.data.table_intensities import NEGATIVE
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import TOLERANCE, FieldTable, accurate_table, in_batches
-from walop_jax.likelihood.likelihood import Census, DataTerms, Likelihood, Matrix, OpticsUsed, Posterior
+from walop_jax.likelihood.likelihood import Census, DataTerms, Expansion, Likelihood, Matrix, OpticsUsed
 from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import compiled
@@ -262,7 +262,7 @@ def unit_slopes_at(
     likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector
 ) -> Float[np.ndarray, "p e k a"]:
     """Derivatives of the counts for light of unit flux with respect to all parameters, at field positions (deg)."""
-    return _at(_slopes, likelihood, instrument, x, y)
+    return _at(_slopes, likelihood, instrument, x, y)[1]
 
 
 def _at(solve: Any, likelihood: Likelihood, instrument: Instrument, x: Vector, y: Vector) -> Any:
@@ -455,15 +455,15 @@ NODES = 24  # per side for the matrix: products of two derivatives, of degree 11
 
 
 @dataclasses.dataclass(frozen=True)
-class PixelPosterior(Posterior):
-    """The posterior of all pixels, or of some strips of them, and the sums that it was made from."""
+class PixelExpansion(Expansion):
+    """The expansion of all pixels, or of some strips of them, and the sums that it was made from."""
 
     sums: FrameSums
 
 
 def expand_pixels(
     likelihood: Likelihood, values: Vector, noise_scale: float = 1.0, every: int = 1
-) -> PixelPosterior:
+) -> PixelExpansion:
     """As `Likelihood.expand`, by one pass over all pixels of frames, or over one strip in `every`.
 
     A table beside the frames is expanded row by row.
@@ -476,8 +476,8 @@ def expand_pixels(
     beside = without_frames(likelihood.calset)
     if beside is not None:
         terms = terms.joined(Likelihood.of(beside, likelihood.model).data_terms(values)[0])
-    plain = likelihood.posterior(values, terms, noise_scale, sums.optics)
-    return PixelPosterior(**{f.name: getattr(plain, f.name) for f in dataclasses.fields(plain)}, sums=sums)
+    plain = likelihood.expanded(values, terms, noise_scale, sums.optics)
+    return PixelExpansion(**{f.name: getattr(plain, f.name) for f in dataclasses.fields(plain)}, sums=sums)
 
 
 def in_blocks(values: Float[np.ndarray, "... r c"], side: int) -> Float[np.ndarray, "... q d"]:

@@ -83,7 +83,7 @@ class OpticsUsed(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Posterior:
+class Expansion:
     """χ² of data and priors at a point of parameter space, and its expansion there in the free parameters.
 
     `gradient` is half the gradient of the total and `matrix` half its Gauss–Newton Hessian, both with the
@@ -167,7 +167,7 @@ class Likelihood:
     Field points are handled in batches of equal size, so that a set larger than memory goes through the same code
     (`likelihood/layout.py`), several of them at a time (`likelihood/runner.py`). Where `layout` says so, `expand`
     and `residuals` solve the optics on Chebyshev nodes only (`likelihood/field_table.py`). Immutable: what a pass
-    finds out beside its sums comes back with them (`Posterior`).
+    finds out beside its sums comes back with them (`Expansion`).
 
     >>> values, residual = result.likelihood.residuals(result.values)
     >>> residual.shape  # point, exposure, camera
@@ -258,7 +258,7 @@ class Likelihood:
         return precision[self.model.free]
 
     def nodes(
-        self, instrument: Instrument, near: Posterior | None = None
+        self, instrument: Instrument, near: Expansion | None = None
     ) -> tuple[FieldTable | None, OpticsUsed]:
         """The optics on nodes of the field, and how accurate; None where they are to be solved point by point.
 
@@ -272,9 +272,9 @@ class Likelihood:
         nodes, error = accurate_nodes(instrument, self.plan, self.layout.rectangle, scale, hint)
         return (None, OpticsUsed(None)) if nodes is None else (nodes, OpticsUsed(nodes.count, error))
 
-    # -------------------------------------------------------------------------------------- the posterior
+    # -------------------------------------------------------------------------------------- the expansion
 
-    def expand(self, values: Vector, noise_scale: float = 1.0, near: Posterior | None = None) -> Posterior:
+    def expand(self, values: Vector, noise_scale: float = 1.0, near: Expansion | None = None) -> Expansion:
         """χ² and its quadratic expansion at a full vector of parameter values.
 
         `noise_scale` multiplies the errors of the data (not the priors'): above 1 it stands for what the
@@ -282,9 +282,9 @@ class Likelihood:
         """
         values = np.asarray(values, float)
         terms, optics = self.data_terms(values, near)
-        return self.posterior(values, terms, noise_scale, optics)
+        return self.expanded(values, terms, noise_scale, optics)
 
-    def data_terms(self, values: Vector, near: Posterior | None = None) -> tuple[DataTerms, OpticsUsed]:
+    def data_terms(self, values: Vector, near: Expansion | None = None) -> tuple[DataTerms, OpticsUsed]:
         """Terms of the data at a full vector of parameter values; `near` as for `expand`."""
         instrument = self.model.instrument(values)
         nodes, optics = self.nodes(instrument, near)
@@ -295,17 +295,15 @@ class Likelihood:
 
         return self._joined("χ², gradient and matrix", of_batch), optics
 
-    def posterior(
-        self, values: Vector, terms: DataTerms, noise_scale: float, optics: OpticsUsed
-    ) -> Posterior:
-        """The posterior from the terms of the data."""
+    def expanded(self, values: Vector, terms: DataTerms, noise_scale: float, optics: OpticsUsed) -> Expansion:
+        """The expansion from the terms of the data."""
         rows, select, pull = self.priors, self.model.selection(), self.priors.residuals(values)
         gradient = terms.gradient / noise_scale**2
         gradient[rows.index] += pull / rows.width
         matrix = terms.matrix / noise_scale**2
         matrix[rows.index, rows.index] += rows.width**-2
         matrix = select.T @ matrix @ select
-        return Posterior(
+        return Expansion(
             data=terms.data,
             priors=float(np.sum(pull[rows.known] ** 2)),
             loose=float(np.sum(pull[~rows.known] ** 2)),

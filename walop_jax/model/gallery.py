@@ -81,7 +81,7 @@ def _effect(effect: EffectKind) -> Iterator[str]:
         yield f"In a run of {gallery['plan']}:"
         yield "\n".join(_sizes(entry))
     if effect.separated_by:
-        yield f"**Told apart by** {effect.separated_by}."
+        yield f"**Separated by** {effect.separated_by}."
     if effect.reference and "\nSource" not in head:
         yield f"Source: {effect.reference}."
 
@@ -124,7 +124,7 @@ def _element(kind: type[Element]) -> Iterator[str]:
     )
     changed = [effect.name for effect in EFFECTS if kind.kind and kind.kind in effect.head().lower()]
     if changed:
-        yield f"Effects that speak of it: {', '.join(f'`{name}`' for name in changed)}."
+        yield f"Effects that name it: {', '.join(f'`{name}`' for name in changed)}."
     if kind.reference and "\nSource" not in head:
         yield f"Source: {kind.reference}."
 

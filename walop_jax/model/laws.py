@@ -156,7 +156,7 @@ def laws_of(tables: Mapping[str, Any]) -> dict[str, Law]:
     for name, entry in tables.items():
         place = f'law."{name}"'
         if not isinstance(entry, Mapping):
-            raise read.fault(place, "must be a table; names with dots stand in quotes")
+            raise read.fault(place, "must be a table; put names with dots in quotes")
         alone = {key: (entry[key],) for key in ("per", "at") if isinstance(entry.get(key), str | int | float)}
         values = read.values(hints, {**entry, **alone}, place)
         try:

@@ -28,6 +28,7 @@ Limits      At normal incidence a plate of air indices is the identity; 𝐄 of 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -167,8 +168,7 @@ def stack_jones(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real)
     """
     if not plates:
         raise ValueError("a stack needs at least one plate")
-    if any(plate.cut is not None for plate in plates):
-        plates = tuple(p if p.cut is not None else p._replace(cut=jnp.zeros(())) for p in plates)
+    (plates,) = alike([plates])
     dimensions = max(map(jnp.ndim, (sx, sy, wavelength, *jax.tree.leaves(plates))))
     sx, sy, _ = jnp.broadcast_arrays(sx, sy, jnp.zeros((1,) * dimensions))
     crystals = jax.tree.map(lambda *values: _stacked(values, dimensions), *plates)
@@ -184,6 +184,15 @@ def stack_jones(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real)
     for turn, face in zip(turns, jnp.moveaxis(faces[:, :, 1:], 2, 0), strict=True):
         jones = product2(face, jnp.stack(jnp.broadcast_arrays(jones[0], turn * jones[1])))
     return jones
+
+
+def alike(stacks: Sequence[tuple[Plate, ...]]) -> list[tuple[Plate, ...]]:
+    """Stacks whose plates all have a cut, or none: the same arrays in every plate."""
+    if all(plate.cut is None for stack in stacks for plate in stack):
+        return list(stacks)
+    return [
+        tuple(p if p.cut is not None else p._replace(cut=jnp.zeros(())) for p in stack) for stack in stacks
+    ]
 
 
 def _stacked(values: tuple[Real, ...], dimensions: int) -> Real:

@@ -284,7 +284,7 @@ def with_effects(
     for effect in active:
         for text in sentences.intersection(effect.stated):
             raise ValueError(
-                f"effect {effect.name!r} is the number that {text!r} adds to: leave one of them out"
+                f"effect {effect.name!r} and {text!r} change the same number: leave one of them out"
             )
     instrument = dataclasses.replace(model.template, effects=in_order(active))
     # An effect that does not fit the instrument is an error here.

@@ -50,9 +50,9 @@ class Break:
     `night` is the first night that it holds for (MJD of the evening), `nights` the first and last that this may be.
     `before` and `after` are the last exposure before the change and the first after it (MJD), NaN for a drift; of a bad
     night they lie half-way to the nights beside it. `p_value` is corrected for all that was tried. `alike` are names
-    that explain the same as well, `separated_by` observations that would tell, `nights_needed` how many more nights
-    like these would (0: they are told, inf: none would). `held_out` is the gain in χ² on every other night by the size
-    that the rest give: more than 0 if it is real.
+    that explain the same as well, `separated_by` observations that would separate them, `nights_needed` how many more
+    nights like these would (0: they are separated, inf: none would). `held_out` is the gain in χ² on every other night
+    by the size that the rest give: more than 0 if it is real.
     """
 
     kind: str

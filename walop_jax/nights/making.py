@@ -80,7 +80,7 @@ class Made(NamedTuple):
     source: str = ""
     sketch: frozenset[int] = frozenset()
     error: DataError | None = None
-    """Why there are no nights of data that have been read: copies of other data are told first."""
+    """Why there are no nights of data that have been read: copies of other data first."""
 
 
 @dataclasses.dataclass
@@ -101,7 +101,7 @@ class Maker:
     def _first(self, data: Data) -> Made:
         if self.like is None:
             raise fail(
-                f"{source_of(data.read())} is a set, and nothing says at which values to linearise it",
+                f"{source_of(data.read())} is a set, and there are no values at which to linearise it",
                 advice="give --like RUN, a fit of the same model (like= in Python)",
             )
         place = None

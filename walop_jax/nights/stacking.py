@@ -342,7 +342,7 @@ def _undetermined(data: Together, error: UndeterminedError) -> DataError:
         )
     number = data.nights[error.unit].number
     return fail(
-        f"the night of MJD {number} says nothing of {name}, which has a value of its own there",
+        f"the night of MJD {number} has no information on {name}, which has a value of its own there",
         advice="give its law a spread, or let it be shared",
     )
 

@@ -118,9 +118,7 @@ class Survey(Drawn):
             against.append(Doubt(Quality.UNEXPLAINED, f"{statement}: the laws do not explain the nights"))
         if scattered := [str(nights[u].number) for u in np.flatnonzero(self.excess > SUSPECT)]:
             listed = ", ".join(scattered[:5]) + (" …" if len(scattered) > 5 else "")
-            what = (
-                f"{len(scattered)} of {len(nights)} nights scatter more than their errors say: MJD {listed}"
-            )
+            what = f"{len(scattered)} of {len(nights)} nights scatter more than their errors: MJD {listed}"
             against.append(Doubt(Quality.DOUBTED, what))
         structure = NO_STRUCTURE if self.like is None else self.like.verdict.structure
         n_data = sum(night.n_data for night in nights)
@@ -382,13 +380,13 @@ class Survey(Drawn):
         for case in self.breaks:
             if case.alike:
                 needed = (
-                    "no more nights like these would tell" if math.isinf(case.nights_needed)
+                    "no more nights like these would separate them" if math.isinf(case.nights_needed)
                     else f"{'or ' if case.separated_by else ''}{case.nights_needed:.0f} more nights like these"
                 )  # fmt: skip
                 names = ", ".join(case.alike[:3]) + (" …" if len(case.alike) > 3 else "")
                 how = "; ".join((*case.separated_by, needed))
                 sentences.append(
-                    f"MJD {case.night}: {case.name} cannot be told from {names}. To separate them: {how}."
+                    f"MJD {case.night}: {case.name} cannot be separated from {names}. To separate them: {how}."
                 )
         return (*sentences, f"Calibrate again before MJD {self.until:.1f}.")
 

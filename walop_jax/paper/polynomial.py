@@ -280,7 +280,7 @@ def _smooth_fit(
 ) -> tuple[float, Float[np.ndarray, " 2"], float, Float[np.ndarray, " 2"]]:
     """Weighted fit of s R + c: s, c, χ²/dof and the mean of R.
 
-    The gradient of R over 35′ is small beside its mean, so s and c are told apart only weakly; a pull of s to
+    The gradient of R over 35′ is small beside its mean, so s and c are separated only weakly; a pull of s to
     the value of the means, |<q, u>| / |<R>| ± 1, keeps it in bounds.
     """
     good = np.isfinite(qu).all(axis=1)

@@ -213,7 +213,9 @@ class Available:
             return (), []
         plan, what = self.plan, "Moon patches" if kind == "moon" else "standards"
         if not plan.site.known:
-            return (), [f"{what} are left out: the site is not known; the description says it under [site]"]
+            return (), [
+                f"{what} are left out: the site is not known; give it in the description, under [site]"
+            ]
         e = dataclasses.replace(
             plan,
             stops=tuple(Stop(None, plan.filter_names[0], kind=kind, number=i) for i in range(total)),

@@ -6,9 +6,9 @@ Error of p   of stars behind the calibration alone: δ(q, u) = −M⁻¹ (δm₁
              `SMALLEST_DETERMINANT` one exposure holds no u, and no plan of calibrations brings it back.
 Parameter    its variance, e.g. `collimator.curvature`.
 Stars        the error of p of the stars of a table.
-Apart        effects, whichever is there told from every other. Truth i of a known size, rival j with sizes and shapes
-             of its own, and the calibration are fitted together; the rival that does its best stays Δχ² = 1 / φ away, φ
-             the variance of the size of i in its units. The least √Δχ² of all pairs is made largest.
+Apart        effects, whichever is there separated from every other. Truth i of a known size, rival j with sizes and
+             shapes of its own, and the calibration are fitted together; the rival that does its best stays Δχ² = 1 / φ
+             away, φ the variance of the size of i in its units. The least √Δχ² of all pairs is made largest.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class Criterion:
     """Linear functions of the parameters, `targets` (draw, target, parameter, column), and what their variance says.
 
     `unit` is that of the root of the largest variance, after `scale`; `what` describes it. `inverse`: its
-    reciprocal is told, in standard deviations. `blocks` (pair, parameter, own) lead from the parameters of each pair to
-    those of the candidates; targets are then one after the other for the pairs of each draw.
+    reciprocal is given, in standard deviations. `blocks` (pair, parameter, own) lead from the parameters of each pair
+    to those of the candidates; targets are then one after the other for the pairs of each draw.
     """
 
     name: str
@@ -63,12 +63,12 @@ class Criterion:
     blocks: Float[np.ndarray, "b f n"] | None = None
 
     def reported(self, variance: float) -> float:
-        """The number that is told for a value of the criterion."""
+        """The number that is given for a value of the criterion."""
         root = self.scale * float(np.sqrt(variance))
         return 1.0 / root if self.inverse else root
 
     def variance(self, told: float) -> float:
-        """The value of the criterion for a number that is told."""
+        """The value of the criterion for a number that is given."""
         return float(((1.0 / told if self.inverse else told) / self.scale) ** 2)
 
 

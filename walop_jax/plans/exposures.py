@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
@@ -34,8 +34,6 @@ from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind, effect_by_name
-from walop_jax.model.instrument import Instrument
-from walop_jax.model.plan import Plan
 from walop_jax.model.specification import Model, effect_context, with_effects
 from walop_jax.plans.available import PLATE_TURN, Available, CandidateExposure
 from walop_jax.plans.families import Family, Listed, even_angles, harmonics, highest, spread_angles
@@ -51,7 +49,7 @@ from walop_jax.simulation.simulate import (
 
 NODES, NODES_OF_EFFECTS, NODES_OF_PLATE = 7, 13, 25
 """Angles of the polariser at which counts are computed: a series of degree 3 in 2θ, one more than it needs.
-Effects that are to be told apart may depend on θ itself, which takes a whole turn. Beams that cross the plate at an
+Effects that are to be separated may depend on θ itself, which takes a whole turn. Beams that cross the plate at an
 angle make series of degree 12 in 2α."""
 ANGLES = 361
 """Angles over half a turn at which the gain of an exposure is known, as a Fourier series in 2θ.
@@ -74,8 +72,8 @@ class Candidates:
     `families` go with `choices`, their information scaled to the field points of the plan. `values` (draw, parameter)
     are all parameters of the instruments that were drawn, `prior` the information on the free ones beforehand, `names`
     of these. `truncation` is the largest error of the information between the angles that were computed, in units of
-    the mean diagonal of each parameter; `notes` say what had to be left out. `effects` are those that are to be told
-    apart, parameters of the model as well, with whether their size is known.
+    the mean diagonal of each parameter; `notes` say what had to be left out. `effects` are those that are to be
+    separated, parameters of the model as well, with whether their size is known.
     """
 
     available: Available
@@ -241,11 +239,7 @@ def drawn(model: Model, draws: int, seed: int, around: Calibration | None) -> Fl
     return np.stack(samples)
 
 
-def _unit(instrument: Instrument, plan: Plan, point: engine.PointData) -> tuple[Array, Array]:
-    return engine.point_prediction(instrument, plan, point), engine.unit_slopes(instrument, plan, point)
-
-
-_unit_at = compiled(jax.vmap(_unit, (None, None, 0)), kept_as="unit_counts")
+_unit_at = compiled(jax.vmap(engine.unit_slopes, (None, None, 0)), kept_as="unit_counts")
 
 
 def _responses(

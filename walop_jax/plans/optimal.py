@@ -386,7 +386,7 @@ def optimise(
 ) -> Allocation:
     """The plan with the least criterion, to a proven relative `gap`, and the proof.
 
-    `progress` is told value, bound and gap of every round.
+    `progress` gets value, bound and gap of every round.
     Raises NotEstimableError for a target that nothing informs about, ValueError for a budget that is not positive. The
     gap that was reached is `Allocation.gap`: larger than asked for only if rounding errors end the search.
     """

@@ -7,7 +7,7 @@ Plate        Where it may stand at any angle the bound holds for all of them; ex
              best weights use most, as many as are worth their changes.
 Order        Settings one after the other, the polariser turning one way in each, then the sky, the nearest pointing
              next. Changes of filter, moving elements and pointing take time from the budget; whether a setting is worth
-             its change is tried. The bound knows of no changes, and holds for every order.
+             its change is tried. The bound ignores changes, and holds for every order.
 """
 
 from __future__ import annotations
@@ -251,8 +251,8 @@ def plan_exposures(
 ) -> ExposurePlan:
     """The calibration exposures of `minutes` that make a criterion (`criteria`) best.
 
-    `known` is a calibration that is there already; `goal` a value of the criterion, as it is told, to which the time
-    is found. `apart` are effects that are to be told apart (`criteria.APART`), each with its value or by name alone, of
+    `known` is a calibration that is there already; `goal` a value of the criterion, as it is given, to which the time
+    is found. `apart` are effects that are to be separated (`criteria.APART`), each with its value or by name alone, of
     the `catalogue`; their goal is `NAMED` unless another is given. Raises ValueError as `check_wishes` and for a time
     that pays for nothing, NotEstimableError where nothing that could be observed, or too little in that time,
     determines the criterion.
@@ -310,7 +310,7 @@ def plan_from(
     except NotEstimableError:
         missing = [k for k in ("moon", "standard") if not any(c.kind == k for c in found.choices)]
         advice = f"; no {' or '.join(missing)} exposures could be taken" if missing else ""
-        reason = f"{criterion.what}: nothing that could be observed says more of it than is known"
+        reason = f"{criterion.what}: no possible exposure adds information on it"
         raise NotEstimableError("; ".join((f"{reason}{advice}", *found.notes))) from None
     best, lines, chosen, experiment = _at_few_angles(
         found, weights, lambda part: experiment_of(part, minutes, criterion, known), gap

@@ -30,7 +30,7 @@ DRAWS = 200  # of a posterior, that stand for it in matrices
 INFLATION = "noise.ln_f"
 _AGAIN = "run walop-jax sample again"
 
-A_MEAN = "is the mean over what its data cannot tell apart, and no fit of one model"
+A_MEAN = "is the mean over models that its data cannot separate, and no fit of a single one"
 """Said of a calibration that cannot be sampled."""
 
 
@@ -66,7 +66,7 @@ def digest(*items: Any) -> str:
 
 
 def digest_of_fit(inputs: Sequence[InputFile], names: Sequence[str], values: np.ndarray) -> str:
-    """Digest that tells a fit from all others: of its data, its parameters and their values, to the last bit."""
+    """Digest that identifies a fit: of its data, its parameters and their values, to the last bit."""
     return digest(sorted(entry.sha256 for entry in inputs), list(names), np.asarray(values, float))
 
 

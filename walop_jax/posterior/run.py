@@ -118,7 +118,7 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
         raise fail(
             f"cannot be found, neither from {Path.cwd()} nor beside {self.folder}",
             file=path,
-            advice="say where it is (--data FILE, for each set of the fit), or copy it into the folder of the run",
+            advice="give its place (--data FILE, for each set of the fit), or copy it into the folder of the run",
         )
 
     def fit(self, model_text: str | None = None) -> FitResult:

@@ -210,7 +210,7 @@ def sample(
     report = report or (lambda progress: None)
     if result.errors_from != STATED:
         stated = dataclasses.replace(
-            result, covariance=covariance(result.model, result.posterior), errors_from=STATED
+            result, covariance=covariance(result.model, result.expansion), errors_from=STATED
         )
         as_stated = sample(stated, options, folder=folder, resume=resume, report=report)
         return sandwich_adjusted(

@@ -40,7 +40,7 @@ class Target:
     """−2 ln posterior of a fitted model in its free parameters x, around the fit at `centre`."""
 
     def __init__(self, result: FitResult) -> None:
-        self.likelihood, self._near = result.likelihood, result.posterior
+        self.likelihood, self._near = result.likelihood, result.expansion
         self.model = result.model
         self.free = result.model.free
         self.centre: Vector = np.asarray(result.values)[self.free]

@@ -41,7 +41,7 @@ LABELS = 0.55  # inches of a panel that its title and numbers take, at any size
 DIVERGING = "RdBu_r"
 SEQUENTIAL = "viridis"
 PLATES = {"half1.plate": "HWP1", "half2.plate": "HWP2"}
-BEFORE = "#b2182b"  # dark enough to be told from AFTER in grey as well; both are ends of DIVERGING
+BEFORE = "#b2182b"  # dark enough to differ from AFTER in grey as well; both are ends of DIVERGING
 AFTER = "#2166ac"
 QUIET = "0.8"
 ABOVE: Any = "outside upper center"  # of a legend
@@ -325,6 +325,7 @@ def calendar(axis: Axes, mjd: Any) -> bool:
     locator = AutoDateLocator(minticks=3, maxticks=7)
     axis.xaxis.set_major_locator(locator)
     axis.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+    axis.xaxis.get_offset_text().set_fontsize(FONT)
     axis.set_xlabel("date (UTC)", fontsize=FONT)
     return True
 

@@ -96,7 +96,7 @@ def apply(
 ) -> Stars:
     """Stokes parameters of all stars of a catalogue.
 
-    `progress` is told how many rows of how many are done. Raises `DataError` for an unknown filter, for a
+    `progress` gets how many rows of how many are done. Raises `DataError` for an unknown filter, for a
     catalogue with more optical settings than can be tabulated, and, unless `force` is given, for settings that the
     calibration does not cover (`check_validity`).
     """
@@ -419,7 +419,7 @@ class _Application:
     ) -> tuple[Float[np.ndarray, "s 2 2"], Bool[np.ndarray, " s"]]:
         """Effect of the changes on stars, and which of them lie at one of the places.
 
-        The largest, in q and in u, of the changes that cannot be told apart.
+        The largest, in q and in u, of the changes that cannot be separated.
         """
         points, fitted = self.catalogue.points, block.found
         cameras = self.vectors.instrument.cameras.names

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Collection, Sequence
 
@@ -12,7 +13,16 @@ from jaxtyping import Bool, Float, Int
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, plain_column
 from walop_jax.data.table_intensities import equal_rows
 from walop_jax.data.units import Place
-from walop_jax.data.user_tables import OF_STARS, InputTable, numeric_column, refuse_rounded, vector_columns
+from walop_jax.data.user_tables import (
+    OF_STARS,
+    InputTable,
+    column_of_stars,
+    numeric_column,
+    refuse_rounded,
+    sky_positions,
+    spellings,
+    vector_columns,
+)
 from walop_jax.io.errors import rows_text
 from walop_jax.model.instrument import Instrument
 from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
@@ -106,7 +116,8 @@ def read_catalogue(
         missing = rows_text(np.flatnonzero(~on_sky))
         source.remarks.append(f"ROTATOR is missing in {missing}: these are in the frame of the instrument")
     sky = None
-    if {"SKY", "SKY0", "SKY_0"} & set(source.names):
+    of_sky = itertools.chain(*spellings("SKY", cameras, instrument.cameras.names))
+    if not set(source.names).isdisjoint(of_sky):
         (sky,) = vector_columns(source, ("SKY",), rule, instrument.cameras.names)
         place.refuse(sky < 0, "is below 0", "SKY", "the level of the sky that was subtracted, in electrons")
     copy, repeated = _copies(source, points, counts, sigma, rotator, star)
@@ -136,23 +147,15 @@ def _with_colours(
 ) -> tuple[FieldPoints, Float[np.ndarray, " n"]]:
     """Field points with the temperatures that BP_RP gives where there is no TEFF, and the errors of all of them (K)."""
     source.used.update(set(CARRIED) & set(source.names))
-    columns = {name: Column("float", unit, missing=np.nan) for name, (unit, _) in OF_STARS.items()}
-
-    def numbers(name: str) -> Float[np.ndarray, " n"]:
-        return (
-            numeric_column(source, name, columns[name])
-            if name in source.names
-            else np.full(source.rows, np.nan)
-        )
-
-    teff, error = points.settings.teff, np.nan_to_num(numbers("TEFF_ERR"))
+    source.lacking.update({"SOURCE_ID"} - set(source.names))
+    teff, error = points.settings.teff, np.nan_to_num(column_of_stars(source, "TEFF_ERR"))
     place.refuse(error < 0, "is below 0", "TEFF_ERR", "standard errors in K")
     error = np.where(np.isnan(teff), 0.0, error)
-    colour = numbers("BP_RP")
-    from_colour = np.isnan(teff) & np.isfinite(colour)
+    colour = np.where(np.isnan(teff), column_of_stars(source, "BP_RP"), np.nan)
+    from_colour = np.isfinite(colour)
     if not from_colour.any():
         return points, error
-    temperature, off = temperature_of(np.where(from_colour, colour, np.nan), numbers("BP_RP_ERR"))
+    temperature, off = temperature_of(colour, column_of_stars(source, "BP_RP_ERR"))
     within = np.isfinite(temperature)
     source.remarks.append(f"TEFF of {int(within.sum())} rows is made of BP_RP ({SOURCE})")
     if beyond := int(np.sum(from_colour & ~within)):
@@ -259,10 +262,8 @@ def _numbered(
 
 def _by_position(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n"]:
     """Numbers of stars by RA and DEC: rows within `SAME_PLACE` that are not of one exposure are one star."""
-    ra, dec, time = (
-        numeric_column(source, name, Column("float", unit, missing=np.nan))
-        for name, unit in (("RA", "deg"), ("DEC", "deg"), ("MJD", "d"))
-    )
+    ra, dec = sky_positions(source)
+    time = numeric_column(source, "MJD", Column("float", "d", missing=np.nan))
     located = np.isfinite(ra) & np.isfinite(dec)
     name = np.zeros(len(ra), int)
     name[located] = same_stars(ra[located], dec[located], SAME_PLACE)

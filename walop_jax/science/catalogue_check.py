@@ -11,7 +11,7 @@ changes     the mean residual of every camera and how it grows with X, Y, time a
 
 One correction for all of them: the chance is `ALARM` that noise raises any. Where analysers split the light in two,
 stars of a single exposure can hardly tell the cameras of an arm, or one arm brighter from the other fainter: what
-describes the data as well (Δχ² < `RIVAL`) is told together.
+describes the data as well (Δχ² < `RIVAL`) is reported together.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ class CatalogueCheck:
             assert self.rows is not None
             texts.append(
                 f"the rows of a star agree more than independent rows do: together their variance is {self.rows:.3g} "
-                "times what N_ERR says. Are rows there twice, or is their noise correlated? Photon errors of stars of "
+                "times N_ERR. Are rows there twice, or is their noise correlated? Photon errors of stars of "
                 f"several rows were multiplied by {np.sqrt(self.scale[1]):.3g}"
             )
         if self.noise_is_off:

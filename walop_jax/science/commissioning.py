@@ -19,7 +19,11 @@ from walop_jax.science.field_accuracy import FieldAccuracy, Requirement
 def requirements(
     verdict: Verdict, message: str, accuracy: FieldAccuracy | None, calset: CalibrationSet | None
 ) -> tuple[Requirement, ...]:
-    """Requirements on a fit with its verdict; `accuracy` is that of p over the field, `calset` its data, if known."""
+    """Requirements on a fit with its verdict; `accuracy` is that of p over the field, `calset` its data, if known.
+
+    The accuracy of a fit that is not trusted is not known: nothing is required of it.
+    """
+    blocking = [doubt.sentence for doubt in verdict.against if doubt.blocking and doubt.sentence]
     checks = [
         Requirement(
             "the fit has reached its minimum", verdict.converged, message or "converged",
@@ -27,11 +31,11 @@ def requirements(
         ),
         Requirement(
             "the model explains the data", verdict.trusted,
-            "trusted" if verdict.trusted else "; ".join(verdict.warnings) or "not trusted",
+            "trusted" if verdict.trusted else [*blocking, *verdict.warnings, "not trusted"][0],
             "walop-jax diagnose looks for missing effects",
         ),
     ]  # fmt: skip
-    if accuracy is not None:
+    if accuracy is not None and verdict.trusted:
         checks += [accuracy.middle, *accuracy.requirements]
     for finding in () if calset is None else inspect(calset).findings:
         fault = finding.severity == "fault"
@@ -54,7 +58,11 @@ def requirement_rows(asked: Sequence[Requirement]) -> tuple[tuple[str, str, str]
 def requirement_advice(asked: Sequence[Requirement]) -> tuple[str, ...]:
     """Advice on requirements that are not met, the needed ones first."""
     ordered = sorted(asked, key=lambda need: not need.needed)
-    return tuple(f"{need.found}: {need.advice}" for need in ordered if not need.met)
+    return tuple(
+        need.found if need.advice in need.found else f"{need.found}: {need.advice}"
+        for need in ordered
+        if not need.met
+    )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

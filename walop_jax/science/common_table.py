@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.schema import Column
-from walop_jax.data.user_tables import InputTable, numeric_column, read_input_table
+from walop_jax.data.user_tables import InputTable, numeric_column, read_input_table, sky_positions
 from walop_jax.io.errors import fail
 from walop_jax.io.plain_tables import astropy_table, faults_of_ucds
 from walop_jax.sky.directions import designations, galactic
@@ -103,16 +103,10 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
     Raises `DataError` where RA, DEC or a column of `apply` is missing.
     """
     present = source.names
-    for name, why in (("RA", "the sky"), ("DEC", "the sky"), ("QU_PHOTON", "walop-jax apply")):
+    of_sky = "give RA and DEC of the stars to apply (walop-jax gather does)"
+    for name, advice in (("RA", of_sky), ("DEC", of_sky), ("QU_PHOTON", "it comes from walop-jax apply")):
         if name not in present:
-            advice = (
-                "give RA and DEC of the stars to apply (walop-jax gather does)"
-                if why == "the sky"
-                else "apply anew"
-            )
-            raise fail(
-                "the column is missing: it comes from " + why, file=source.path, column=name, advice=advice
-            )
+            raise fail("the column is missing", file=source.path, column=name, advice=advice)
 
     def number(name: str) -> np.ndarray:
         return numeric_column(source, name, Column("float", UNITS.get(name, ""), missing=np.nan))
@@ -122,19 +116,24 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
         for name in ("Q", "U", "Q_ERR", "U_ERR", "QU_COV", "Q_PHOTON", "U_PHOTON", "QU_PHOTON")
     }
     rotator = number("ROTATOR")
+    every_ra, every_dec = sky_positions(source)
     good = np.isfinite(values["Q"]) & np.isfinite(values["U"])
+    placed = np.isfinite(every_ra) & np.isfinite(every_dec)
     sky = np.isfinite(rotator)
     key = np.stack([*values.values(), number("CHI2"), number("NROWS")], axis=1)
     first = np.unique(key, axis=0, return_index=True)[1]
-    keep = np.sort(first[(good & sky)[first]])
+    keep = np.sort(first[(good & sky & placed)[first]])
     remarks = []
     if not keep.size:
-        raise fail("has no star with a result on the sky", file=source.path, advice="give ROTATOR to apply")
+        what, advice = "has no star with a result on the sky", "give ROTATOR, RA and DEC to apply"
+        raise fail(what, file=source.path, advice=advice)
     if lost := int(np.sum(~good)):
         remarks.append(f"{lost} rows without a result are left out")
+    if unplaced := int(np.sum(good & ~placed)):
+        remarks.append(f"{unplaced} rows without RA and DEC are left out")
     if inside := int(np.sum(good & ~sky)):
         remarks.append(f"{inside} rows in the frame of the instrument (no ROTATOR) are left out")
-    ra, dec = number("RA")[keep], number("DEC")[keep]
+    ra, dec = np.mod(every_ra[keep], 360.0), every_dec[keep]
     remarks += _about_north(ra, dec, rotator[keep])
     rows = {name: column[keep] for name, column in values.items()}
     qu = np.stack([rows["Q"], rows["U"]], axis=1)
@@ -145,7 +144,7 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
     cells: dict[str, np.ndarray] = {
         "Name": designations(ra, dec), "GLON": longitude, "GLAT": latitude,
         "Inst": np.full(len(keep), str(source.table.meta.get("INSTRUME", "WALOP"))),
-        "PA_gal": np.mod(number("EVPA")[keep] - north, 180.0),
+        "RAJ2000": ra, "DEJ2000": dec, "PA_gal": np.mod(number("EVPA")[keep] - north, 180.0),
     }  # fmt: skip
     if "MJD" in present and np.isfinite(number("MJD")[keep]).any():
         cells["JD"] = number("MJD")[keep] + MJD_ZERO
@@ -156,11 +155,11 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
         cells[f"q{end}"], cells[f"u{end}"] = pair.T
     for name, entry in COLUMNS.items():
         if name == "Filter":
-            rule = Column("str", missing="SDSS-r")
-            cells[name] = numeric_column(source, entry.of, rule)[keep]
+            cells[name] = numeric_column(source, entry.of, Column("str", missing="SDSS-r"))[keep]
         elif name == "GaiaID" and entry.of in present:
-            cells[name] = np.asarray(source.table.columns[present.index(entry.of)])[keep]
-        elif entry.of in present:
+            identity = np.ma.asarray(source.table.columns[present.index(entry.of)])[keep]
+            cells[name] = np.ma.filled(identity, -1 if identity.dtype.kind in "iu" else "")
+        elif entry.of in present and name not in cells:
             column = number(entry.of)[keep]
             cells[name] = column.astype(np.int64) if name in _WHOLE else column
     columns = {
@@ -235,6 +234,9 @@ def _wrong_numbers(table: Any) -> tuple[str, ...]:
         for name in COLUMNS
         if name in table.colnames and name not in texts
     }
+    beyond = ~((np.abs(c["RAJ2000"]) <= 360.0) & (np.abs(c["DEJ2000"]) <= 90.0))
+    if beyond.any():
+        return (f"RAJ2000, DEJ2000: no direction in degrees{_counted(beyond)}",)
     qu, p = np.stack([c["q"], c["u"]], axis=1), np.hypot(c["q"], c["u"])
     longitude, latitude, north = galactic(c["RAJ2000"], c["DEJ2000"])
     turned, _ = to_galactic(qu, np.zeros((len(qu), 2, 2)), north)
@@ -258,11 +260,11 @@ def _wrong_numbers(table: Any) -> tuple[str, ...]:
         + np.abs(c["GLAT"] - latitude)
         > _SAME_ANGLE,
     }
-    return tuple(
-        f"{what} ({int(rows.sum())} rows, the first {int(np.argmax(rows))}, counted from 0)"
-        for what, rows in wrong.items()
-        if rows.any()
-    )
+    return tuple(f"{what}{_counted(rows)}" for what, rows in wrong.items() if rows.any())
+
+
+def _counted(rows: np.ndarray) -> str:
+    return f" ({int(rows.sum())} rows, the first {int(np.argmax(rows))}, counted from 0)"
 
 
 def _apart(one: np.ndarray, other: np.ndarray, turn: float = 180.0) -> np.ndarray:

@@ -168,12 +168,12 @@ class Epoch(Displayed):
             + f", {with_minus_sign(f'{largest.z:+.1f}')} standard errors"
             + (" if no other parameter has changed" if largest.alone else "")
             + f" (p {probability(largest.p_value)} after allowing for {largest.asked} trials)",
-            "stars with the old one": f"off by {two_digits(errors['median'])} % in p (median), "
+            "bias of stars": f"{two_digits(errors['median'])} % of p with the old calibration (median), "
             f"{two_digits(errors['max'])} % at most",
             "chance": f"p {probability(self.p_value)} (χ² = {self.test:.1f} in {self.directions} directions, and "
             "the largest change)",
-            "would be seen": f"a change of {', '.join(f'{n} {two_digits(v)} %' for n, v in self.visible.items())} "
-            "(5 standard errors, median over the field)",
+            "sensitivity": f"a change of {', '.join(f'{n} {two_digits(v)} %' for n, v in self.visible.items())} "
+            "would be detected (5 standard errors, median over the field)",
         }
         if self.added:
             facts = {"not in the old model": ", ".join(self.added)} | facts
@@ -251,7 +251,7 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
         directions=measured.directions,
         largest=largest,
         visible=_visible(dataclasses.replace(new, covariance=of_all)),
-        chi2_old=result.likelihood.expand(values[fitted], near=result.posterior).chi2,
+        chi2_old=result.likelihood.expand(values[fitted], near=result.expansion).chi2,
         chi2_new=result.chi2,
         dof=result.dof,
         moved=tuple(sorted(moved, key=lambda entry: -abs(entry.z))),

@@ -27,7 +27,7 @@ SIZE = 21  # points along each axis of the map
 COARSE = 8  # the same where the question is what limits it
 FEW_STARS = 20
 NODES = (10, 14, 20, 28)
-TOLERANCE = 1e-2  # relative, of errors that are told with two digits
+TOLERANCE = 1e-2  # relative, of errors that are given with two digits
 
 GROUPS = {
     "throughput": "the relative throughput of the cameras",
@@ -87,15 +87,13 @@ class FieldAccuracy:
     def requirements(self) -> tuple[Requirement, ...]:
         """Requirements of the goal: all that acts on stars is measured, p is known, and no larger error could hide."""
         allowed = self.goal / 2
-        what = f"what moves stars by {two_digits(100 * allowed)} % is measured"
+        what = f"effects of {two_digits(100 * allowed)} % on stars are measured"
         asked = []
         for name, gap in unmeasured(self.not_measured).items():
             found = f"{name} not measured, {off_by(*gap.error)} at the usual size"
             asked.append(Requirement(what, gap.error[0] <= allowed, found, gap.remedy))
         light = two_digits((self.reached / allowed) ** 2)  # errors fall with its square root
-        advice = (
-            f"{light} times the light; walop-jax plan RUN --goal {100 * allowed:.2g} says how long that takes"
-        )
+        advice = f"{light} times the light; walop-jax plan RUN --goal {100 * allowed:.2g} gives the time that it takes"
         if self.without_u > 1.0 - SHARE and self.median <= allowed:
             strip = f"the strip without u ({100 * self.without_u:.0f} % of the field)"
             advice = f"observe {strip} with the plate at 22.5° as well"
@@ -103,7 +101,7 @@ class FieldAccuracy:
         if self.hidden > 0:
             what = f"no error above {two_digits(100 * self.goal)} % goes undetected: {self.hidden_by}"
             found = f"a systematic error of {two_digits(100 * self.hidden)} % of q or u would go undetected"
-            advice = self.remedy or "walop-jax limits says which exposures would show it"
+            advice = self.remedy or "walop-jax limits lists the exposures that would show it"
             asked.append(Requirement(what, self.hidden <= self.goal, found, advice, needed=False))
         return tuple(asked)
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.camera_catalogues import CameraCatalogue, sky_positions
+from walop_jax.data.camera_catalogues import CameraCatalogue
 from walop_jax.data.schema import Column
 from walop_jax.data.user_tables import (
     OF_STARS,
@@ -24,6 +24,7 @@ from walop_jax.data.user_tables import (
     in_memory,
     numeric_column,
     read_input_table,
+    sky_positions,
 )
 from walop_jax.io.errors import fail
 from walop_jax.sky.directions import (
@@ -141,6 +142,9 @@ def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
             values[stars] = column_of_stars(source, name)[near][rows]
             columns[name] = (_whole(values) if texts else values, unit, about)
     remarks = [f"{len(stars)} of {len(place)} stars are in {source.path}"]
+    if replaced := [name for name in OF_STARS if name in source.names and name in made.columns]:
+        remarks.append(f"{', '.join(replaced)} of the cameras: replaced by those of {source.path}")
+    remarks += [f"{source.path}: {hint}" for hint in source.hints({"SOURCE_ID", "TEFF"})]
     if np.hypot(*move.shift) > 0.5 * tolerance:
         shift = f"{move.shift[0]:+.1f} and {move.shift[1]:+.1f} arcsec along X and Y"
         remarks.append(f"all cameras are shifted by {shift} against {source.path}: is their WCS right?")
@@ -209,7 +213,7 @@ def _matched(
     ambiguous, place = np.zeros((0, cameras), bool), np.zeros((0, 2))
     for k in sorted(range(cameras), key=lambda k: -len(places[k])):
         doubtful, rows, stars = mutual(places[k], place, tolerance)
-        doubtful |= _crowded(places[k], tolerance)
+        doubtful |= mutual(places[k], places[k], tolerance)[0]  # stars with another one of the same camera
         new = np.setdiff1d(np.arange(len(places[k])), rows)
         count = (index[stars] >= 0).sum(axis=1, keepdims=True)
         place[stars] = (count * place[stars] + places[k][rows]) / (count + 1)
@@ -221,11 +225,6 @@ def _matched(
         index, ambiguous = np.concatenate([index, additions]), np.concatenate([ambiguous, unsure])
         place = np.concatenate([place, places[k][new]])
     return index, ambiguous, place
-
-
-def _crowded(place: Float[np.ndarray, "n 2"], tolerance: float) -> Bool[np.ndarray, " n"]:
-    """Stars with another one of the same camera within the tolerance."""
-    return mutual(place, place, tolerance)[0]
 
 
 def _check_common(
@@ -294,23 +293,15 @@ def _columns(
         columns["SKY"] = (of_cameras(levels, np.nan), "", "level of the sky that was subtracted, electrons")
     remarks = []
     for name, (unit, about) in OF_STARS.items():
-        with_column = [k for k, camera in enumerate(catalogues) if name in camera.of_stars]
-        if not with_column:
+        if not any(name in camera.of_stars for camera in catalogues):
             continue
         texts = name == "SOURCE_ID"
-        each_camera = [
-            catalogues[k].of_stars.get(name) if k in with_column else None for k in range(len(catalogues))
-        ]
         empty = "" if texts else np.nan
-        filled = [
-            np.full(len(camera), empty, object if texts else float) if v is None else v
-            for camera, v in zip(catalogues, each_camera, strict=True)
-        ]
-        values, differ = _agreed(of_cameras(filled, empty), texts)
+        columns_of = [camera.of_stars.get(name, np.full(len(camera), empty)) for camera in catalogues]
+        values, differ = _agreed(of_cameras(columns_of, empty), texts)
         if differ.any():
-            remarks.append(
-                f"{name} is not the same in all cameras for {int(differ.sum())} stars: taken as unknown"
-            )
+            what = f"{name} is not the same in all cameras for {int(differ.sum())} stars: taken as unknown"
+            remarks.append(what)
         columns[name] = (_whole(values) if texts else values, unit, about)
     for name in sorted({name for camera in catalogues for name in camera.of_exposure}):
         stated = [camera.of_exposure.get(name, "not stated") for camera in catalogues]

@@ -52,13 +52,10 @@ class Overlap:
 
 def extents(catalogue: Catalogue) -> Float[np.ndarray, " s"]:
     """The largest distance in X or Y (deg) between the rows of every star."""
-    extent = np.zeros(catalogue.star.max() + 1)
-    for place in (catalogue.points.x, catalogue.points.y):
-        low, high = np.full(len(extent), np.inf), np.full(len(extent), -np.inf)
-        np.minimum.at(low, catalogue.star, place)
-        np.maximum.at(high, catalogue.star, place)
-        extent = np.maximum(extent, high - low)
-    return extent
+    order = np.argsort(catalogue.star, kind="stable")
+    first = np.searchsorted(catalogue.star[order], np.arange(catalogue.star.max() + 1))
+    places = (place[order] for place in (catalogue.points.x, catalogue.points.y))
+    return np.maximum(*(np.maximum.reduceat(p, first) - np.minimum.reduceat(p, first) for p in places))
 
 
 def at_several_places(catalogue: Catalogue) -> Bool[np.ndarray, " n"]:

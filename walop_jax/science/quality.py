@@ -288,7 +288,7 @@ def _medians_before(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 def append(path: str | os.PathLike[str], new: Any, limits: Limits) -> tuple[Any, list[str]]:
     """Add nights to the table in a file, which is made if it is not there; the whole table, and remarks.
 
-    Nothing is lost where it is killed, and of two processes the second one is told of the first.
+    Nothing is lost where it is killed, and of two processes the second one is notified of the first.
     """
     table_format(path)
     target = check_output(path, overwrite=True)

@@ -105,6 +105,8 @@ def about_counts(
 ) -> Iterator[str]:
     """Warnings about errors that are none of counts, and about cameras that are hardly used."""
     used = np.isfinite(counts)
+    if not used.any():
+        yield "no row has a camera that is used: N is negative, flagged, saturated or NaN"
     for name, of_camera in zip(names, used.T, strict=True):
         if used.any() and of_camera.mean() < FEW:
             what = "N is negative, flagged, saturated or NaN in the others"

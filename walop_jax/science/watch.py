@@ -16,10 +16,10 @@ All cameras together are flux: no history of theirs leaves a trace. Asked are th
 cameras of one), their gradients over the field (of any direction φ: β cos φ x + β sin φ y, as χ² of two numbers), spots
 (`places`) and the numbers of the optics (thicknesses, axes of plates, …). One correction for all of it: noise
 raises an alarm in one of 1/`ALARM` catalogues, at z₀; the size seen in 99 % is (z₀ + 2.33) σ_β. A detected change
-competes with all others of the same history: those that describe the stars as well are told together, and a camera is
-named only if no other is among them. A number of the optics that would have to change by more than `FARTHEST` widths of
-its prior explains nothing: its columns are first-order, and no optics moves that far. If only such a number describes
-the stars, they have changed by something that has no name here.
+competes with all others of the same history: those that describe the stars as well are reported together, and a camera
+is named only if no other is among them. A number of the optics that would have to change by more than `FARTHEST` widths
+of its prior explains nothing: its columns are first-order, and no optics moves that far. If only such a number
+describes the stars, they have changed by something that has no name here.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ from walop_jax.science.watch_readings import Answers, Readings
 
 WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen to 10⁻⁵
 MOST_GROUPS = 150
-"""Exposure groups that are told apart; neighbours of more are joined."""
+"""Exposure groups that are separated; neighbours of more are joined."""
 RIVALS = (
     "hwp1_axis",
     "hwp2_axis",

@@ -53,7 +53,7 @@ class WatchedChange(InstrumentChange):
         if not self.rivals:
             return f"{self.best.words()} {when} {significance}"
         either = some([entry.words() for entry in (self.best, *self.rivals)], 5, " or ")
-        return f"{when} {significance}, one of these, which the stars cannot tell apart: {either}"
+        return f"{when} {significance}, one of these, which the stars cannot separate: {either}"
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -177,7 +177,10 @@ class Watch(Displayed):
                 ("exposure groups", f"{len(self.time)}"),
                 ("sensitivity", f"a {smallest} % step in one camera would be detected (99 % probability)"),
             ),
-            head=("time", ">stars", ">χ²/dof", *(f">{name} %" for name in self.cameras), ">seen %"),
+            head=(
+                "MJD" if np.min(self.time) > FIRST_DATE else "group",
+                *(">stars", ">χ²/dof", *(f">{name} %" for name in self.cameras), ">sensitivity %"),
+            ),
             rows=rows,
             notes=self.warnings,
         )

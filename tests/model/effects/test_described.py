@@ -417,12 +417,17 @@ def test_factors_of_single_exposures_by_hand():
     )
     np.testing.assert_allclose(factor("per EXPTIME").value(at, OF_WALOP), [1 / 3, 0.1, 0.0])
     np.testing.assert_allclose(factor("order").value(at, OF_WALOP), [0, 1, 2])
+    nights = SimpleNamespace(hours=np.array([25.5, 0.0, 24.0, 3.0, 49.0]))
+    np.testing.assert_allclose(factor("night hours").value(nights, OF_WALOP), [1.5, 0.0, 0.0, 3.0, 0.0])
+    traced = SimpleNamespace(hours=jnp.asarray(nights.hours))
+    np.testing.assert_allclose(factor("night hours").value(traced, OF_WALOP), [1.5, 0.0, 0.0, 3.0, 0.0])
     # 350° → 20° upward through 0, then 20° → 10° downward.
     np.testing.assert_allclose(factor("side CLP").value(at, OF_WALOP), [0, -1, 1])
 
 
 @pytest.mark.parametrize(
-    "given", ["hours", "hours 0 to 2", "exposure 3", "kind moon", "side CLP", "order", "per EXPTIME"]
+    "given",
+    ["hours", "hours 0 to 2", "exposure 3", "kind moon", "side CLP", "order", "night hours", "per EXPTIME"],
 )
 def test_a_change_in_single_exposures_is_not_known_for_stars(given):
     assert Change.parsed("gain of O1").of_stars

@@ -32,7 +32,7 @@ def test_beside_a_change_of_the_same_number_it_would_be_another_number(first):
     context = Context()
     both = [effect_by_name("clp_extinction"), Described.of(context, sentences=("extinction of polariser",))]
     with pytest.raises(
-        ValueError, match="'clp_extinction' is the number that 'extinction of polariser' adds to"
+        ValueError, match="'clp_extinction' and 'extinction of polariser' change the same number"
     ):
         with_effects(
             model_without_data("WALOP-SOUTH"), both if first == "clp_extinction" else both[::-1], context

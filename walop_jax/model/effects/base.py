@@ -153,7 +153,7 @@ class Effect(Component):
         return self.replaced(**values)
 
     def moved(self, amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
-        """With numbers added to its amplitudes, in the order of its parameters."""
+        """The effect with numbers added to its amplitudes, in the order of its parameters."""
         remaining, changed = np.asarray(amplitudes, float), {}
         for name in self.kind.amplitudes():
             value = np.asarray(getattr(self, name))

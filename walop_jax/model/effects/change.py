@@ -39,7 +39,7 @@ Term = tuple["Change", Scalar]
 Given = str | Callable[[Any], Any]
 """A factor: a text, or a function of the quantities of factors."""
 OPPOSITE = "opposite"  # the field point, as an origin of light
-SLOW, SINGLE = ("hours", "kelvin", "hour angle"), ("per EXPTIME", "order")
+SLOW, SINGLE = ("hours", "kelvin", "hour angle"), ("per EXPTIME", "order", "night hours")
 OF_LIST = ("exposure", "kind", "side", *SINGLE)  # forms of factors that ask for the list of exposures
 SKY, BAND = "sky", "band"  # places other than elements
 

@@ -25,6 +25,7 @@ from walop_jax.model import legendre
 from walop_jax.model.conventions import Units
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
 from walop_jax.model.parameters import unknown_name
+from walop_jax.sky.nights import GAP
 
 LARGEST_SQUARE = 2.0  # of the field radius, in units of the scale of the field: the corners
 FIELD, WAVELENGTH, EXPOSURE, COUNTS, SHAPE = "field", "wavelength", "exposure", "counts", "shape"
@@ -125,6 +126,16 @@ def _side(prefix: str) -> Factor:
     return Factor(f"side {prefix}", EXPOSURE, words, test, value, "side", (prefix,))
 
 
+def _since_evening(at: Any, _: Units) -> Any:
+    """Hours since the first exposure of its night, nights being `GAP` hours apart."""
+    xp: Any = np if isinstance(at.hours, np.ndarray) else jnp
+    order = xp.argsort(at.hours, axis=-1)
+    hours = xp.take_along_axis(at.hours, order, axis=-1)
+    first = xp.diff(hours, axis=-1, prepend=hours[..., :1] - 2.0 * GAP) > GAP
+    since = hours - xp.maximum.accumulate(xp.where(first, hours, -xp.inf), axis=-1)
+    return xp.take_along_axis(since, xp.argsort(order, axis=-1), axis=-1)
+
+
 def _gap(thickness: str) -> Factor:
     """Thickness (µm) of the air of a change by fringes: 1, as the fringes depend on it themselves."""
     words = f"of {thickness} µm of air (amplitude at a maximum)"
@@ -189,6 +200,10 @@ def _plain() -> Mapping[str, Factor]:
         Factor(
             "order", EXPOSURE, "growing from exposure to exposure of the list", ONCE_MORE,
             lambda at, _: 1.0 * at.number, "order",
+        ),
+        Factor(
+            "night hours", EXPOSURE, "growing through every night (per hour since its first exposure)",
+            "the same exposures of a night in another order", _since_evening, "night hours",
         ),
         Factor(
             # The detector multiplies with its own counts.

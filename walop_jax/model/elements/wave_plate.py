@@ -238,12 +238,7 @@ def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Floa
         return jnp.stack([jnp.broadcast_to(value, shape) for value in values])
 
     indices: Known = {}
-    stacks = [plate.crystals(ray, indices) for plate, ray in cases]
-    if any(crystal.cut is not None for stack in stacks for crystal in stack):
-        stacks = [
-            tuple(c if c.cut is not None else c._replace(cut=jnp.zeros(())) for c in stack)
-            for stack in stacks
-        ]
+    stacks = plates.alike([plate.crystals(ray, indices) for plate, ray in cases])
     kx, ky, wavelength = (
         together(*(getattr(ray, name) for _, ray in cases)) for name in ("kx", "ky", "wavelength")
     )
