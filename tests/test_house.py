@@ -186,7 +186,7 @@ MOST_LINES = {
     "instruments": 250,
     "data": 5970,
     "sky": 455,
-    "model": 9780,
+    "model": 9790,
     "likelihood": 3380,
     "simulation": 1130,
     "fit": 2190,
