@@ -95,6 +95,7 @@ def test_pictures_that_the_command_has_drawn(tmp_path: Path, kind: str, name: st
     html, missing = written(tmp_path, kind, **DOCUMENTS[kind])
     assert len(Page(html).images) == 1
     assert len(missing) == lacking
+    assert ('class="scrolls"' in html) == ('class="hint"' in html) == (kind == "comparison")
 
 
 def test_an_epoch_shows_what_has_changed_of_the_matrix(tmp_path: Path):

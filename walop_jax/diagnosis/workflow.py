@@ -3,7 +3,7 @@
 1. Fit the model. 2. Score every effect of the catalogue, every sentence (`grammar`) and every pattern without a
 name; global p by Monte Carlo. 3. Below `thresholds.ALARM`: add names one after the other (`search`), each fitted
 together with everything before it is added (`refits`). 4. Drop names that are not needed beside the others. 5. Names
-that leave a poor fit nearly as poor are reported as parts of what is missing, and taken out again. 6. What no name
+that leave a poor fit nearly as poor are reported as parts of the missing effect, and taken out again. 6. What no name
 explains is described, and the verdict is `unexplained`; a free-form term for it stays in the model where it predicts
 settings and parts of the field that it has not seen, and names that only stood in for it are dropped (`remainder`). 7.
 List for each name what the data cannot separate from it, and give the verdict. Names are given at any size;
@@ -163,7 +163,7 @@ def _examined(diagnosis: Diagnosis, tables: tuple[ScoreTable, ScoreTable], seed:
         return dataclasses.replace(diagnosis, before=after, after=after)
     for sentence in rival_conditions(Design.of(diagnosis.before), diagnosis.after.chi2):
         after = after.remarked(sentence)
-    # Where χ² speaks against the model given, the steps say what is missing.
+    # Where χ² contradicts the model given, the steps name the missing effects.
     explained = diagnosis.before.explains_data or diagnosis.before.nearly_explains_data
     before = diagnosis.before.judged()
     if explained:
@@ -193,7 +193,7 @@ def _not_scored(catalogue: Sequence[EffectKind], candidates: Hypotheses) -> dict
 
 
 def _promise(choice: Choice) -> tuple[float, float]:
-    """Order of other descriptions: by the gain where it is known, then by what is left."""
+    """Order of other descriptions: by the gain where it is known, then by the remaining χ²."""
     return (-choice.better_by if np.isfinite(choice.better_by) else np.inf), choice.left
 
 

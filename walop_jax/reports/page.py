@@ -449,7 +449,7 @@ OTHERS = {
     "plan": OtherPage("Which calibration exposures to take"),
     "limits": OtherPage("What these data can show"),
     "survey": OtherPage("Many nights of one instrument", "trusted"),
-    "watch": OtherPage("Does the calibration still hold?", "holds"),
+    "watch": OtherPage("Is the calibration still valid?", "holds"),
     "affected": OtherPage("Catalogues that a new calibration changes"),
     "commissioning": OtherPage("Go or no-go", "go"),
 }
@@ -531,7 +531,10 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
     names = [name for name in CAPTIONS if name.endswith(".png") and name.startswith(kind)]
     existing = [name for name in names if (folder / name).exists()]
     missing += [f"{name} is not there." for name in names if name not in existing]
-    return [Picture(png((folder / name).read_bytes()), CAPTIONS[name]) for name in existing]
+    one_above_the_other = kind == "watch"  # whole on a narrow screen
+    return [
+        Picture(png((folder / name).read_bytes()), CAPTIONS[name], one_above_the_other) for name in existing
+    ]
 
 
 def _change_of_the_matrix(folder: Path, document: Mapping[str, Any], missing: list[str]) -> list[Picture]:

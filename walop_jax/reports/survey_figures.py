@@ -96,7 +96,7 @@ def watch_figure(found: Watch) -> Figure:
         for change in found.changes:
             axis.axvline(float(day_of(change.time)), color=BEFORE, lw=0.8, ls="--")
         axis.set_ylabel(f"{found.cameras[k]} (%)", fontsize=FONT)
-    axes[0, 0].set_title("gain since the calibration; grey: steps that would not be seen", fontsize=FONT)
+    axes[0, 0].set_title("gain since the calibration; grey: steps too small to be detected", fontsize=FONT)
     if not calendar(axes[-1, 0], found.time):
         axes[-1, 0].set_xlabel("number of the exposure group", fontsize=FONT)
     return figure
