@@ -268,7 +268,7 @@ def _residual_pictures(run: RunContents, missing: list[str]) -> list[Picture]:
     whole = picture(
         "whole",
         lambda canvas: diagnosis_figures.residual_maps(
-            data.points, {"residuals": overall.before}, data.cameras, canvas
+            data.points, {"residuals": overall.field["BEFORE"]}, data.cameras, canvas
         ),
         combination=in_greek(overall.combination),
     )
