@@ -241,8 +241,10 @@ def executor_of(
         return
     if importlib.util.find_spec("distributed") is None:
         raise fail("Dask is not installed", advice="pip install 'walop-jax[cluster]'")
-    dask = importlib.import_module("distributed")
+    dask, config = map(importlib.import_module, ("distributed", "dask.config"))
     with contextlib.ExitStack() as hold:
+        # Every night travels with the model: some hundred kilobytes each, of which Dask would warn.
+        hold.enter_context(config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}))
         if scheduler is None:
             options = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None}
             address = hold.enter_context(dask.LocalCluster(**options))
