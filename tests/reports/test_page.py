@@ -134,6 +134,14 @@ def test_every_section_is_there(diagnosed, refitted):
     assert "cos(3θ − 57°), θ the polariser angle" in page.text
 
 
+def test_a_diagnosis_without_additions_has_its_figures(tmp_path):
+    """Residual maps of the one model, shares, matrix and errors: nothing to compare, no ladder."""
+    folder = handmade_run.make_diagnosis(tmp_path / "run", verdict="consistent", steps=[])
+    page = page_of(folder)
+    assert "Residuals" in " ".join(page.headings)
+    assert len(page.images) == 4
+
+
 def test_numbers_are_those_of_the_files(diagnosed):
     page = Page(diagnosed)
     for name in ("throughput.n0.p00", "half1.efficiency"):  # which are not displayed

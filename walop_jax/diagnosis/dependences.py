@@ -127,7 +127,7 @@ class Dependences:
 
     def _night_hours(self) -> Iterator[tuple[str, ...]]:
         """The time since the beginning of a night, where there are several."""
-        if varies(self.exposures.mjd) and len(first_of_nights(np.sort(self.exposures.mjd))) > 1:
+        if self._nights():
             yield ("night hours",)
 
     def _side(self) -> Iterator[tuple[str, ...]]:
@@ -160,14 +160,17 @@ class Dependences:
 
     def _night(self) -> Iterator[tuple[str, ...]]:
         """Every night, where there are several."""
+        for start, stop in self._nights():
+            yield (f"hours {max(start - 0.5, 0.0):.2f} to {stop + 0.5:.2f}",)
+
+    def _nights(self) -> list[tuple[float, float]]:
+        """Hours of the first and the last exposure of every night; empty unless there are several."""
         if not varies(self.exposures.mjd):
-            return
+            return []
         hours = np.sort(hours_of(self.exposures))
         first = first_of_nights(hours / 24.0)
-        if len(first) < 2:
-            return
-        for start, stop in itertools.pairwise([*first, len(hours)]):
-            yield (f"hours {max(hours[start] - 0.5, 0.0):.2f} to {hours[stop - 1] + 0.5:.2f}",)
+        nights = itertools.pairwise([*first, len(hours)]) if len(first) > 1 else ()
+        return [(hours[start], hours[stop - 1]) for start, stop in nights]
 
     def _kind(self) -> Iterator[tuple[str, ...]]:
         """Kinds of exposures, but the most frequent."""
