@@ -15,6 +15,7 @@ Units       counts per unit of unpolarised light at unit throughput; angles rad;
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -27,10 +28,9 @@ from jaxtyping import Array, Bool, Float, Int
 from walop_jax.model import fold, mueller
 from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.simple import Analyser
-from walop_jax.model.light_path import LightPath, Scalar
-from walop_jax.model.parameters import Shapes, of_shapes, shapes_of
+from walop_jax.model.light_path import LightPath, Scalar, is_achromatic
 from walop_jax.model.plan import Plan
-from walop_jax.model.ray import NotPlannedError, Ray
+from walop_jax.model.ray import Ray
 from walop_jax.model.sources import ExposureArrays, Sight, Source, turned
 
 FEW_BANDS = 3
@@ -56,30 +56,8 @@ def divided(instrument: LightPath) -> Train:
     another quantity of the exposures, as a run on shapes shows.
     """
     behind = instrument.behind_polariser()
-    count = _leading(*shapes_of(behind))
-    return Train(instrument.telescope(), behind[:count], behind[count:])
-
-
-@functools.lru_cache(maxsize=256)
-def _leading(structure: Any, shapes: Shapes) -> int:
-    """Number of leading elements; one run for all values of their numbers."""
-    count = 0
-
-    def follow(elements: tuple[Element, ...]) -> None:
-        nonlocal count
-        ray = Ray.entering(jnp.zeros(()), jnp.zeros(()))
-        for element in elements:
-            if element.moves:
-                return
-            try:
-                element.mueller(ray)
-                ray = element.ray(ray)
-            except NotPlannedError:
-                return
-            count += 1
-
-    jax.eval_shape(follow, of_shapes(structure, shapes))
-    return count
+    leading = tuple(itertools.takewhile(lambda e: not e.moves and is_achromatic(e), behind))
+    return Train(instrument.telescope(), leading, behind[len(leading) :])
 
 
 def _achromatic(elements: tuple[Element, ...], x: Scalar, y: Scalar) -> Float[Array, "4 4"]:

@@ -22,7 +22,7 @@ from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.simple import Analyser, Polariser
 from walop_jax.model.elements.wave_plate import WavePlate
-from walop_jax.model.parameters import Component, check_names, number, unknown_name
+from walop_jax.model.parameters import Component, by_shapes, check_names, number, unknown_name
 from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import Source, Standards
 
@@ -94,7 +94,7 @@ class LightPath(Component):
             return ()
         elements = tuple(itertools.takewhile(lambda e: not isinstance(e, Polariser), self.train()))
         for element in elements:
-            if element.moves or type(element).ray is not Element.ray or not _is_achromatic(element):
+            if element.moves or type(element).ray is not Element.ray or not is_achromatic(element):
                 raise ValueError(
                     f"element {element.name!r} is ahead of the polariser, where nothing may move, bend the ray "
                     "or depend on wavelength or exposure; put it behind the polariser"
@@ -211,10 +211,16 @@ def _member(members: tuple[AnyPart, ...], name: str, what: str) -> AnyPart:
     raise NoSuchPlaceError(str(unknown_name(what, name, [_name(member) for member in members])))
 
 
-def _is_achromatic(element: Element) -> bool:
-    zero = jnp.zeros(())
+@by_shapes
+def is_achromatic(element: Element) -> bool:
+    """True if an element depends neither on wavelength nor on another quantity of the exposures."""
+
+    def run(element: Element) -> Any:
+        ray = Ray.entering(jnp.zeros(()), jnp.zeros(()))
+        return element.mueller(ray), element.ray(ray)
+
     try:
-        jax.eval_shape(lambda e: e.mueller(Ray.entering(zero, zero)), element)
+        jax.eval_shape(run, element)
     except NotPlannedError:
         return False
     return True

@@ -41,7 +41,7 @@ from walop_jax.model.elements.wave_plate import WavePlate, fringe
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light_path import Scalar
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
-from walop_jax.model.parameters import shapes_of
+from walop_jax.model.parameters import by_shapes
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import CONDITIONS, Conditions, Ray
 from walop_jax.model.sources import MoonPatches, MoonSky, Sight, Standards
@@ -62,21 +62,10 @@ def trains(instrument: Instrument) -> dict[str, tuple[Element, ...]]:
     }
 
 
+@by_shapes
 def acts(element: Element) -> bool:
     """True if an element has a Mueller matrix."""
-    return _acts(*shapes_of(element))
-
-
-@functools.lru_cache(maxsize=1024)
-def _acts(structure: Any, shapes: Any) -> bool:
-    ones, zero = array(np.ones(1)), array(np.zeros(()))
-
-    def run(*arrays: Array) -> Any:
-        element = jax.tree_util.tree_unflatten(structure, arrays)
-        conditions = Conditions(band_width=0.1 * ones, planned=dict.fromkeys(CONDITIONS, ones))
-        return element.mueller(Ray.entering(zero, zero, (0.62 * ones, conditions)))
-
-    return jax.eval_shape(run, *(jax.ShapeDtypeStruct(s, d) for s, d in shapes)) is not None
+    return jax.eval_shape(lambda e: e.mueller(Ray.on_trial(CONDITIONS)), element) is not None
 
 
 def _places(instrument: Instrument) -> list[list[int]]:
