@@ -181,12 +181,8 @@ def _node_rows(instrument: LightPath, plan: Plan, ray: Ray) -> Float[Array, "c n
     train = divided(instrument)
     for element in train.leading:
         ray = element.ray(ray)
-    common, ray = fold.stations(train.banded, ray)
-    arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
-    states = [state for state, _, _ in plan.settings]
-    matrices = fold.solved([*common, *(station for arm in arms for station in arm)], plan.moving, states)
-    analysers = [arm.analyser for arm in instrument.arms]
-    return fold.backward(common, arms, analysers, matrices, plan.moving, states, len(plan.wavelength))
+    path = fold.Fold.of(train.banded, instrument.arms, ray, plan.moving, plan.states)
+    return path.backward(path.solved(), len(plan.wavelength))
 
 
 def camera_vectors(

@@ -245,29 +245,25 @@ def _summed(
     stretch: Scalar,
 ) -> _Banded:
     """The same at wavelengths times a factor, without the differences between beams."""
-    states, conditions = [state for state, _, _ in plan.settings], plan.conditions
+    conditions = plan.conditions
     if "temperature" not in conditions.planned:  # the thermal change of one kelvin
         warm = jnp.full_like(plan.wavelength, REFERENCE_TEMPERATURE + 1.0)
         conditions = Conditions(conditions.band_width, {**conditions.planned, "temperature": warm})
 
-    def stations(instrument: Instrument) -> list[list[fold.Station]]:
-        common, *arms = trains(instrument).values()
-        spectrum = stretch * light.node_wavelengths(instrument, plan), conditions
-        first, ray = fold.stations(common, Ray.entering(*at, spectrum))
-        return [first, *(fold.stations(arm, ray)[0] for arm in arms)]
+    def path_of(instrument: Instrument) -> fold.Fold:
+        ray = Ray.entering(*at, (stretch * light.node_wavelengths(instrument, plan), conditions))
+        return fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, plan.moving, plan.states)
 
     def solved(sizes: Float[Array, " t"]) -> tuple[fold.Solved, Float[Array, "b n"]]:
         changed = moved(sizes)
-        all_stations = list(itertools.chain(*stations(changed)))
-        return fold.solved(all_stations, plan.moving, states), light.band_weights(changed, plan)
+        return path_of(changed).solved(), light.band_weights(changed, plan)
 
     single, together = sizes
     nothing = jnp.zeros(single + together)
     (matrices, weights), push = jax.linearize(solved, nothing)
     slopes, weight_slopes = jax.vmap(push)(jnp.eye(len(nothing)))
-    common, *arms = stations(neutral := moved(nothing))
-    analysers, all_stations = [arm.analyser for arm in neutral.arms], list(itertools.chain(common, *arms))
-    folded = fold.around(common, arms, analysers, matrices, plan.moving, states, len(plan.wavelength))
+    path = path_of(neutral := moved(nothing))
+    folded = path.around(matrices, len(plan.wavelength))
     sides = [
         (behind, ahead)
         for folded_train in folded
@@ -287,9 +283,7 @@ def _summed(
         behind, ahead = sides[number]
 
         def change(tangents: fold.Solved) -> Float[Array, "c n r 4"]:
-            matrix = fold.stacked(
-                tangents, number, all_stations[number][0], plan.moving, states, jnp.zeros((4, 4))
-            )
+            matrix = path.stacked(tangents, number, out=jnp.zeros((4, 4)))
             assert matrix is not None
             return behind @ matrix @ ahead
 
@@ -299,13 +293,13 @@ def _summed(
     moments = weights, weights * (wavelength / neutral.units.wavelength - 1.0)
     inserted = _inserted(plan, moments, _places(neutral), folded)
     plates = [jnp.zeros((0, len(gaps), single, *sums(weights, rows).shape))]
-    for number, (element, ray) in enumerate(all_stations):
+    for number, (element, ray) in enumerate(path.stations):
         if _is_plate(element):
             change = pushed(number, slice(single))
             waves = jax.vmap(fringe, (0, None))(gaps, ray)
             plates.append(jax.vmap(lambda wave, change=change: sums(wave * weights, change))(waves)[None])
     overall = sum(
-        (pushed(number, slice(single, None)) for number in range(len(all_stations))),
+        (pushed(number, slice(single, None)) for number in range(len(path.stations))),
         jnp.zeros((together, *rows.shape)),
     )
     shifted = jax.vmap(lambda slope: sums(slope, rows))(weight_slopes[single:])
