@@ -71,7 +71,9 @@ class LightPath(Component):
     effects: tuple[Any, ...] = ()  # patches: `effects.base.Effect`
     rotator_zero: Scalar | None = number(unit="deg", about="true ROTATOR minus the header's", default=None)
     filter_shift: Scalar | None = number(unit="um", about="displacement of broad bands", default=None)
-    sky_films: tuple[Any, ...] = ()  # changes of light from the sky in single exposures (`optics.SkyFilm`)
+    sky_films: tuple[
+        Any, ...
+    ] = ()  # changes of light from the sky in single exposures (`effects.optics.Film`)
 
     # ------------------------------------------------------------------------------- parts
 
@@ -176,14 +178,16 @@ class LightPath(Component):
         A duplicate name gets a number. Raises `NoSuchPlaceError` where there is no such element.
         """
         where, _, neighbour = (before or after).rpartition(".")
-        if where:
-            arm = next((arm for arm in self.arms if arm.name == where), None)
-            if arm is None:
-                raise NoSuchPlaceError(f"the instrument has no arm {where!r}")
-            holder = _inserted(arm, element, neighbour, bool(after))
-            arms = tuple(holder if candidate.name == where else candidate for candidate in self.arms)
-            return dataclasses.replace(self, arms=arms)
-        return _inserted(self, element, neighbour, bool(after))
+        holder = _member(self.arms, where, "arm") if where else self
+        if neighbour not in holder.path:
+            raise NoSuchPlaceError(str(unknown_name("element", neighbour, holder.path)))
+        name, count = element.name or element.kind, 1
+        while name in holder.path:
+            count += 1
+            name = f"{element.name or element.kind}_{count}"
+        at = holder.path.index(neighbour) + bool(after)
+        elements = (*holder.elements, dataclasses.replace(element, name=name))
+        return self.changed(where, elements=elements, path=(*holder.path[:at], name, *holder.path[at:]))
 
     def with_part(self, slot: str, part: Component) -> Self:
         """The instrument with one more part of its cameras.
@@ -195,13 +199,8 @@ class LightPath(Component):
 
     def with_source(self, source: Source) -> Self:
         """The instrument with a source of one more KIND, or with one of its sources replaced."""
-        remaining = tuple(present for present in self.sources if present.name != source.name)
-        if len(remaining) == len(self.sources):
-            return dataclasses.replace(self, sources=(*self.sources, source))
-        return dataclasses.replace(
-            self,
-            sources=tuple(source if present.name == source.name else present for present in self.sources),
-        )
+        sources = {present.name: present for present in self.sources} | {source.name: source}
+        return dataclasses.replace(self, sources=tuple(sources.values()))
 
 
 def _member(members: tuple[AnyPart, ...], name: str, what: str) -> AnyPart:
@@ -249,17 +248,3 @@ def _changed(part: AnyPart, path: list[str], fields: dict[str, Any], place: str)
                 new = (*members[:i], _changed(member, path[1:], fields, place), *members[i + 1 :])
                 return dataclasses.replace(part, **{field.name: new})
     raise NoSuchPlaceError(f"the instrument has no part {place!r}; {nearest(path[0], names)}")
-
-
-def _inserted(holder: Any, element: Element, neighbour: str, after: bool) -> Any:
-    if neighbour not in holder.path:
-        raise NoSuchPlaceError(str(unknown_name("element", neighbour, holder.path)))
-    name, number_ = element.name or element.kind, 1
-    while name in holder.path:
-        number_ += 1
-        name = f"{element.name or element.kind}_{number_}"
-    at = holder.path.index(neighbour) + (1 if after else 0)
-    path = (*holder.path[:at], name, *holder.path[at:])
-    return dataclasses.replace(
-        holder, elements=(*holder.elements, dataclasses.replace(element, name=name)), path=path
-    )
