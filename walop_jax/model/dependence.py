@@ -61,8 +61,7 @@ def needs(instrument: Instrument) -> Needs:
         return patched, light.detected(patched, plan.exposures, counts)
 
     (patched, _), quantities = _asking(run, instrument)
-    elements = [*patched.elements, *(element for arm in patched.arms for element in arm.elements)]
-    longest = max((item.path_difference for item in elements), default=0.0)
+    longest = max((element.path_difference for element in patched.by_place().values()), default=0.0)
     return Needs(quantities - {"median"}, "median" in quantities, longest)
 
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -41,23 +41,15 @@ BROAD = 0.05  # µm: equivalent width from which a filter is displaced by `Light
 # ------------------------------------------------------------------------------------------- the train
 
 
-class Train(NamedTuple):
-    """The common train in its three parts: ahead of the polariser, leading elements, those in the band integral."""
+def divided(instrument: LightPath) -> tuple[tuple[Element, ...], tuple[Element, ...]]:
+    """The common train behind the polariser: leading elements, then those in the band integral.
 
-    telescope: tuple[Element, ...]
-    leading: tuple[Element, ...]
-    banded: tuple[Element, ...]
-
-
-def divided(instrument: LightPath) -> Train:
-    """The parts of the common train.
-
-    Leading are the elements behind the polariser up to the first that moves, or that depends on the wavelength or on
-    another quantity of the exposures, as a run on shapes shows.
+    Leading are the elements up to the first that moves, or that depends on the wavelength or on another quantity of
+    the exposures, as a run on shapes shows.
     """
     behind = instrument.behind_polariser()
     leading = tuple(itertools.takewhile(lambda e: not e.moves and is_achromatic(e), behind))
-    return Train(instrument.telescope(), leading, behind[len(leading) :])
+    return leading, behind[len(leading) :]
 
 
 def _achromatic(elements: tuple[Element, ...], x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
@@ -74,7 +66,7 @@ def telescope(instrument: LightPath, x: Scalar, y: Scalar) -> Float[Array, "4 4"
 
 def upstream(instrument: LightPath, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
     """Mueller matrix of the leading elements at a field point (see `divided`)."""
-    return _achromatic(divided(instrument.patched()).leading, x, y)
+    return _achromatic(divided(instrument.patched())[0], x, y)
 
 
 # ------------------------------------------------------------------------------------ bands and cameras
@@ -178,10 +170,10 @@ def is_dispersed(instrument: LightPath) -> bool:
 
 def _node_rows(instrument: LightPath, plan: Plan, ray: Ray) -> Float[Array, "c n r 4"]:
     """Rows of the analysers at every node, in every state."""
-    train = divided(instrument)
-    for element in train.leading:
+    leading, banded = divided(instrument)
+    for element in leading:
         ray = element.ray(ray)
-    path = fold.Fold.of(train.banded, instrument.arms, ray, plan.moving, plan.states)
+    path = fold.Fold.of(banded, instrument.arms, ray, plan.moving, plan.states)
     return path.backward(path.solved(), len(plan.wavelength))
 
 

@@ -127,27 +127,26 @@ class LightPath(Component):
 
     def places(self, kind: type[Element]) -> tuple[str, ...]:
         """Places, as for `changed`, of all elements of a class; arms first, then the common train."""
-        arms = [
-            f"{arm.name}.{element.name}"
-            for arm in self.arms
-            for element in arm.elements
-            if isinstance(element, kind)
-        ]
-        return (*arms, *(element.name for element in self.elements if isinstance(element, kind)))
+        return tuple(place for place, element in self.by_place().items() if isinstance(element, kind))
+
+    def by_place(self) -> dict[str, Element]:
+        """All elements by their places, as for `changed`; arms first, then the common train."""
+        in_arms = {f"{arm.name}.{element.name}": element for arm in self.arms for element in arm.elements}
+        return in_arms | {element.name: element for element in self.elements}
+
+    def ahead_of_analysers(self) -> list[Element]:
+        """The elements of the common train, then of every arm, in the order light meets them."""
+        return [*self.train(), *(element for arm in self.arms for element in arm.train())]
 
     def moving(self) -> tuple[str, ...]:
         """Prefixes of the columns of the moving elements behind the polariser, common train first."""
-        elements = [*self.train(), *(element for arm in self.arms for element in arm.train())]
-        prefixes = [
-            element.moves for element in elements if element.moves and not isinstance(element, Polariser)
-        ]
-        return tuple(dict.fromkeys(prefixes))
+        elements = (e for e in self.ahead_of_analysers() if not isinstance(e, Polariser))
+        return tuple(dict.fromkeys(element.moves for element in elements if element.moves))
 
     @property
     def plates(self) -> str | None:
         """Model of its wave plates (`wave_plate.MODELS`); None where it has none."""
-        elements = (*self.elements, *(element for arm in self.arms for element in arm.elements))
-        return next((element.model for element in elements if isinstance(element, WavePlate)), None)
+        return next((e.model for e in self.by_place().values() if isinstance(e, WavePlate)), None)
 
     def effect(self, name: str) -> Any:
         """The active effect of a name; ValueError when there is none."""

@@ -151,7 +151,7 @@ class _Banded(NamedTuple):
 def vector_slopes(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> VectorSlopes:
     """Slopes of the analysis vectors at a field point (deg)."""
     instrument = instrument.patched()
-    numbers, overall, cameras = _numbers(instrument), _whole(instrument), len(instrument.cameras)
+    numbers, overall = _numbers(instrument), _whole(instrument)
     longest = max(map(len, numbers), default=0)
 
     def moved(sizes: Float[Array, " t"]) -> Instrument:
@@ -165,18 +165,13 @@ def vector_slopes(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> V
     rows = jnp.concatenate([block.reshape(-1, *banded.rows.shape) for block in banded[1:]])
     shifted = jax.jacfwd(mean)(jnp.zeros(()))
     means = jnp.zeros((len(rows), len(shifted))).at[-1].set(shifted)
-    neutral = (
-        banded.rows,
-        light.mean_wavelengths(instrument, plan),
-        instrument.throughput.at(x, y),
-        jnp.zeros(cameras**2),
-    )
-    value, push = jax.linearize(functools.partial(_vectors, instrument, (x, y)), *neutral)
-    zeros = [jnp.zeros_like(tangent) for tangent in neutral]
+    neutral = _neutral(instrument, plan, x, y)
+    value, push = jax.linearize(functools.partial(_vectors, instrument, (x, y)), banded.rows, *neutral)
+    zeros = [jnp.zeros_like(tangent) for tangent in (banded.rows, *neutral)]
     slopes = (
         jax.vmap(lambda tangent, mean: push(tangent, mean, *zeros[2:]))(rows, means),
-        jax.vmap(lambda tangent: push(*zeros[:2], tangent, zeros[3]))(jnp.diag(neutral[2])),
-        jax.vmap(lambda tangent: push(*zeros[:3], tangent))(jnp.eye(cameras**2)),
+        jax.vmap(lambda tangent: push(*zeros[:2], tangent, zeros[3]))(jnp.diag(neutral[1])),
+        jax.vmap(lambda tangent: push(*zeros[:3], tangent))(jnp.eye(len(neutral[2]))),
     )
     return VectorSlopes(value, jnp.concatenate(slopes))
 
@@ -195,18 +190,16 @@ def fringe_slopes(
         return changed
 
     def vectors(rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
-        none = jnp.zeros(len(instrument.cameras) ** 2)
-        return _vectors(
-            instrument,
-            (x, y),
-            rows,
-            light.mean_wavelengths(instrument, plan),
-            instrument.throughput.at(x, y),
-            none,
-        )
+        return _vectors(instrument, (x, y), rows, *_neutral(instrument, plan, x, y))
 
     banded = _banded(plan, (x, y), moved, (1, 0), gaps)
     return jax.vmap(jax.vmap(jax.linearize(vectors, banded.rows)[1]))(banded.plates[:, :, 0])
+
+
+def _neutral(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> tuple[Array, Array, Array]:
+    """Mean wavelengths, throughput, no shares."""
+    mean, throughput = light.mean_wavelengths(instrument, plan), instrument.throughput.at(x, y)
+    return mean, throughput, jnp.zeros(len(throughput) ** 2)
 
 
 def _vectors(
