@@ -114,7 +114,7 @@ def gauss_rules(node: Vector, weight: Vector, counts: range) -> Iterator[Rule]:
         yield centre + half * value, columns[0] ** 2
 
 
-def _fringe_error(rule: Rule, measure: Rule, waves: float) -> float:
+def _fringe_error(rule: Rule, measure: tuple[Vector, Vector], waves: float) -> float:
     # Phase of a plate of fixed birefringence, 2π waves · 0.62/λ, at a range of thicknesses.
     thickness = 2j * np.pi * 0.62 * waves * np.linspace(0.3, 1.0, 8)[:, None]
     mean, exact = (np.exp(thickness / node) @ weight for node, weight in (rule, measure))
