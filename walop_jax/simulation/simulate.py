@@ -136,9 +136,8 @@ def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, 
     lmax = np.asarray(standards.lmax).copy()
     if plan.star_lmax:
         polarised = np.append(np.arange(n) - plan.unpolarised, np.full(len(names) - n, -1))
-        lmax = np.where(
-            polarised < 0, lmax, np.resize(plan.star_lmax, polarised.max(initial=0) + 1)[polarised]
-        )
+        in_turn = np.array(plan.star_lmax)[polarised % len(plan.star_lmax)]
+        lmax = np.where(polarised < 0, lmax, in_turn)
     return sources, dataclasses.replace(standards, q=array(true[0]), u=array(true[1]), lmax=array(lmax))
 
 
