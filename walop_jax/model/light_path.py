@@ -150,10 +150,7 @@ class LightPath(Component):
 
     def effect(self, name: str) -> Any:
         """The active effect of a name; ValueError when there is none."""
-        for effect in self.effects:
-            if effect.name == name:
-                return effect
-        raise unknown_name("active effect", name, [effect.name for effect in self.effects])
+        return _member(self.effects, name, "active effect")
 
     # ------------------------------------------------------------------------------- changing it
 
@@ -202,11 +199,11 @@ class LightPath(Component):
         return dataclasses.replace(self, sources=tuple(sources.values()))
 
 
-def _member(members: tuple[AnyPart, ...], name: str, what: str) -> AnyPart:
-    for member in members:
-        if _name(member) == name:
-            return member
-    raise NoSuchPlaceError(str(unknown_name(what, name, [_name(member) for member in members])))
+def _member(members: tuple[Any, ...], name: str, what: str) -> Any:
+    by_name = {member.name: member for member in members}
+    if name not in by_name:
+        raise NoSuchPlaceError(str(unknown_name(what, name, by_name)))
+    return by_name[name]
 
 
 @by_shapes
@@ -224,10 +221,6 @@ def is_achromatic(element: Element) -> bool:
     return True
 
 
-def _name(member: Any) -> str:
-    return member.name
-
-
 def _changed(part: AnyPart, path: list[str], fields: dict[str, Any], place: str) -> AnyPart:
     if not path:
         names = [field.name for field in dataclasses.fields(part)]
@@ -241,9 +234,9 @@ def _changed(part: AnyPart, path: list[str], fields: dict[str, Any], place: str)
         members = getattr(part, field.name)
         if field.metadata.get("static", False) or not isinstance(members, tuple):
             continue
-        names += [_name(member) for member in members if isinstance(member, Element | Arm)]
+        names += [member.name for member in members if isinstance(member, Element | Arm)]
         for i, member in enumerate(members):
-            if isinstance(member, Component) and _name(member) == path[0]:
+            if isinstance(member, Component) and member.name == path[0]:  # pyright: ignore
                 new = (*members[:i], _changed(member, path[1:], fields, place), *members[i + 1 :])
                 return dataclasses.replace(part, **{field.name: new})
     raise NoSuchPlaceError(f"the instrument has no part {place!r}; {nearest(path[0], names)}")
