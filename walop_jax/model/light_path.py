@@ -69,8 +69,8 @@ class LightPath(Component):
     cameras: Cameras
     path: tuple[str, ...] = eqx.field(static=True)
     effects: tuple[Any, ...] = ()  # patches: `effects.base.Effect`
-    rotator_zero: Scalar | None = number(unit="deg", about="true ROTATOR minus the header's", default=None)
-    filter_shift: Scalar | None = number(unit="um", about="displacement of broad bands", default=None)
+    rotator_zero: Scalar | None = number("deg", "true ROTATOR minus the header's", default=None)
+    filter_shift: Scalar | None = number("um", "displacement of broad bands", default=None)
     sky_films: tuple[
         Any, ...
     ] = ()  # changes of light from the sky in single exposures (`effects.optics.Film`)

@@ -146,7 +146,7 @@ class MoonSky(Source):
         scale=0.05,
         default=0.8,
     )
-    missing: Scalar | None = number(unit="", about="degree taken away by multiple scattering", default=None)
+    missing: Scalar | None = number("", "degree taken away by multiple scattering", default=None)
     patches: MoonPatches | None = None
 
     name: ClassVar[str] = "sky"
@@ -197,7 +197,7 @@ class Standards(Source):
     bands: tuple[tuple[float, float], ...] = eqx.field(static=True, default=())
     stars: tuple[int, ...] = eqx.field(static=True, default=())
     unknown: tuple[int, ...] = eqx.field(static=True, default=())
-    angle: Scalar | None = number(unit="deg", about="added to all position angles", default=None)
+    angle: Scalar | None = number("deg", "added to all position angles", default=None)
     changes: tuple[Any, ...] = ()  # `effects.numbers.GrownStandard`
 
     name: ClassVar[str] = "standard"
