@@ -101,10 +101,10 @@ def _finite(value: Any) -> bool:
 
 
 def param(
-    *,
     unit: str,
     about: str,
     source: str,
+    *,
     width: float | None = None,
     scale: float | None = None,
     loose: float | None = None,

@@ -140,11 +140,7 @@ class MoonSky(Source):
     """Singly scattered moonlight, depolarised."""
 
     depolarisation: Scalar = param(
-        unit="",
-        about="δ, one for all patches and wavelengths",
-        source=f"{PAPER_II}, eq. 8",
-        scale=0.05,
-        default=0.8,
+        "", "δ, one for all patches and wavelengths", f"{PAPER_II}, eq. 8", scale=0.05, default=0.8
     )
     missing: Scalar | None = number("", "degree taken away by multiple scattering", default=None)
     patches: MoonPatches | None = None
@@ -180,19 +176,16 @@ class Standards(Source):
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
-    q: Float[Array, " s"] = param(unit="", about="catalogue q", source="SOURCES table", scale=2e-4)
-    u: Float[Array, " s"] = param(unit="", about="catalogue u", source="SOURCES table", scale=2e-4)
+    q: Float[Array, " s"] = param("", "catalogue q", "SOURCES table", scale=2e-4)
+    u: Float[Array, " s"] = param("", "catalogue u", "SOURCES table", scale=2e-4)
     lmax: Float[Array, " c"] = param(
-        unit="um", about="wavelength of largest polarisation", source=WHITTET, width=0.1, default=()
+        "um", "wavelength of largest polarisation", WHITTET, width=0.1, default=()
     )
     turn: Float[Array, " c"] = param(
-        unit="deg/um", about="slope of the angle with wavelength", source=TURN_SOURCE, width=3.0, default=()
+        "deg/um", "slope of the angle with wavelength", TURN_SOURCE, width=3.0, default=()
     )
     wavelength: Float[Array, " n"] = param(
-        unit="um",
-        about="wavelength at which the catalogue value holds",
-        source="FILTER of EXPOSURES",
-        default=(),
+        "um", "wavelength at which the catalogue value holds", "FILTER of EXPOSURES", default=()
     )
     bands: tuple[tuple[float, float], ...] = eqx.field(static=True, default=())
     stars: tuple[int, ...] = eqx.field(static=True, default=())
