@@ -6,12 +6,8 @@ PRODUCT, MODEL = "calibration.fits", "model.toml"
 SUMMARY, FAILED = "summary.json", "summary.failed.json"
 DIAGNOSIS, FIGURE_DATA = "diagnosis.json", "diagnosis.fits"
 POSTERIOR, CORNER, SAMPLE = "posterior.nc", "posterior_corner.png", "sample.json"
-COMPARISON, EPOCH, LIMITS, COMMISSIONING = (
-    "comparison.json",
-    "epoch.json",
-    "limits.json",
-    "commissioning.json",
-)
+COMPARISON, EPOCH = "comparison.json", "epoch.json"
+LIMITS, COMMISSIONING = "limits.json", "commissioning.json"
 PLANNED, WATCHED, SURVEY, AFFECTED = "plan.json", "watch.json", "survey.json", "affected.json"
 NIGHTS, REFERENCE, TRACKS = "nights.fits", "reference.fits", "tracks.fits"
 

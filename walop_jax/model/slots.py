@@ -58,10 +58,8 @@ OF_PLATE, OF_LAYER = ("axis", "thermal"), ("thickness", "axis", "cut")
 
 def trains(instrument: Instrument) -> dict[str, tuple[Element, ...]]:
     """The elements behind the polariser and those of the arms of an instrument (`patched`), by beginnings of names."""
-    return {
-        "": instrument.behind_polariser(),
-        **{f"{arm.name}.": tuple(arm.train()) for arm in instrument.arms},
-    }
+    in_arms = {f"{arm.name}.": tuple(arm.train()) for arm in instrument.arms}
+    return {"": instrument.behind_polariser()} | in_arms
 
 
 @by_shapes
@@ -256,11 +254,8 @@ def _summed(
 
     def pushed(number: int, selection: slice) -> Float[Array, "t c n r 4"]:
         """Rows for some changes of the matrix of a station."""
-        tangents = {
-            key: tangent[selection]
-            for key, tangent in slopes.items()
-            if key[0] == number and tangent is not None
-        }
+        of_station = {k: slope for k, slope in slopes.items() if k[0] == number and slope is not None}
+        tangents = {key: slope[selection] for key, slope in of_station.items()}
         if not tangents:
             return jnp.zeros((len(nothing[selection]), *rows.shape))
         behind, ahead = sides[number]
