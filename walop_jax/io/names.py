@@ -11,17 +11,8 @@ LIMITS, COMMISSIONING = "limits.json", "commissioning.json"
 PLANNED, WATCHED, SURVEY, AFFECTED = "plan.json", "watch.json", "survey.json", "affected.json"
 NIGHTS, REFERENCE, TRACKS = "nights.fits", "reference.fits", "tracks.fits"
 
-DOCUMENTS = {
-    "summary": SUMMARY,
-    "diagnosis": DIAGNOSIS,
-    "sample": SAMPLE,
-    "comparison": COMPARISON,
-    "epoch": EPOCH,
-    "limits": LIMITS,
-    "commissioning": COMMISSIONING,
-    "plan": PLANNED,
-    "survey": SURVEY,
-    "watch": WATCHED,
-    "affected": AFFECTED,
-}
+_JSON = (
+    SUMMARY, DIAGNOSIS, SAMPLE, COMPARISON, EPOCH, LIMITS, COMMISSIONING, PLANNED, SURVEY, WATCHED, AFFECTED,
+)  # fmt: skip
+DOCUMENTS = {file.removesuffix(".json"): file for file in _JSON}
 """Files of the documents of commands, by the name of the document."""
