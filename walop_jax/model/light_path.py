@@ -15,18 +15,16 @@ from typing import Any, Self, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from walop_jax.io.errors import nearest
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.simple import Analyser, Polariser
 from walop_jax.model.elements.wave_plate import WavePlate
-from walop_jax.model.parameters import Component, by_shapes, check_names, number, unknown_name
+from walop_jax.model.parameters import Component, Scalar, by_shapes, check_names, number, unknown_name
 from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import Source, Standards
 
-Scalar = Float[Array, ""]
 AnyPart = TypeVar("AnyPart", bound=Component)
 
 

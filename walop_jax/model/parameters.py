@@ -29,6 +29,7 @@ NUMBER = "walop_jax.number"
 SEVERAL = "walop_jax.several"
 
 Vector = Float[Array, " n"]
+Scalar = Float[Array, ""]
 NAME = re.compile(r"[A-Za-z0-9_.+*-]+")
 """Valid names of parameters, in models and in files."""
 

@@ -26,10 +26,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.kinds import KINDS, ExposureKind
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH
-from walop_jax.model.parameters import Component, number, param
+from walop_jax.model.parameters import Component, Scalar, number, param
 from walop_jax.model.ray import NotPlannedError
 
-Scalar = Float[Array, ""]
 PAPER_II = "Maharana et al. 2022, Paper II"
 COLOUR_OF_STANDARDS = "Serkowski, Mathewson & Ford 1975, ApJ 196, 261; Whittet et al. 1992, ApJ 386, 562"
 WHITTET = "Whittet et al. 1992, ApJ 386, 562: 0.55 µm, most stars within 0.1 µm"

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 from walop_jax.io.errors import nearest
 from walop_jax.model import materials, mueller
 from walop_jax.model.elements.base import Element, Mueller
-from walop_jax.model.parameters import number
+from walop_jax.model.parameters import Scalar, number
 from walop_jax.model.ray import Ray, Real
 
 
@@ -70,7 +70,6 @@ def wedge_rotation(direction: tuple[Real, Real, Real], angle: Real, index: Real)
 
 # --------------------------------------------------------------------------------------------------------- the elements
 
-Scalar = Float[Array, ""]
 FRAMES = ("kept", "turned")
 
 

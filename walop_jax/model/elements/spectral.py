@@ -30,10 +30,9 @@ from jaxtyping import Array, Float
 from walop_jax.model import legendre, mueller
 from walop_jax.model.conventions import FIELD_SCALE
 from walop_jax.model.elements.base import Element, Mueller
-from walop_jax.model.parameters import number, row
+from walop_jax.model.parameters import Scalar, number, row
 from walop_jax.model.ray import Ray
 
-Scalar = Float[Array, ""]
 Curve = Float[Array, " k"]
 FIELD_TERMS = {f"p{i}{j}": n for n, (i, j) in enumerate(legendre.terms(2))}
 
