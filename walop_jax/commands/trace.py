@@ -84,14 +84,8 @@ def trace(
         Traced(stages),
         {
             "stages": [
-                {
-                    "stage": stage.name,
-                    "about": stage.about,
-                    "rows": stage.rows,
-                    "columns": stage.columns,
-                    "value": stage.value.tolist(),
-                }
-                for stage in stages
+                {"stage": s.name, "about": s.about, "rows": s.rows, "columns": s.columns, "value": s.value.tolist()}
+                for s in stages
             ],
             NOT_CARRIED_OVER: list(lost),
         },
