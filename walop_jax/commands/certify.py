@@ -50,11 +50,11 @@ def certify(
 
     job.tell("checking")
     source: Any = fit_of(calibration)
-    held = Calibration.from_fit(source) if isinstance(source, FitResult) else source
+    held: Any = Calibration.from_fit(source) if isinstance(source, FitResult) else source
     if in_memory := isinstance(held, Calibration):
         path, product, catalogue = Path(IN_MEMORY), held.product, held.model.catalogue
     else:
-        path = product_path(folder_of(source))
+        path = product_path(folder_of(held))
         product, catalogue = read_product(path), catalogue_of(effects)
     with errors_naming(path):
         checks = tuple(checks_of(product, catalogue))

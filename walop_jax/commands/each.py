@@ -20,7 +20,6 @@ WORKERS = Option("With --each: in so many processes of this machine, by Dask.", 
 SCHEDULER = Option("With --each: on the workers of a Dask cluster that share the files.", "ADDRESS", str)
 
 
-
 def for_each(
     job: Job,
     command: Callable[..., Any],

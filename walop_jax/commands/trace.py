@@ -84,7 +84,13 @@ def trace(
         Traced(stages),
         {
             "stages": [
-                {"stage": s.name, "about": s.about, "rows": s.rows, "columns": s.columns, "value": s.value.tolist()}
+                {
+                    "stage": s.name,
+                    "about": s.about,
+                    "rows": s.rows,
+                    "columns": s.columns,
+                    "value": s.value.tolist(),
+                }
                 for s in stages
             ],
             NOT_CARRIED_OVER: list(lost),

@@ -435,7 +435,7 @@ OTHERS = {
     "affected": ("Catalogues that a new calibration changes", ""),
     "commissioning": ("Go or no-go", "go"),
 }
-"""Pages about no fit by the name of their document (`io.names.DOCUMENTS`): title, and the key that says if it is good."""
+"""Pages about no fit by the name of their document (`io.names.DOCUMENTS`): title, key that says if it is good."""
 
 
 def kind_of_run(folder: Path) -> str:
