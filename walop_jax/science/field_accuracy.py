@@ -141,14 +141,9 @@ class FieldAccuracy:
         """The answer in a few lines: accuracy, its limits, mistakes that could hide; of a `complete` model or not."""
         if not self.trusted:
             return (("p of a star", "not known: the calibration is not trusted"),)
-        ahead = all(mistake.ahead for mistake in self.not_measured)
-        apart = (
-            ""
-            if not self.not_measured
-            else " behind the telescope"
-            if ahead
-            else " apart from quantities not measured"
-        )
+        apart = " behind the telescope" if self.not_measured else ""
+        if not all(mistake.ahead for mistake in self.not_measured):
+            apart = " apart from quantities not measured"
         goal, lacks = f"{100 * self.goal:.3g} %", self.shortfalls
         median_error = f"{two_digits(100 * self.median)} %{apart} (median error for p ≤ 5 %)"
         median_error += f"; below {goal} over {100 * self.share:.0f} % of the field"
