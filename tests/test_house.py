@@ -139,13 +139,13 @@ def test_no_room_calls_upward_through_a_string():
 
 
 MOST_REACHED = {
-    "model.light": 4050,
+    "model.light": 3930,
     "likelihood.flux": 100,
-    "diagnosis.score": 850,
-    "commands.matrix": 23050,
-    "commands.refit": 28400,
-    "commands.diagnose": 31800,
-    "commands.apply": 31850,
+    "diagnosis.score": 800,
+    "commands.matrix": 16420,
+    "commands.refit": 27050,
+    "commands.diagnose": 30780,
+    "commands.apply": 31440,
 }
 """Lines that one must be able to follow from a module, all its imports followed: these may only become fewer."""
 
@@ -189,13 +189,13 @@ def test_the_core_is_reached_without_the_rest(entry):
 
 
 MOST_LINES = {
-    "io": 1621,
+    "io": 1599,
     "instruments": 220,
     "data": 5970,
     "sky": 435,
-    "model": 9626,
+    "model": 9521,
     "likelihood": 3380,
-    "simulation": 1128,
+    "simulation": 1118,
     "fit": 2190,
     "calibration": 2845,
     "posterior": 2380,
