@@ -39,6 +39,7 @@ from walop_jax.model.specification import Model, series_indices
 if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult
 
+Filters = Mapping[str, FilterCurve]
 _MARK = 2.0**40
 """A value that no parameter has: it finds the amplitudes of effects among all parameters."""
 
@@ -164,9 +165,8 @@ def _slopes_at(
 
         def vectors(values: Float[Array, " n"], local: Float[Array, " k"]) -> Float[Array, "b k 3"]:
             changed, rows = to_instrument(values), optics.band_rows(values, instrument, settings, x, y)
-            return (light.camera_vectors(changed, rows, local, x, y) @ light.telescope(changed, x, y))[
-                ..., :3
-            ]
+            seen = light.camera_vectors(changed, rows, local, x, y) @ light.telescope(changed, x, y)
+            return seen[..., :3]
 
         derivatives = linearised(instrument, vectors, instrument.throughput.at(x, y))
         return derivatives.value, jnp.concatenate([derivatives.plain, derivatives.local])
@@ -179,12 +179,7 @@ _slopes = compiled(_slopes_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="
 
 
 def analysis_vectors(
-    instrument: Instrument,
-    plan: Plan,
-    x: Vector,
-    y: Vector,
-    *,
-    from_sky: bool = False,
+    instrument: Instrument, plan: Plan, x: Vector, y: Vector, *, from_sky: bool = False
 ) -> Float[np.ndarray, "p b k 4"]:
     """Analysis vectors (point, band, camera, Stokes) at field positions in degrees.
 
@@ -254,7 +249,7 @@ def _matrix_and_slopes(
 def matrices(
     instrument: Instrument,
     settings: Settings,
-    filters: Mapping[str, FilterCurve],
+    filters: Filters,
     x: Vector,
     y: Vector,
     covariance: Float[np.ndarray, "n n"],
@@ -284,12 +279,7 @@ def _numbers(settings: Settings) -> tuple[Vector, Vector, Vector]:
 
 
 def matrix_draws(
-    model: Model,
-    draws: Float[np.ndarray, "d n"],
-    settings: Settings,
-    filters: Mapping[str, FilterCurve],
-    x: Vector,
-    y: Vector,
+    model: Model, draws: Float[np.ndarray, "d n"], settings: Settings, filters: Filters, x: Vector, y: Vector
 ) -> Float[np.ndarray, "d p m"]:
     """Elements of the instrument matrix at field positions (deg) for every draw of all parameters."""
     result = np.empty((len(draws), len(x), 3 * len(model.template.cameras.pairs)))
@@ -305,7 +295,7 @@ def matrix_draws(
 
 
 def matrix_slopes(
-    instrument: Instrument, setting: Settings, filters: Mapping[str, FilterCurve], x: Vector, y: Vector
+    instrument: Instrument, setting: Settings, filters: Filters, x: Vector, y: Vector
 ) -> tuple[Float[np.ndarray, "p a 3"], Float[np.ndarray, "p a 3 n"]]:
     """Instrument matrix (point, arm, element) at positions in degrees, and its derivatives to all parameters.
 
@@ -315,14 +305,13 @@ def matrix_slopes(
         return np.zeros((len(x), 0, 3)), np.zeros((len(x), 0, 3, values_of(instrument).size))
     plan = dataclasses.replace(plan_for_settings(instrument, setting, filters), work=len(x))
     numbers = (np.broadcast_to(number, len(x)) for number in _numbers(setting))
-    matrix, slopes = _in_chunks(_matrix_and_slopes(instrument, plan), x, y, *numbers)
-    return matrix, slopes
+    return _in_chunks(_matrix_and_slopes(instrument, plan), x, y, *numbers)
 
 
 def slopes_over_field(
     instrument: Instrument,
     setting: Settings,
-    filters: Mapping[str, FilterCurve],
+    filters: Filters,
     x: Vector,
     y: Vector,
     covariance: Float[np.ndarray, "n n"],
@@ -370,7 +359,7 @@ def of_structure(structure: Structure, values: Float[np.ndarray, "p m"]) -> Floa
 def effect_slopes(
     instrument: Instrument,
     setting: Settings,
-    filters: Mapping[str, FilterCurve],
+    filters: Filters,
     x: Vector,
     y: Vector,
     effects: tuple[Effect, ...],

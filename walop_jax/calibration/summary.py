@@ -25,6 +25,11 @@ def summary(
     Raises RuntimeError for a fit without a verdict.
     """
     verdict = result.checked_verdict()
+    mistakes, hidden = None, result.hidden
+    if hidden is not None:
+        columns = (hidden.names, hidden.sizes, hidden.units, hidden.kinds, hidden.measured)
+        keys = ("name", "size", "unit", "kind", "measured")
+        mistakes = [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
     parameters = {
         p.name: {"value": float(value), "sigma": float(sigma), "unit": p.unit}
         for p, value, sigma in zip(result.model.parameters, result.values, result.sigma, strict=True)
@@ -45,14 +50,7 @@ def summary(
         "doubts": list(verdict.doubts),
         "warnings": list(verdict.warnings),
         "structure": dataclasses.asdict(verdict.structure),
-        "hidden": None
-        if result.hidden is None
-        else [
-            dict(zip(("name", "size", "unit", "kind", "measured"), (*e, kind, measured), strict=True))
-            for e, kind, measured in zip(
-                result.hidden.each(), result.hidden.kinds, result.hidden.measured, strict=True
-            )
-        ],
+        "hidden": mistakes,
         "accuracy_of_p": None if accuracy is None else accuracy.document(),
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),

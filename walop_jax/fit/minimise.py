@@ -145,28 +145,16 @@ def minimise(
             break
         trial = x + step
     assert current is not None
-    return Minimum(
-        x=x,
-        expansion=current,
-        result=result,  # pyright: ignore[reportArgumentType]
-        message=_in_words(result, len(history), distance, condition),  # pyright: ignore[reportArgumentType]
-        steps=len(history),
-        scaled_gradient=distance,
-        condition=condition,
-        history=tuple(history),
+    steps, reached = len(history), f"scaled gradient {distance:.1e}"
+    messages = (
+        (RESULTS.successful, f"converged: {reached}"),
+        (RESULTS.conlim, f"parameters cannot be distinguished: condition number {condition:.1e}"),
+        (RESULTS.stagnation, f"no step lowers χ² any more, {reached}"),
+        (RESULTS.nonfinite, "the model is not finite at the start values"),
+        (RESULTS.nonlinear_max_steps_reached, f"not converged after {steps} steps, {reached}"),
     )
-
-
-def _in_words(result: optx.RESULTS, steps: int, distance: float, condition: float) -> str:
-    if bool(result == RESULTS.successful):
-        return f"converged: scaled gradient {distance:.1e}"
-    if bool(result == RESULTS.conlim):
-        return f"parameters cannot be distinguished: condition number {condition:.1e}"
-    if bool(result == RESULTS.stagnation):
-        return f"no step lowers χ² any more, scaled gradient {distance:.1e}"
-    if bool(result == RESULTS.nonfinite):
-        return "the model is not finite at the start values"
-    return f"not converged after {steps} steps, scaled gradient {distance:.1e}"
+    message = next(text for outcome, text in messages if bool(result == outcome))
+    return Minimum(x, current, result, message, steps, distance, condition, tuple(history))  # pyright: ignore[reportArgumentType]
 
 
 def distance_to_minimum(expansion: Quadratic) -> tuple[float, float]:

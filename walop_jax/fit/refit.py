@@ -44,9 +44,7 @@ TOO_LOW = 0.8  # χ²/dof below which the stated errors are those of something e
 PRIOR_EDGE = 4.0  # standard deviations
 EXCESS_NOISE = 0.5  # sigma
 LAYOUTS = 5  # times that wavelength nodes are laid out anew for thicker retarders
-ILL_CONDITIONED = (
-    1e6  # for each intensity: eigenvalues of data grow with their number, those of priors do not
-)
+ILL_CONDITIONED = 1e6  # for each intensity: eigenvalues of data grow with their number, not those of priors
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -183,10 +181,8 @@ class FitResult(Fitted):
     def checked_verdict(self) -> Verdict:
         """The verdict; raises RuntimeError for a fit without one."""
         if self.verdict is None:
-            raise RuntimeError(
-                "the residuals of this fit are not examined yet: call walop_jax.diagnosis.trust.examined(fit), as "
-                "walop_jax.refit and walop_jax.diagnose do"
-            )
+            what = "the residuals of this fit are not examined yet: call walop_jax.diagnosis.trust.examined(fit), as"
+            raise RuntimeError(f"{what} walop_jax.refit and walop_jax.diagnose do")
         return self.verdict
 
     @property
@@ -202,9 +198,8 @@ class FitResult(Fitted):
         """The sentences of the verdict; of a fit that was not examined, those on χ², priors and convergence."""
         if self.verdict is not None:
             return self.verdict.warnings
-        return tuple(
-            doubt.sentence for doubt in _against(self, (), examined=False, noiseless=False) if doubt.sentence
-        )
+        doubts = _against(self, (), examined=False, noiseless=False)
+        return tuple(doubt.sentence for doubt in doubts if doubt.sentence)
 
     def value(self, name: str) -> tuple[float, float]:
         """Value and standard error of a parameter."""
@@ -248,10 +243,9 @@ def check_constrained(model: Model, expansion: Expansion) -> None:
     """Raise ValueError for a free parameter without data and without a prior."""
     idle = [model.parameters[i].name for i in model.free[np.diag(expansion.matrix) == 0.0]]
     if idle:
-        raise ValueError(
-            f"nothing in the data depends on {', '.join(idle)}, free and without a prior: freeze "
-            f"{'it' if len(idle) == 1 else 'them'} or set a prior in the model file"
-        )
+        what = f"nothing in the data depends on {', '.join(idle)}, free and without a prior"
+        them = "it" if len(idle) == 1 else "them"
+        raise ValueError(f"{what}: freeze {them} or set a prior in the model file")
 
 
 def covariance(model: Model, expansion: Expansion) -> Matrix:
@@ -317,12 +311,8 @@ def with_honest_errors(result: FitResult) -> FitResult:
         return result
     robust = robust_errors(result.likelihood, result.values, result.expansion)
     select = result.model.selection()
-    return dataclasses.replace(
-        result,
-        covariance=select @ robust.covariance @ select.T,
-        errors_from=robust.made_from,
-        verdict=None,
-    )
+    errors = select @ robust.covariance @ select.T
+    return dataclasses.replace(result, covariance=errors, errors_from=robust.made_from, verdict=None)
 
 
 def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noiseless: bool) -> Iterator[Doubt]:
@@ -338,17 +328,11 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
     if result.minimum.condition > ILL_CONDITIONED * result.n_data:
         yield Doubt(Quality.ILL_CONDITIONED, "", blocking=False)
     if result.dof <= 0:
-        yield Doubt(
-            Quality.UNEXPLAINED | excess,
-            f"{result.n_data} intensities for {len(result.model.free)} free parameters: nothing is left to test",
-        )
+        what = f"{result.n_data} intensities for {len(result.model.free)} free parameters: nothing is left to test"
+        yield Doubt(Quality.UNEXPLAINED | excess, what)
     elif examined and not doubts and result.nearly_explains_data:
-        yield Doubt(
-            excess,
-            f"χ²/dof = {ratio:.4g} with nothing but noise in the residuals: the stated errors N_ERR are "
-            f"{100 * (np.sqrt(ratio) - 1):.2g} % too small",
-            blocking=False,
-        )
+        what = f"χ²/dof = {ratio:.4g} with nothing but noise in the residuals: the stated errors N_ERR are"
+        yield Doubt(excess, f"{what} {100 * (np.sqrt(ratio) - 1):.2g} % too small", blocking=False)
     elif not result.explains_data:
         yield Doubt(
             Quality.UNEXPLAINED | excess,
@@ -377,10 +361,8 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
         p, value = result.model[name], result.value(name)[0]
         assert p.prior is not None
         pull = (value - p.prior[0]) / p.prior[1]
-        yield Doubt(
-            Quality.AT_PRIOR_EDGE,
-            f"{name} = {value:.6g} {p.unit} lies {pull:+.1f} prior widths from {p.prior[0]:g}",
-        )
+        text = f"{name} = {value:.6g} {p.unit} lies {pull:+.1f} prior widths from {p.prior[0]:g}"
+        yield Doubt(Quality.AT_PRIOR_EDGE, text)
     yield from (Doubt(Quality.DOUBTED, sentence) for sentence in doubts)
     if result.errors_from != STATED:
         reason = result.errors_from.removeprefix("residuals: ").replace("chi2/dof", "χ²/dof")

@@ -78,13 +78,10 @@ def with_pixels(result: FitResult) -> FitResult:
 
 def values_then(result: FitResult) -> Float[np.ndarray, " n"]:
     """Values at which the pixels of a set were summed; parameters that were not there then have their start values."""
-    compression = result.calset.compression
+    compression, model = result.calset.compression, result.model
     assert compression is not None
-    model = result.model
-    values = [
-        compression.values.get(name, value) for name, value in zip(model.names, model.start, strict=True)
-    ]
-    return np.array(values)[model.masters]
+    starts = zip(model.names, model.start, strict=True)
+    return np.array([compression.values.get(name, start) for name, start in starts])[model.masters]
 
 
 def moved(result: FitResult) -> float:

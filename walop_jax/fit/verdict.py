@@ -94,10 +94,8 @@ class Structure:
 
 
 NO_STRUCTURE = Structure()
-
-
 NOT_MEASURED = (
-    "the calibration data hold no information on {}; Q_HIDDEN, U_HIDDEN of stars have it, Q_ERR, U_ERR do not"
+    "the calibration data hold no information on {}; Q_HIDDEN, U_HIDDEN of stars have it, Q_ERR, U_ERR not"
 )
 """Remark on mistakes without information in the data, at their usual sizes."""
 EFFECT, DATA = "effect", "data"
@@ -199,9 +197,7 @@ class Verdict:
     @property
     def doubts(self) -> tuple[str, ...]:
         """The sentences about the residuals alone (`Quality.DOUBTED`)."""
-        return tuple(
-            doubt.sentence for doubt in self.against if doubt.bit & Quality.DOUBTED and doubt.sentence
-        )
+        return tuple(d.sentence for d in self.against if d.bit & Quality.DOUBTED and d.sentence)
 
     @property
     def words(self) -> str:

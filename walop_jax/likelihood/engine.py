@@ -138,9 +138,7 @@ def best_flux(
     flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, flux_known, shared)
     if not light.is_linear(instrument):
         for _ in range(NEWTON_STEPS):
-            counts, slope = jax.jvp(
-                lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
-            )
+            counts, slope = counts_and_slope(instrument, plan, unit, flux)
             missing = (point.counts - counts) * point.weight
             step, _ = eliminate_flux(missing, slope * point.weight, flux_known, shared)
             flux = jnp.where(flux_known[:, None], flux, flux + step)
@@ -152,6 +150,13 @@ def real_counts(
 ) -> Float[Array, "e k"]:
     """Counts that the detectors report for light of a flux, `unit` being the counts for light of unit flux."""
     return light.detected(instrument, plan.exposures, flux * unit)
+
+
+def counts_and_slope(
+    instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], flux: Float[Array, "e f"]
+) -> tuple[Float[Array, "e k"], Float[Array, "e k"]]:
+    """The same, and their derivative with respect to the flux."""
+    return jax.jvp(lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),))
 
 
 def point_residuals(
@@ -243,14 +248,6 @@ def _point_jacobian(
     return residual.reshape(-1), -projected.reshape(d_counts.shape[0], -1)
 
 
-def _point_normal(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None
-) -> tuple[Float[Array, ""], Float[Array, " l"], Float[Array, "l l"]]:
-    """χ², Jᵀr and JᵀJ of one point in its local quantities."""
-    r, jacobian = _point_jacobian(instrument, plan, point, nodes)
-    return r @ r, jacobian @ r, jacobian @ jacobian.T
-
-
 def normal_equations(
     instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None = None
 ) -> Normal:
@@ -262,11 +259,8 @@ def normal_equations(
         return Normal(*map(np.asarray, _table_equations(instrument, plan, data, nodes)))
     size, chi2, gradient, matrix = values_of(instrument).size, 0.0, 0.0, 0.0
     for start in range(0, len(data.x), limits.BATCH):
-        points = data
-        if len(data.x) > limits.BATCH:
-            points = jax.tree.map(
-                lambda leaf, first=start: np.asarray(leaf)[first : first + limits.BATCH], data
-            )
+        rows = slice(start, start + limits.BATCH)
+        points = jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], data)
         residual, slope = map(np.asarray, linearised_residuals(instrument, plan, points))
         r, jacobian = residual.reshape(-1), slope.reshape(-1, size)
         chi2, gradient, matrix = chi2 + r @ r, gradient + jacobian.T @ r, matrix + jacobian.T @ jacobian
@@ -296,9 +290,13 @@ def summed(function: Callable[[Any], Any], parts: Any) -> Any:
 
 def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:
     size, series, plain = values_of(instrument).size, series_indices(instrument), plain_positions(instrument)
-    chi2, gradient, gram = jax.vmap(_point_normal, in_axes=(None, None, 0, None))(
-        instrument, plan, data, nodes
-    )
+
+    def of_point(point: PointData) -> tuple[Float[Array, ""], Float[Array, " l"], Float[Array, "l l"]]:
+        """χ², Jᵀr and JᵀJ in its local quantities."""
+        r, jacobian = _point_jacobian(instrument, plan, point, nodes)
+        return r @ r, jacobian @ r, jacobian @ jacobian.T
+
+    chi2, gradient, gram = jax.vmap(of_point)(data)
     k = plain.size
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
     g = jnp.zeros(size).at[plain].set(gradient[:, :k].sum(axis=0))
@@ -330,10 +328,8 @@ def _linearised_residuals(
     residual, local = jax.vmap(_point_jacobian, in_axes=(None, None, 0))(instrument, plan, data)
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
     count = plain_positions(instrument).size
-    slope = jax.vmap(lambda columns, at: to_all(instrument, columns[:count], columns[count:], at))(
-        local, basis
-    )
-    return residual, slope
+    spread = jax.vmap(lambda columns, at: to_all(instrument, columns[:count], columns[count:], at))
+    return residual, spread(local, basis)
 
 
 def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:

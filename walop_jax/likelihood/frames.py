@@ -212,11 +212,11 @@ class Cells:
         """Edges of the columns and rows of cells, or of blocks of `together` × `together` of them, within the frame."""
         rows, columns = self.shape
         counts = ((columns, self.grid.width), (rows, self.grid.height))
-        edges = [
+        s, t = (
             np.minimum(np.append(np.arange(0, n, together), n) * self.side, pixels) / pixels * 2.0 - 1.0
             for n, pixels in counts
-        ]
-        return edges[0], edges[1]
+        )
+        return s, t
 
     def middles(self, together: int = 1) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " r"]]:
         """Middles of the columns and rows of cells, or of blocks of them."""
@@ -385,9 +385,8 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
         strip = strip_sums(pixels, jnp.asarray(series), across, along, jnp.zeros(cells.side), fixed, together)
         if int(strip.impossible):
             frames.block(top * cells.grid.width, bottom * cells.grid.width)  # names the pixel
-        return np.asarray(strip.moments), jax.tree.map(
-            lambda leaf: np.asarray(leaf)[..., :columns], strip.cells
-        )
+        cut = jax.tree.map(lambda leaf: np.asarray(leaf)[..., :columns], strip.cells)
+        return np.asarray(strip.moments), cut
 
     step = height * cells.grid.width * every
     moments, strip_cells = np.zeros(series.shape), []
@@ -422,15 +421,8 @@ def _series(
         return _at(_solve, likelihood, instrument, *cells.field(s, t))
 
     def error(interpolated: Smooth, truth: Smooth) -> float:
-        off = [
-            float(np.abs(value - true_value).max())
-            for value, true_value in (
-                (interpolated.unit[..., exposures], truth.unit[..., exposures]),
-                (interpolated.vectors, truth.vectors),
-                (interpolated.stokes[:, exposures], truth.stokes[:, exposures]),
-            )
-        ]
-        return max(off) if np.all(np.isfinite(off)) else float("nan")
+        chosen = ((s.unit[..., exposures], s.vectors, s.stokes[:, exposures]) for s in (interpolated, truth))
+        return float(np.max([np.abs(a - b).max() for a, b in zip(*chosen, strict=True)]))
 
     return accurate_table(exact, FRAME, limits.NODES_PER_SIDE, TOLERANCE, error)
 

@@ -64,12 +64,8 @@ class DataTerms(NamedTuple):
 
     def joined(self, other: DataTerms) -> DataTerms:
         """The terms of two parts of a set."""
-        return DataTerms(
-            self.data + other.data,
-            self.gradient + other.gradient,
-            self.matrix + other.matrix,
-            self.census.joined(other.census),
-        )
+        a, b, census = self, other, self.census.joined(other.census)
+        return DataTerms(a.data + b.data, a.gradient + b.gradient, a.matrix + b.matrix, census)
 
 
 Joined = TypeVar("Joined", Census, DataTerms)
@@ -154,9 +150,9 @@ def prior_rows(model: Model) -> PriorRows:
             rows.append((i, *p.prior, True))
         elif p.loose is not None:
             rows.append((i, p.start, p.loose, False))
-    index, mean, width, measured = zip(*rows, strict=True) if rows else ((), (), (), ())
+    index, mean, width, known = zip(*rows, strict=True) if rows else ((),) * 4
     return PriorRows(
-        np.array(index, int), np.array(mean, float), np.array(width, float), np.array(measured, bool)
+        np.array(index, int), np.array(mean, float), np.array(width, float), np.array(known, bool)
     )
 
 
@@ -349,9 +345,7 @@ class Likelihood:
     @cached_property
     def used(self) -> Bool[np.ndarray, "p e"]:
         """True where the intensities of a (point, exposure) are used."""
-        return np.concatenate([np.asarray(batch.weight)[..., 0] > 0 for batch in self.points])[
-            : self.layout.points
-        ]
+        return self.points.gathered("weight")[..., 0] > 0
 
     # ----------------------------------------------------------------------------------------- row by row
 
@@ -364,9 +358,9 @@ class Likelihood:
         nodes, _ = self.nodes(instrument)
         batches = [engine.residuals(instrument, self.plan, batch, nodes) for batch in self.points]
         flux, residual = (
-            np.concatenate([np.asarray(batch_result[i]) for batch_result in batches]) for i in (0, 1)
+            np.concatenate(arrays)[: self.layout.points] for arrays in zip(*batches, strict=True)
         )
-        return flux[: self.layout.points].mean(axis=-1), residual[: self.layout.points]
+        return flux.mean(axis=-1), residual
 
     def jacobian(self, values: Vector) -> Float[np.ndarray, "d f"]:
         """Derivatives of the used residuals with respect to the free parameters, dense: for tables, not frames.
@@ -374,16 +368,13 @@ class Likelihood:
         Rows run over points, then exposures, then cameras, as in `residuals(values)[1][self.used]`.
         """
         instrument, select = self.model.instrument(values), self.model.selection()
-        matrices = [
-            used_rows(engine.linearised_residuals(instrument, self.plan, c)[1], c) @ select
-            for c in self.points
-        ]
-        return np.concatenate(matrices)
+        slopes = ((engine.linearised_residuals(instrument, self.plan, c)[1], c) for c in self.points)
+        return np.concatenate([used_rows(slope, batch) @ select for slope, batch in slopes])
 
     def stokes(self, values: Vector) -> Float[np.ndarray, "p e 4"]:
         """Stokes vectors that enter the instrument, per unit flux."""
         instrument = self.model.instrument(values)
-        vectors = [np.asarray(engine.incoming(instrument, self.plan, batch)) for batch in self.points]
+        vectors = [engine.incoming(instrument, self.plan, batch) for batch in self.points]
         return np.concatenate(vectors)[: self.layout.points]
 
 

@@ -108,14 +108,11 @@ def mixture(moves: str) -> list[tuple[Any, float]]:
     """Return emcee's moves with their shares; ValueError for an unknown name."""
     from emcee import moves as made
 
-    evolution = [(made.DEMove(), 1.0 - JUMPS), (made.DEMove(gamma0=1.0), JUMPS)]
-    if moves == "laplace":
-        return [
-            (made.MHMove(_laplace_draws), 0.5),
-            *((move, 0.5 * share) for move, share in evolution),
-        ]
-    if moves == "de":
-        return evolution
+    if moves not in MOVES:
+        raise ValueError(f"there are no moves {moves!r}: choose one of {', '.join(MOVES)}")
     if moves == "stretch":
         return [(made.StretchMove(), 1.0)]
-    raise ValueError(f"there are no moves {moves!r}: choose one of {', '.join(MOVES)}")
+    evolution = [(made.DEMove(), 1.0 - JUMPS), (made.DEMove(gamma0=1.0), JUMPS)]
+    if moves == "de":
+        return evolution
+    return [(made.MHMove(_laplace_draws), 0.5), *((move, 0.5 * share) for move, share in evolution)]

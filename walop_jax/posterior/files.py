@@ -80,10 +80,8 @@ class Chain:
             for number, (state, stretch) in enumerate(zip(states, stretches, strict=True)):
                 steps, walkers, dimension = stretch.positions.shape
                 group = file.create_group(f"ensemble{number}")
-                group.attrs.update(
-                    {"version": "3", "nwalkers": walkers, "ndim": dimension, "has_blobs": False}
-                )
-                group.attrs.update({"iteration": steps, **random_attributes(state)})
+                size = {"nwalkers": walkers, "ndim": dimension, "iteration": steps}
+                group.attrs.update({"version": "3", "has_blobs": False, **size, **random_attributes(state)})
                 group["chain"], group["log_prob"] = stretch.positions, stretch.log_density
                 group["accepted"] = stretch.acceptance.sum(axis=0)
 
@@ -98,14 +96,10 @@ class Chain:
 
         try:
             with h5py.File(self.path, "r") as file:
-                before, seconds = (
-                    json.loads(str(file.attrs["fingerprint"])),
-                    float(str(file.attrs["seconds"])),
-                )
-                count = len(file)
-            arrays: list[Any] = [
-                HDFBackend(str(self.path), name=f"ensemble{n}", read_only=True) for n in range(count)
-            ]
+                before, count = json.loads(str(file.attrs["fingerprint"])), len(file)
+                seconds = float(str(file.attrs["seconds"]))
+            path = str(self.path)
+            arrays: list[Any] = [HDFBackend(path, name=f"ensemble{n}", read_only=True) for n in range(count)]
             stretches = [Stretch(k.get_chain(), k.get_log_prob(), _shares(k)) for k in arrays]
             states = [
                 emcee_state(s.positions[-1], s.log_density[-1], k.random_state)
@@ -114,13 +108,9 @@ class Chain:
         except Exception as error:  # whatever a damaged file brings about
             raise fail(f"cannot be read: {error}", file=self.path, advice=_ADVICE) from error
         keys = sorted({*before, *self.fingerprint})
-        changed = [key for key in keys if before.get(key) != self.fingerprint.get(key)]
-        if changed:
-            what = ", ".join(
-                f"{k} ({before.get(k, 'none')[:12]} → {self.fingerprint.get(k, 'none')[:12]})"
-                for k in changed
-            )
-            raise fail(f"was sampled with other {what}", file=self.path, advice=_ADVICE)
+        pairs = {key: (before.get(key, "none"), self.fingerprint.get(key, "none")) for key in keys}
+        if changed := [f"{k} ({a[:12]} → {b[:12]})" for k, (a, b) in pairs.items() if a != b]:
+            raise fail(f"was sampled with other {', '.join(changed)}", file=self.path, advice=_ADVICE)
         return states, stretches, seconds
 
 

@@ -130,40 +130,35 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
         """
         diagnosis = self.documents.get("diagnosis", {})
         if diagnosis.get("members") or diagnosis.get("shape"):
-            raise fail(
-                A_MEAN,
-                file=self.folder,
-                advice=f"fit one: walop-jax refit --model {self.folder / MODEL}, and take that run",
-            )
+            advice = f"fit one: walop-jax refit --model {self.folder / MODEL}, and take that run"
+            raise fail(A_MEAN, file=self.folder, advice=advice)
         calibration, calset = self.rebuilt, self.calset
         text = "\n".join(calibration.product.model_lines) if model_text is None else model_text
         model = model_for(calset, text, calibration.design, self.catalogue)
+        advice = "run walop-jax refit with this model and version first"
         if model.names != calibration.model.names:
-            advice = "run walop-jax refit with this model first"
             raise fail("was fitted with another model", file=self.folder, advice=advice)
         likelihood = Likelihood.of(calset, model)
         if likelihood.layout.large:
-            raise fail(
-                f"has {len(calset.points)} field points: the posterior of so many is as good as normal, and "
-                "calibration.fits holds its covariance",
-                file=calibration.inputs[0].path,
-                advice=f"sample a set of up to {limits.LARGE_ABOVE} points; walop-jax refit --compress makes one",
+            what = (
+                f"has {len(calset.points)} field points: the posterior of so many is as good as normal, and"
             )
+            advice = (
+                f"sample a set of up to {limits.LARGE_ABOVE} points; walop-jax refit --compress makes one"
+            )
+            path = calibration.inputs[0].path
+            raise fail(f"{what} calibration.fits holds its covariance", file=path, advice=advice)
         result = fit(likelihood, start=calibration.values)
         away = np.abs(result.values - calibration.values) / np.where(result.sigma > 0, result.sigma, 1.0)
         if not result.converged or np.max(away) > SAME_FIT:
-            name = model.names[int(np.argmax(away))]
-            raise fail(
-                f"fitted again, {name} moves by {np.max(away):.2g} standard errors", file=self.folder,
-                advice="run walop-jax refit with this model and version first",
-            )  # fmt: skip
+            what = f"{model.names[int(np.argmax(away))]} moves by {np.max(away):.2g} standard errors"
+            raise fail(f"fitted again, {what}", file=self.folder, advice=advice)
         if calibration.verdict.errors_from != STATED:
             result = with_honest_errors(result)
         verdict = calibration.verdict
         if result.errors_from != verdict.errors_from and verdict.covariance_from == "fit":
-            result = dataclasses.replace(
-                result, covariance=calibration.covariance, errors_from=verdict.errors_from
-            )
+            errors = {"covariance": calibration.covariance, "errors_from": verdict.errors_from}
+            result = dataclasses.replace(result, **errors)
         return dataclasses.replace(result, verdict=verdict)
 
     def display(self) -> Display:

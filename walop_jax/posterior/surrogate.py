@@ -39,7 +39,7 @@ from jaxtyping import Array, Float, Int
 from walop_jax.model.compiled import compiled
 from walop_jax.posterior.draws import INFLATION
 from walop_jax.posterior.samplers import Density
-from walop_jax.posterior.target import LN_F_WIDTH, Target, choose_sampled
+from walop_jax.posterior.target import LN_F_WIDTH, Target, choose_sampled, ln_f_unit
 
 Matrix = Float[np.ndarray, "..."]
 Draws = Float[np.ndarray, "n k"]
@@ -84,7 +84,7 @@ class Surrogate:
     @property
     def ln_f_unit(self) -> float:
         """Change of ln f per unit of its coordinate."""
-        return 1.0 / np.sqrt(2.0 * max(self.measured, 1))
+        return ln_f_unit(self.measured)
 
     def weight(self, z: Draws) -> Float[np.ndarray, " n"]:
         """1/f² of every draw."""
@@ -156,10 +156,7 @@ class Surrogate:
         return self.centre + z[:, : self.along.shape[1]] @ self.along.T + s @ self.across.T
 
     def moments(self, z: Draws) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f f"]]:
-        """Mean and covariance of all free parameters.
-
-        E and Var of the conditional, averaged over draws (Rao–Blackwell).
-        """
+        """Mean and covariance of all free parameters: E and Var of the conditional, averaged (Rao–Blackwell)."""
         mean, variance = self._conditional(z)
         x = self.place(z, mean @ self.linear.T)
         inner = (self.across @ self.linear) * np.sqrt(variance.mean(axis=0))
@@ -212,8 +209,11 @@ def _axes(covariance: Matrix, scale: Float[np.ndarray, " k"]) -> Matrix:
 
 
 def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Matrix, Matrix]:
-    marginalised = np.setdiff1d(np.arange(len(target.free)), sampled)
-    c, scale = target.covariance, target.scale
+    marginalised, c, scale = (
+        np.setdiff1d(np.arange(len(target.free)), sampled),
+        target.covariance,
+        target.scale,
+    )
     axes = _axes(c[np.ix_(sampled, sampled)], scale[sampled])
     follow = np.linalg.solve(axes, c[np.ix_(sampled, marginalised)]).T  # C_λφ A⁻ᵀ
     along, across = np.zeros((len(c), len(sampled))), np.zeros((len(c), len(marginalised)))
@@ -222,13 +222,6 @@ def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Matrix
         c[np.ix_(marginalised, marginalised)] - follow @ follow.T, scale[marginalised]
     )
     return along, across
-
-
-def _design(rng: np.random.Generator, odd: int, even: int, width: int) -> Draws:
-    """Points ±u with u normal: odd and even parts of the residuals separate."""
-    pairs = max(0.5 * OVERSAMPLING * (odd + even), LEAST * max(odd, even)) + 1.0
-    half = SPREAD * rng.standard_normal((int(np.ceil(pairs)), width))
-    return np.concatenate([half, -half])
 
 
 def _gram(target: Target, x: Float[np.ndarray, "m f"], progress: Callable[[int, int], None] | None) -> Matrix:
@@ -269,17 +262,16 @@ def build_surrogate(
     triples = np.array(list(itertools.combinations_with_replacement(bent, 3)), int).reshape(-1, 3)
     odd, even = k + len(triples) + s, 1 + len(pairs)
     n_features = odd + even
-    design = _design(np.random.default_rng([seed, 20]), odd, even, k + s)
+    # Points ±u with u normal: odd and even parts of the residuals separate.
+    count = max(0.5 * OVERSAMPLING * n_features, LEAST * max(odd, even)) + 1.0
+    half = SPREAD * np.random.default_rng([seed, 20]).standard_normal((int(np.ceil(count)), k + s))
+    design = np.concatenate([half, -half])
     x = target.centre + design[:, :k] @ along.T + design[:, k:] @ across.T
-    y = np.concatenate(
-        [np.asarray(features_of(*(jnp.asarray(a) for a in (design[:, :k], pairs, triples)))), design[:, k:]],
-        axis=1,
-    )
+    features = features_of(*(jnp.asarray(a) for a in (design[:, :k], pairs, triples)))
+    y = np.concatenate([np.asarray(features), design[:, k:]], axis=1)
     q, r = np.linalg.qr(y)
-    inverse = np.linalg.solve(r, q.T)
-    gram = _gram(target, x, progress)
-    data = inverse @ gram[1:, 1:] @ inverse.T
-    cross = inverse @ gram[1:, 0]
+    inverse, gram = np.linalg.solve(r, q.T), _gram(target, x, progress)
+    data, cross = inverse @ gram[1:, 1:] @ inverse.T, inverse @ gram[1:, 0]
     data[0] += cross
     data[:, 0] += cross
     data[0, 0] += gram[0, 0]
@@ -307,10 +299,7 @@ def _prior_form(target: Target, along: Matrix, across: Matrix, n_features: int) 
 def _determinant_slopes(
     target: Target, along: Matrix, across: Matrix
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " s"]]:
-    """Derivatives of ln det H_ss along both kinds of coordinates.
-
-    Columns of `across` make H_ss the unit matrix.
-    """
+    """Derivatives of ln det H_ss along both kinds of coordinates; columns of `across` make H_ss the unit matrix."""
     total, twice = np.zeros(len(target.centre)), 2.0 * target.half_gradient(target.centre)
     for step in across.T:
         up, down = (target.half_gradient(target.centre + sign * step) for sign in (1, -1))
@@ -345,10 +334,8 @@ class Accuracy:
     @property
     def exact_enough(self) -> bool:
         """True where sampling the surrogate is sampling the posterior: means to 0.1 σ, widths to 5 %."""
-        shift, width = (
-            abs(value) - 3.0 * error
-            for value, error in (self.shift[1:], (self.width[1] - 1.0, self.width[2]))
-        )
+        pairs = self.shift[1:], (self.width[1] - 1.0, self.width[2])
+        shift, width = (abs(value) - 3.0 * error for value, error in pairs)
         return bool(np.isfinite(self.spread)) and self.efficiency > 0.5 and shift < 0.1 and width < 0.05
 
 

@@ -26,6 +26,7 @@ from walop_jax.posterior.draws import INFLATION
 from walop_jax.posterior.samplers import Density
 
 Vector = Float[np.ndarray, " f"]
+Draws = Float[np.ndarray, "n k"]
 LARGEST_SAMPLED = 20
 LN_F_WIDTH = 1.0  # prior of ln f, the noise inflation
 NEAR_LINEAR = ("throughput", "standard")
@@ -36,6 +37,11 @@ def _instrument(template: Instrument, values: Float[Array, " n"]) -> Instrument:
     return with_values(template)(values)
 
 
+def ln_f_unit(measured: int) -> float:
+    """Change of ln f, the noise inflation, per unit of its coordinate: about its standard error."""
+    return 1.0 / np.sqrt(2.0 * max(measured, 1))
+
+
 class Target:
     """−2 ln posterior of a fitted model in its free parameters x, around the fit at `centre`."""
 
@@ -43,12 +49,9 @@ class Target:
         self.likelihood, self._near = result.likelihood, result.expansion
         self.model = result.model
         self.free = result.model.free
-        self.centre: Vector = np.asarray(result.values)[self.free]
-        self.covariance: Float[np.ndarray, "f f"] = np.asarray(result.covariance)[
-            np.ix_(self.free, self.free)
-        ]
-        self.noise_scale = result.noise_scale
-        self._fitted = np.asarray(result.values)
+        self.centre: Vector = result.values[self.free]
+        self.covariance: Float[np.ndarray, "f f"] = result.covariance[np.ix_(self.free, self.free)]
+        self.noise_scale, self._fitted = result.noise_scale, result.values
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -74,7 +77,7 @@ class Target:
     @property
     def ln_f_unit(self) -> float:
         """Change of ln f, the noise inflation, per unit of its coordinate: about its standard error."""
-        return 1.0 / np.sqrt(2.0 * max(self.measured, 1))
+        return ln_f_unit(self.measured)
 
     def values(self, x: Vector) -> Float[np.ndarray, " n"]:
         """All parameters, frozen and tied ones included."""
@@ -178,17 +181,14 @@ class ExactPosterior:
     def monitored(self, z: Float[np.ndarray, "... k"]) -> Float[np.ndarray, "... q"]:
         """The free parameters (and ln f), in the order of their names."""
         free, k = len(self.target.free), len(self.sampled)
-        x = self.target.centre + z[..., :free] @ self.target.root.T
-        x = x[..., self._order]
+        x = (self.target.centre + z[..., :free] @ self.target.root.T)[..., self._order]
         return np.concatenate([x[..., :k], z[..., free:] * self.ln_f_unit, x[..., k:]], axis=-1)
 
-    def draw(self, z: Float[np.ndarray, "n k"], rng: np.random.Generator) -> Float[np.ndarray, "n f"]:
+    def draw(self, z: Draws, rng: np.random.Generator) -> Float[np.ndarray, "n f"]:
         """Free parameters at sampled coordinates; nothing is left to be drawn."""
         return self.target.centre + z[:, : len(self.target.free)] @ self.target.root.T
 
-    def moments(
-        self, z: Float[np.ndarray, "n k"]
-    ) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f f"]]:
+    def moments(self, z: Draws) -> tuple[Vector, Float[np.ndarray, "f f"]]:
         """Mean and covariance of all free parameters over draws."""
         x = self.draw(z, np.random.default_rng(0))
         return x.mean(axis=0), np.cov(x, rowvar=False).reshape(2 * (x.shape[1],))
