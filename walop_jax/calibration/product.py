@@ -577,5 +577,5 @@ def _listed(table: Mapping[str, Any], model_lines: Sequence[str]) -> tuple[Param
             "tie": entry.get("tie"),
             "part": str(name).partition(".")[0],
         }  # names are all that a file has
-        parameters.append(Parameter(str(name), str(unit), "", "", start, prior, bool(free), 1.0, **known))
+        parameters.append(Parameter(str(name), str(unit), "", "", start, prior, bool(free), 1.0, **stated))
     return tuple(parameters)

@@ -172,8 +172,7 @@ class FrameIntensities(Intensities):
             values = cube.rows(top, bottom)
             return values.reshape(len(values), -1)[:, inside].T
 
-        counts = np.stack([columns(cube) for cube in stack.counts], axis=-1)
-        sigma = np.stack([columns(cube) for cube in stack.sigma], axis=-1)
+        counts, sigma = (np.stack(list(map(columns, s)), axis=-1) for s in (stack.counts, stack.sigma))
         if stack.flag is None:
             return counts, sigma, np.zeros(counts.shape[:2], dtype=np.int64)
         # An undefined flag is no clean bill of health.
@@ -207,32 +206,26 @@ def frame_stack(images: Mapping[str, Any], exposures: int, path: Path) -> tuple[
     check_units(units, "electron", Place(path, "BUNIT"))
     if len(grids) > 1:
         reference, second, *_ = grids.values()
-        raise fail(
-            f"{reference} and {second} do not lie on the same grid", file=path, advice="resample them first"
-        )
-    grid = next(iter(grids))
-    flag = cubes.get("FLAG")
+        what = f"{reference} and {second} do not lie on the same grid"
+        raise fail(what, file=path, advice="resample them first")
+    grid, flag = next(iter(grids)), cubes.get("FLAG")
     if flag is not None and flag.shape[1:] != (grid.height, grid.width):
         raise fail("does not have the shape of N0", file=path, extension="FLAG", advice="write it anew")
-    return grid, FrameStack(
-        exposures, tuple(cubes[name] for name in counts), tuple(cubes[name] for name in errors), flag
-    )
+    of_camera = (tuple(cubes[name] for name in names) for names in (counts, errors))
+    return grid, FrameStack(exposures, *of_camera, flag)
 
 
 def _cube(hdu: Any, exposures: int, place: Place) -> Cube:
     header = hdu.header
     if "ZIMAGE" in header:
-        raise place.fail(
-            "is compressed tile by tile", advice="unpack it with funpack: frames are read in slabs"
-        )
+        advice = "unpack it with funpack: frames are read in slabs"
+        raise place.fail("is compressed tile by tile", advice=advice)
     shape = tuple(int(header[f"NAXIS{n}"]) for n in range(int(header["NAXIS"]), 0, -1))
     shape = (1, *shape) if len(shape) == 2 else shape
     planes = (exposures, 1) if place.extension == "FLAG" else (exposures,)
     if len(shape) != 3 or shape[0] not in planes or 0 in shape:
-        raise place.fail(
-            f"has shape {shape} where ({exposures}, ny, nx) is needed",
-            advice="one plane per row of EXPOSURES",
-        )
+        what = f"has shape {shape} where ({exposures}, ny, nx) is needed"
+        raise place.fail(what, advice="one plane per row of EXPOSURES")
     path = Path(str(place.file)).absolute()
     info, stat = hdu.fileinfo(), path.stat()
     kinds = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}

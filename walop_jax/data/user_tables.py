@@ -154,9 +154,8 @@ def in_memory(columns: Any, name: str = "the table") -> InputTable:
             single = {key for key, values in dict(columns).items() if np.ndim(values) == 0}
             table = Table({k: np.repeat(v, rows, axis=0) if k in single else v for k, v in arrays.items()})
     except (TypeError, ValueError) as error:
-        raise fail(
-            f"is no table: {one_line(error)}", file=name, advice="give columns of one length"
-        ) from error
+        advice = "give columns of one length"
+        raise fail(f"is no table: {one_line(error)}", file=name, advice=advice) from error
     return _input_table(Path(name), table)
 
 
