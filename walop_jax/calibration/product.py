@@ -573,9 +573,7 @@ def _listed(table: Mapping[str, Any], model_lines: Sequence[str]) -> tuple[Param
     for name, _, _, unit, mean, width, free in zip(*(table[n] for n in TABLES["PARAMETERS"]), strict=True):
         entry, prior = written.get(name, {}), (float(mean), float(width)) if np.isfinite(width) else None
         start = float(entry.get("start", np.nan if prior is None else mean))
-        known = {
-            "tie": entry.get("tie"),
-            "part": str(name).partition(".")[0],
-        }  # names are all that a file has
-        parameters.append(Parameter(str(name), str(unit), "", "", start, prior, bool(free), 1.0, **stated))
+        part = str(name).partition(".")[0]  # names are all that a file has
+        further = {"tie": entry.get("tie"), "part": part}
+        parameters.append(Parameter(str(name), str(unit), "", "", start, prior, bool(free), 1.0, **further))
     return tuple(parameters)

@@ -211,8 +211,8 @@ def frame_stack(images: Mapping[str, Any], exposures: int, path: Path) -> tuple[
     grid, flag = next(iter(grids)), cubes.get("FLAG")
     if flag is not None and flag.shape[1:] != (grid.height, grid.width):
         raise fail("does not have the shape of N0", file=path, extension="FLAG", advice="write it anew")
-    of_camera = (tuple(cubes[name] for name in names) for names in (counts, errors))
-    return grid, FrameStack(exposures, *of_camera, flag)
+    cubes_of, sigma_of = (tuple(cubes[name] for name in names) for names in (counts, errors))
+    return grid, FrameStack(exposures, cubes_of, sigma_of, flag)
 
 
 def _cube(hdu: Any, exposures: int, place: Place) -> Cube:
