@@ -173,21 +173,15 @@ class Product(Contents):
         names = self.names
         standards = standards_of(self.sources, self.exposures, self.filters)
         context = effect_context(adapted(self.design, standards=standards), self.exposures)
-        text = "\n".join(self.model_lines)
-        model = model_without_data(
-            self.design, text, standards=standards, context=context, catalogue=catalogue
-        )
+        facts = {"standards": standards, "context": context, "catalogue": catalogue}
+        model = model_without_data(self.design, "\n".join(self.model_lines), **facts)
         if sorted(model.names) != sorted(names):
             odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]
-            raise DataError(
-                f"the model of the product has other parameters than it lists ({', '.join(odd[:3])}): it was "
-                "made by a version with other physics; fit again"
-            )
+            what = f"the model of the product has other parameters than it lists ({', '.join(odd[:3])})"
+            raise DataError(f"{what}: it was made by a version with other physics; fit again")
         order = np.array([names.index(name) for name in model.names])
-        contents: dict[str, Any] = _contents(self) | {
-            "values": self.values[order],
-            "covariance": self.covariance[np.ix_(order, order)],
-        }
+        contents, covariance = _contents(self), self.covariance[np.ix_(order, order)]
+        contents |= {"values": self.values[order], "covariance": covariance}
         if self.hidden is not None:
             contents["hidden"] = dataclasses.replace(self.hidden, changes=self.hidden.changes[:, order])
         return Calibration(model=model, file=self, **contents)
@@ -257,9 +251,8 @@ class Calibration(Contents, Fitted):
     def with_covariance(self, covariance: Matrix, errors_from: str) -> Calibration:
         """The calibration with the covariance of a posterior, made of errors from `errors_from`, as made now."""
         verdict = dataclasses.replace(self.verdict, covariance_from="posterior", errors_from=errors_from)
-        return dataclasses.replace(
-            self, covariance=covariance, verdict=verdict, date=now(), versions=software_versions()
-        )
+        made = {"date": now(), "versions": software_versions()}
+        return dataclasses.replace(self, covariance=covariance, verdict=verdict, **made)
 
     @property
     def instrument(self) -> str:
@@ -347,10 +340,8 @@ class Calibration(Contents, Fitted):
 
         In one setting, a row of `settings`; from the covariance of the parameters, draws left aside.
         """
-        matrix, slopes = slopes_over_field(
-            self.model.instrument(self.values), settings, self.curves(settings), x, y,
-            self.covariance, counts, tolerance,
-        )  # fmt: skip
+        at = self.model.instrument(self.values), settings, self.curves(settings), x, y
+        matrix, slopes = slopes_over_field(*at, self.covariance, counts, tolerance)
         matrix, slopes = matrix.reshape(len(x), -1), slopes.reshape(len(x), matrix[0].size, -1)
         covariance = slopes @ self.covariance @ np.swapaxes(slopes, 1, 2)
         return matrix, covariance + of_structure(self.verdict.structure, matrix), slopes
@@ -488,11 +479,9 @@ class Calibration(Contents, Fitted):
     def provenance(self, content: str = "") -> dict[str, str]:
         """Cards of a table of matrices: the calibration (hash of its content), and the origin of the errors."""
         verdict = self.verdict
-        drawn = (
-            "draws of the posterior"
-            if self.draws is not None
-            else f"covariance of the {verdict.covariance_from}"
-        )
+        drawn = f"covariance of the {verdict.covariance_from}"
+        if self.draws is not None:
+            drawn = "draws of the posterior"
         return {
             "CALHASH": content or self.content_hash(),
             "ERRFROM": f"{drawn}, {verdict.errors_from}",
@@ -514,10 +503,8 @@ class Calibration(Contents, Fitted):
         flag = np.full(len(x), Quality.BEYOND_FIELD, np.int32)
         flag[inside] = self.flags(x[inside], y[inside], settings[inside], values[inside])
         names = matrix_names(values.shape[1] // 3)
-        columns: Columns = {
-            name: (column, f"element {name.lower()} of the instrument matrix")
-            for name, column in zip(names, values.T, strict=True)
-        }
+        about = [f"element {name.lower()} of the instrument matrix" for name in names]
+        columns: Columns = dict(zip(names, zip(values.T, about, strict=True), strict=True))
         for name, column in zip(names, errors.T, strict=True):
             columns[f"{name}_ERR"] = column, f"standard error of {name}"
         if len(names) == 6:

@@ -183,9 +183,8 @@ def acts_in(effect: Effect, instrument: Instrument, settings: Settings) -> bool:
 def is_ahead(calibration: Calibration, effect: Effect) -> bool:
     """True if an effect acts on the light from the sky ahead of the polariser, or turns the sky."""
     instrument, zero = calibration.model.instrument(calibration.values), jnp.zeros(())
-    after, before = (
-        np.asarray(light.telescope(m, zero, zero)) for m in (with_effect(instrument, effect), instrument)
-    )
+    models = with_effect(instrument, effect), instrument
+    after, before = (np.asarray(light.telescope(model, zero, zero)) for model in models)
     return bool(np.any(after != before)) or turn_of(instrument, effect) != 0.0
 
 
@@ -208,8 +207,6 @@ def change_by_effect(
     instrument: Instrument, effect: Effect, setting: Settings, filters: Filters, x: Vector, y: Vector
 ) -> Float[np.ndarray, "p a 3"]:
     """Instrument matrix with an effect at its size, less the one without, in one setting."""
-    after, before = (
-        planned_matrices(m, plan_for_settings(m, setting, filters), x, y)
-        for m in (with_effect(instrument, effect), instrument)
-    )
+    models = with_effect(instrument, effect), instrument
+    after, before = (planned_matrices(m, plan_for_settings(m, setting, filters), x, y) for m in models)
     return after - before

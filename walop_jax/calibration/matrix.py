@@ -105,9 +105,8 @@ class ResidualMap:
 
     def __post_init__(self) -> None:
         if len(self.values) % 4 != 3:
-            raise ValueError(
-                f"{len(self.values)} planes, for A arms there are 3 A elements and A − 1 throughputs"
-            )
+            what = "for A arms there are 3 A elements and A − 1 throughputs"
+            raise ValueError(f"{len(self.values)} planes, {what}")
 
     @property
     def arms(self) -> int:
@@ -326,9 +325,8 @@ def slopes_over_field(
     exact = functools.partial(matrix_slopes, instrument, setting, filters)
 
     def error(interpolated: tuple[np.ndarray, np.ndarray], truth: tuple[np.ndarray, np.ndarray]) -> float:
-        errors, true_errors = (
-            np.sqrt(np.sum(slopes @ covariance * slopes, axis=-1)) for _, slopes in (interpolated, truth)
-        )
+        tables = interpolated, truth
+        errors, true_errors = (np.sqrt(np.sum(s @ covariance * s, axis=-1)) for _, s in tables)
         return float(np.max(np.abs(errors - true_errors) / np.where(true_errors > 0, true_errors, 1.0)))
 
     corners = Rectangle(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]))

@@ -190,9 +190,8 @@ def make_exposures(
     check(table, {**EXPOSURES, **angles_of, **{f"{prefix}_TURN": TURN for prefix in turning}}, place)
 
     moon, standard = ((kind == name) & ~clp_in for name in ("moon", "standard"))
-    needs = [
-        (moon, name, "the moonlit sky needs time and pointing") for name in ("MJD", "RA", "DEC", "ROTATOR")
-    ]
+    pointing = ("MJD", "RA", "DEC", "ROTATOR")
+    needs = [(moon, name, "the moonlit sky needs time and pointing") for name in pointing]
     for needing, name, advice in (*needs, (standard, "ROTATOR", "a standard needs it")):
         place.refuse(needing & ~np.isfinite(table[name]), "is not finite", name, advice)
     low, high = EPHEMERIS_MJD

@@ -220,9 +220,8 @@ def _join_exposures(sets: tuple[CalibrationSet, ...]) -> tuple[Exposures, list[s
             remarks.append(f"{_name(entry)} [EXPOSURES] {names}: column missing; taken as out of the beam")
         parts.append(e.placed(**absent).columns())
     names = dict.fromkeys(name for part in parts for name in part)
-    still = [
-        (part, np.zeros(len(part["EXPOSURE"]))) for part in parts
-    ]  # of a column <P>_TURN that a part has not
+    # A column <P>_TURN that a part has not is 0.
+    still = [(part, np.zeros(len(part["EXPOSURE"]))) for part in parts]
     columns = {name: np.concatenate([part.get(name, zero) for part, zero in still]) for name in names}
     return Exposures.from_columns(columns | {"EXPOSURE": ids}), remarks
 

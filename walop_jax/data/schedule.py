@@ -28,9 +28,7 @@ from walop_jax.io.toml import Reader
 
 TYPES: Mapping[str, str] = {"clp": "CAL-CAL", "lamp": "CAL-CAL", "moon": "CAL-MOO"}
 """Types of targets by KIND; of standards CAL-POL or CAL-UPO."""
-KINDS_OF: Mapping[str, str] = {
-    "CAL-CAL": "clp", "CAL-MOO": "moon", "CAL-POL": "standard", "CAL-UPO": "standard",
-}  # fmt: skip
+KINDS_OF = {"CAL-CAL": "clp", "CAL-MOO": "moon", "CAL-POL": "standard", "CAL-UPO": "standard"}
 OF_SCIENCE = ("PAS", "SCI")
 """Types of targets that are no calibration."""
 FASTEST = 3.0  # turns per minute

@@ -195,11 +195,10 @@ def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]
         if last not in ("IN", "ANGLE") or name == last or name in rules:
             continue
         if not PREFIX.fullmatch(prefix):
-            raise place.fail(
-                f"{prefix!r} is no name of a moving element",
-                name,
-                "letters, digits and _, a letter first; rename the column if it is none of a moving element",
+            advice = (
+                "letters, digits and _, a letter first; rename the column if it is none of a moving element"
             )
+            raise place.fail(f"{prefix!r} is no name of a moving element", name, advice)
         inside, angle = f"{prefix}_IN", f"{prefix}_ANGLE"
         if angle not in columns:
             pairs = [entry for entry in columns if entry.endswith("_ANGLE")]
@@ -427,9 +426,8 @@ def _shaped(values: np.ndarray, name: str, rule: Column, place: Place) -> np.nda
 
 MISSING = ("", "nan", "na", "n/a", "<na>", "none", "null", "--", "-", "...")
 """Texts of a cell without a value, in small letters."""
-_TRUTH = dict.fromkeys(("true", "t", "1", "1.0", "yes"), 1.0) | dict.fromkeys(
-    ("false", "f", "0", "0.0", "no", *MISSING), 0.0
-)
+_TRUTH = dict.fromkeys(("false", "f", "0", "0.0", "no", *MISSING), 0.0)
+_TRUTH |= dict.fromkeys(("true", "t", "1", "1.0", "yes"), 1.0)
 
 
 def _from_text(text: np.ndarray, rule: Column, name: str, place: Place) -> Float[np.ndarray, ...]:

@@ -313,11 +313,8 @@ def _exports(folder: Path, tell: Callable[[str], None]) -> tuple[list[Transmissi
         read.append(read_export(file))
     exports = [export for export in read if export is not None]
     if not exports:
-        what, advice = (
-            f"none of {len(files)} text files begins with",
-            "export that analysis as text, in English",
-        )
-        raise fail(f"{what} {HEADING!r}", file=folder, advice=advice)
+        what = f"none of {len(files)} text files begins with {HEADING!r}"
+        raise fail(what, file=folder, advice="export that analysis as text, in English")
     ignored = [file.name for file, export in zip(files, read, strict=True) if export is None]
     what = f"{folder}: {len(ignored)} text files are no exports and not read"
     return exports, [f"{what}, {ignored[0]} for one"] if ignored else []
@@ -333,9 +330,8 @@ def _instrument(
         return named.pop()
     if wanted is None:
         advice = f"say which it is: --instrument {' or '.join(shipped())}"
-        raise fail(
-            f"the titles name {len(named)} instruments ({', '.join(titles)})", file=folder, advice=advice
-        )
+        what = f"the titles name {len(named)} instruments ({', '.join(titles)})"
+        raise fail(what, file=folder, advice=advice)
     if named - {wanted.upper()}:
         named_by = ", ".join(sorted(named))
         remarks.append(f"{folder}: the titles name {named_by}, {wanted.upper()} was asked for")

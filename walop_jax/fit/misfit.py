@@ -55,20 +55,16 @@ class Misfit:
 
     def advice(self) -> tuple[str, ...]:
         """The remedy, where single rows spoil the fit."""
-        share = (
-            f"{100 * self.outliers:.2g} % of the rows lie more than {BEYOND:g} standard errors off: if these are "
-            "cosmic rays or stars, walop-jax clip flags them"
-        )
-        return (share,) if 0.0 < self.outliers <= MOST else ()
+        share = f"{100 * self.outliers:.2g} % of the rows lie more than {BEYOND:g} standard errors off"
+        advice = "if these are cosmic rays or stars, walop-jax clip flags them"
+        return (f"{share}: {advice}",) if 0.0 < self.outliers <= MOST else ()
 
     def reasons(self, warnings: Sequence[str], folder: str | PathLike[str] | None) -> tuple[str, ...]:
         """The first reasons against a fit, its `warnings` among them, and the command that shows all of them."""
         reasons = tuple(dict.fromkeys((*self.advice(), *warnings, *self.sentences())))
         omitted = len(reasons) - MOST_REASONS
-        return (
-            *reasons[:MOST_REASONS],
-            f"{omitted} more, with the misfit by camera and exposure: walop-jax report {folder}",
-        )
+        more = f"{omitted} more, with the misfit by camera and exposure: walop-jax report {folder}"
+        return (*reasons[:MOST_REASONS], more)
 
     def sentences(self) -> tuple[str, ...]:
         """The disagreement in words, the largest of each kind first."""

@@ -340,11 +340,10 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
             "calibration (walop-jax diagnose looks for missing effects)",
         )
     elif result.errors_too_large and not noiseless:
-        yield Doubt(
-            Quality.ERRORS_TOO_LARGE,
-            f"χ²/dof = {ratio:.4g}: N_ERR is not the standard error of N; check the gain, and whether N_ERR holds "
-            "variances or other units",
+        what = (
+            f"χ²/dof = {ratio:.4g}: N_ERR is not the standard error of N; check the gain, and whether N_ERR"
         )
+        yield Doubt(Quality.ERRORS_TOO_LARGE, f"{what} holds variances or other units")
     elif excess:
         yield Doubt(excess, "", blocking=False)  # so few degrees of freedom that noise alone may do it
     if result.noise_scale > 1.0:
@@ -366,9 +365,8 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
     yield from (Doubt(Quality.DOUBTED, sentence) for sentence in doubts)
     if result.errors_from != STATED:
         reason = result.errors_from.removeprefix("residuals: ").replace("chi2/dof", "χ²/dof")
-        reason = reason.replace(" states", " states of the exposures").replace(
-            " cells", " cells of the field"
-        )
+        for short, text in ((" states", " states of the exposures"), (" cells", " cells of the field")):
+            reason = reason.replace(short, text)
         text = f"errors of parameters are estimated from the scatter of the residuals ({reason})"
         yield Doubt(Quality(0), text, blocking=False)
 

@@ -95,7 +95,7 @@ class Structure:
 
 NO_STRUCTURE = Structure()
 NOT_MEASURED = (
-    "the calibration data hold no information on {}; Q_HIDDEN, U_HIDDEN of stars have it, Q_ERR, U_ERR not"
+    "the calibration data hold no information on {}; Q_HIDDEN, U_HIDDEN of stars have it, Q_ERR, U_ERR do not"
 )
 """Remark on mistakes without information in the data, at their usual sizes."""
 EFFECT, DATA = "effect", "data"
@@ -141,10 +141,8 @@ class Hidden:
         for name, remedy, measured in zip(self.names, self.remedies, self.measured, strict=True):
             if not measured:
                 together.setdefault(remedy, []).append(name)
-        return tuple(
-            f"{', '.join(names)} (to measure it: {remedy})" if remedy else ", ".join(names)
-            for remedy, names in together.items()
-        )
+        joined = {", ".join(names): remedy for remedy, names in together.items()}
+        return tuple(f"{names} (to measure it: {cure})" if cure else names for names, cure in joined.items())
 
     def in_words(self, most: int = 1) -> str:
         """The worst of them in a sentence."""

@@ -326,9 +326,8 @@ class ResponseBlock:
     def __init__(self, of: Columns, start: int, every: Sequence[Slot]) -> None:
         self.of = of
         data, self.found = of.responses(start)
-        self.x, self.y, weight, self.band, source = (
-            np.asarray(getattr(data, name)) for name in ("x", "y", "weight", "band", "source")
-        )
+        arrays = (data.x, data.y, data.weight, data.band, data.source)
+        self.x, self.y, weight, self.band, source = map(np.asarray, arrays)
         self.value = np.asarray(of.patched.standard.values(source, of.exposures.colour))
         self.used = weight[..., 0] > 0
         self.linear = light.is_linear(of.patched)
@@ -385,11 +384,11 @@ class ResponseBlock:
             return {}
         sites = [np.stack([c, -c], 1)[:, : self.sites] for c in (self.x, self.y)]
         padded = np.pad(np.array(distinct), (0, -len(distinct) % GAPS_TOGETHER), mode="edge")
-        slopes = [
-            np.asarray(_fringes_at(self.of.instrument, self.of.fringe_plan, batch, *sites))
-            for batch in np.split(padded, len(padded) // GAPS_TOGETHER)
-        ]
-        joined = np.concatenate(slopes, axis=3)
+        at, batches = (
+            (self.of.instrument, self.of.fringe_plan),
+            np.split(padded, len(padded) // GAPS_TOGETHER),
+        )
+        joined = np.concatenate([_fringes_at(*at, batch, *sites) for batch in batches], axis=3)
         return {
             ("fringes", place, gap): joined[:, :, plate, i]
             for i, gap in enumerate(distinct)

@@ -283,9 +283,11 @@ def summed(function: Callable[[Any], Any], parts: Any) -> Any:
     """Sums of the results of a function for the slices along the first axis, one after the other."""
     first = jax.eval_shape(function, jax.tree.map(lambda v: v[0], parts))
     nothing = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), first)
-    return jax.lax.scan(
-        lambda total, part: (jax.tree.map(jnp.add, total, function(part)), None), nothing, parts
-    )[0]
+
+    def add(total: Any, part: Any) -> tuple[Any, None]:
+        return jax.tree.map(jnp.add, total, function(part)), None
+
+    return jax.lax.scan(add, nothing, parts)[0]
 
 
 def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:

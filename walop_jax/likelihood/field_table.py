@@ -121,11 +121,9 @@ def accurate_table(
     for count in counts:
         x, y = chebyshev.grid(rectangle, count)
         if truth is None:
-            solutions = exact(np.append(x, other_x), np.append(y, other_y))
-            values, truth = (
-                jax.tree.map(lambda leaf, cut=cut: leaf[cut], solutions)
-                for cut in (slice(0, len(x)), slice(len(x), None))
-            )
+            solutions, points = exact(np.append(x, other_x), np.append(y, other_y)), len(x)
+            values = jax.tree.map(lambda leaf, end=points: leaf[:end], solutions)
+            truth = jax.tree.map(lambda leaf, end=points: leaf[end:], solutions)
         else:
             values = exact(x, y)
         table = FieldTable.through(rectangle, count, values, total=total)

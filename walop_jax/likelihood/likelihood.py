@@ -151,9 +151,8 @@ def prior_rows(model: Model) -> PriorRows:
         elif p.loose is not None:
             rows.append((i, p.start, p.loose, False))
     index, mean, width, known = zip(*rows, strict=True) if rows else ((),) * 4
-    return PriorRows(
-        np.array(index, int), np.array(mean, float), np.array(width, float), np.array(known, bool)
-    )
+    at, is_known = np.array(index, int), np.array(known, bool)
+    return PriorRows(at, np.array(mean, float), np.array(width, float), is_known)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -357,10 +356,8 @@ class Likelihood:
         instrument = self.model.instrument(values)
         nodes, _ = self.nodes(instrument)
         batches = [engine.residuals(instrument, self.plan, batch, nodes) for batch in self.points]
-        flux, residual = (
-            np.concatenate(arrays)[: self.layout.points] for arrays in zip(*batches, strict=True)
-        )
-        return flux.mean(axis=-1), residual
+        flux, residual = (np.concatenate(arrays) for arrays in zip(*batches, strict=True))
+        return flux[: self.layout.points].mean(axis=-1), residual[: self.layout.points]
 
     def jacobian(self, values: Vector) -> Float[np.ndarray, "d f"]:
         """Derivatives of the used residuals with respect to the free parameters, dense: for tables, not frames.

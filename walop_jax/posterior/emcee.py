@@ -50,9 +50,8 @@ class Emcee(Sampler):
         d = density.dimension
         count = self.walkers or max(LEAST_WALKERS, 2 * d)
         if count < 2 * d or count % 2:
-            raise ValueError(
-                f"{count} walkers for {d} sampled coefficients: an even number of at least {2 * d}"
-            )
+            what = f"{count} walkers for {d} sampled coefficients"
+            raise ValueError(f"{what}: an even number of at least {2 * d}")
         random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed)))
         positions = random.standard_normal((count, d))
         value = density.log_density(positions)
@@ -65,9 +64,8 @@ class Emcee(Sampler):
         import emcee
 
         count, dimension = state["positions"].shape
-        sampler = emcee.EnsembleSampler(
-            count, dimension, density.log_density, vectorize=True, moves=mixture(self.moves)
-        )
+        how = {"vectorize": True, "moves": mixture(self.moves)}
+        sampler = emcee.EnsembleSampler(count, dimension, density.log_density, **how)
         random = tuple(random_attributes(state).values())
         current = emcee.State(state["positions"], log_prob=state["log_density"], random_state=random)
         positions, value = np.empty((steps, count, dimension)), np.empty((steps, count))

@@ -101,10 +101,8 @@ class Chain:
             path = str(self.path)
             arrays: list[Any] = [HDFBackend(path, name=f"ensemble{n}", read_only=True) for n in range(count)]
             stretches = [Stretch(k.get_chain(), k.get_log_prob(), _shares(k)) for k in arrays]
-            states = [
-                emcee_state(s.positions[-1], s.log_density[-1], k.random_state)
-                for s, k in zip(stretches, arrays, strict=True)
-            ]
+            ends = ((s.positions[-1], s.log_density[-1]) for s in stretches)
+            states = [emcee_state(*end, k.random_state) for end, k in zip(ends, arrays, strict=True)]
         except Exception as error:  # whatever a damaged file brings about
             raise fail(f"cannot be read: {error}", file=self.path, advice=_ADVICE) from error
         keys = sorted({*before, *self.fingerprint})

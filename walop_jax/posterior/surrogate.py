@@ -209,18 +209,14 @@ def _axes(covariance: Matrix, scale: Float[np.ndarray, " k"]) -> Matrix:
 
 
 def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Matrix, Matrix]:
-    marginalised, c, scale = (
-        np.setdiff1d(np.arange(len(target.free)), sampled),
-        target.covariance,
-        target.scale,
-    )
+    marginalised = np.setdiff1d(np.arange(len(target.free)), sampled)
+    c, scale = target.covariance, target.scale
     axes = _axes(c[np.ix_(sampled, sampled)], scale[sampled])
     follow = np.linalg.solve(axes, c[np.ix_(sampled, marginalised)]).T  # C_λφ A⁻ᵀ
     along, across = np.zeros((len(c), len(sampled))), np.zeros((len(c), len(marginalised)))
     along[sampled], along[marginalised] = axes, follow
-    across[marginalised] = _axes(
-        c[np.ix_(marginalised, marginalised)] - follow @ follow.T, scale[marginalised]
-    )
+    conditional = c[np.ix_(marginalised, marginalised)] - follow @ follow.T
+    across[marginalised] = _axes(conditional, scale[marginalised])
     return along, across
 
 
@@ -346,11 +342,9 @@ def compare_with_exact(target: Target, surrogate: Surrogate, z: Draws, rng: np.r
     Cov(ρ, t) and the exact variance by the factor 1 + Cov(ρ, t²).
     """
     x, weight = surrogate.draw(z, rng), surrogate.weight(z)
-    exact = [
-        w * target.data(point) + float(np.sum(target.prior_rows(point) ** 2))
-        for w, point in zip(weight, x, strict=True)
-    ]
-    ln_ratio = -0.5 * (np.array(exact) - surrogate.joint(z, x))
+    data = np.array([target.data(point) for point in x])
+    exact = weight * data + np.array([np.sum(target.prior_rows(point) ** 2) for point in x])
+    ln_ratio = -0.5 * (exact - surrogate.joint(z, x))
     ln_ratio = ln_ratio - ln_ratio.mean()
     importance = np.exp(np.clip(ln_ratio, -50.0, 50.0))
     t = (x - x.mean(axis=0)) / x.std(axis=0)
