@@ -432,10 +432,7 @@ class Calibration(Contents, Fitted):
         return beyond
 
     def new_maps(self, size: int = MAP_SIZE) -> MatrixMaps:
-        """The matrix over the field on a regular grid, computed anew, for a look at it.
-
-        In `usual_settings`, through the `usual_filter`.
-        """
+        """The matrix over the field on a regular grid, anew, in `usual_settings` through the `usual_filter`."""
         name = self.usual_filter
         half = float(np.ceil(np.max(np.abs(self.field)) * 50.0) / 50.0) or 0.3
         step = 2.0 * half / (size - 1)
@@ -491,10 +488,7 @@ class Calibration(Contents, Fitted):
     def matrix_columns(
         self, x: Positions, y: Positions, settings: Settings, outside: Bool[np.ndarray, " p"]
     ) -> Columns:
-        """The matrix elements, their standard errors and FLAG, each with its description; NaN and 32 where `outside`.
-
-        Raises `DataError` for a filter that neither the calibration nor the package has.
-        """
+        """Matrix elements, standard errors and FLAG, each with its description; NaN and 32 where `outside`."""
         inside = np.flatnonzero(~outside)
         elements, covariance = self.matrix(x[inside], y[inside], settings[inside])
         values, errors = np.full((2, len(x), elements.shape[1]), np.nan)

@@ -57,10 +57,7 @@ def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
 
 
 def certify(product: Product, catalogue: tuple[EffectKind, ...] = EFFECTS) -> list[Check]:
-    """All checks of a product that could be read, in a fixed order; those behind a failed one may be missing.
-
-    `catalogue` are the effects that its model may have.
-    """
+    """All checks of a product in a fixed order, up to a failed rebuild; `catalogue` are effects that it may have."""
     earlier = UNCHECKED in product.verdict.warnings  # the content of others was checked when they were read
     checks = [Check("content", False, UNCHECKED)] if earlier else []
     checks += [*_verdict(product), _covariance(product), _validity(product), _parents(product)]
@@ -148,10 +145,7 @@ def _physics(calibration: Calibration) -> Check:
 
 
 def _protection(calibration: Calibration) -> Iterator[Check]:
-    """A statement of mistakes that could hide, at the limits of the data; unmeasured ones fail.
-
-    It may do no more to stars than `UNMEASURED`.
-    """
+    """Mistakes that could hide, at the limits of the data; unmeasured ones fail beyond `UNMEASURED`."""
     if calibration.hidden is None:
         yield Check("protection", True, "undetectable errors were not computed")
         return

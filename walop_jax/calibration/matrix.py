@@ -180,10 +180,7 @@ _slopes = compiled(_slopes_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="
 def analysis_vectors(
     instrument: Instrument, plan: Plan, x: Vector, y: Vector, *, from_sky: bool = False
 ) -> Float[np.ndarray, "p b k 4"]:
-    """Analysis vectors (point, band, camera, Stokes) at field positions in degrees.
-
-    For light behind the telescope, or `from_sky`, which passes the telescope first.
-    """
+    """Analysis vectors (point, band, camera, Stokes) at field positions (deg), behind the telescope or `from_sky`."""
     plan = dataclasses.replace(plan, work=len(x))
     vectors, telescope = _in_chunks(lambda a, b: _vectors(instrument, plan, a, b), x, y)
     return vectors @ telescope[:, None] if from_sky else vectors
@@ -362,10 +359,7 @@ def effect_slopes(
     y: Vector,
     effects: tuple[Effect, ...],
 ) -> Float[np.ndarray, "p a 3 e"]:
-    """Derivatives of the matrix with respect to the amplitudes of neutral effects, effect by effect in their order.
-
-    Parts of an effect outside the matrix (single exposures, ghosts, detectors) have none.
-    """
+    """Derivatives of the matrix to the amplitudes of neutral effects, in order; parts outside the matrix have none."""
     if not effects:
         return np.zeros((len(x), len(instrument.cameras.pairs), 3, 0))
     neutral, put = with_amplitudes(instrument, effects)

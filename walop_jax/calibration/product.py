@@ -115,10 +115,7 @@ def write_calibration(
 
 
 def content_of(hdus: Iterable[Any]) -> str:
-    """SHA-256 of words, columns and images, as in a file; the order of extensions does not matter.
-
-    Not of dates, software, paths, and additions by others.
-    """
+    """SHA-256 of words, columns, images, extensions in any order; not of dates, software, paths, additions."""
     digest = hashlib.sha256()
     for name, hdu in sorted(((hdu.name.strip().upper(), hdu) for hdu in hdus), key=lambda pair: pair[0]):
         if not _EXTENSIONS.fullmatch(name):

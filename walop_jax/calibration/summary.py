@@ -20,10 +20,7 @@ def summary(
     misfit: Misfit | None = None,
     residuals: ResidualMap | None = None,
 ) -> dict[str, Any]:
-    """The content of `summary.json`, key by key as in docs: files. Frozen parameters have sigma 0.
-
-    Raises RuntimeError for a fit without a verdict.
-    """
+    """The content of `summary.json` (docs: files) of a fit with a verdict; frozen parameters have sigma 0."""
     verdict = result.checked_verdict()
     mistakes, hidden = None, result.hidden
     if hidden is not None:

@@ -363,10 +363,7 @@ def from_arrays(
 
 
 def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationSet:
-    """A set from memory behind the checks that files meet, and as they would leave it: unusable rows masked, and said.
-
-    `kinds` are kinds of exposures beyond those of the format. Raises `DataError` as `read_calibration_set` does.
-    """
+    """A set from memory behind the checks that files meet; unusable rows are masked, and remarked on."""
     header = {name: getattr(calset, name) for name in ("instrument", "site", "origin", "compression")}
     found = _in_memory(set_tables(calset), **header, kinds=(*KINDS, *kinds))
     before, after = calset.intensities, found.intensities

@@ -107,10 +107,7 @@ class CameraCatalogue:
 
 
 def read_map(source: str | os.PathLike[str]) -> ColumnMap:
-    """A map of columns: one that comes with the package, by name, or a TOML file.
-
-    Raises `DataError` naming the key that is wrong.
-    """
+    """A map of columns that comes with the package, by name, or of a TOML file; `DataError` names a wrong key."""
     shipped = str(source) in SHIPPED
     text = (files("walop_jax.data") / f"{source}.toml").read_text("utf-8") if shipped else read_text(source)
     with errors_naming(source):

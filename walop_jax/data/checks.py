@@ -90,10 +90,7 @@ def checked_curve(
     place: Place,
     where: str = "",
 ) -> FilterCurve:
-    """The curve of a filter (µm), its NaN padding stripped, turned round where it descends.
-
-    Raises `DataError`, naming `place` and `where` in it, for a curve that no filter has.
-    """
+    """The curve of a filter (µm), padding stripped, ascending; `DataError`, at `place`, for one that no filter has."""
 
     def refuse(bad: Any, what: str, column: str, advice: str) -> None:
         if bad:
@@ -119,10 +116,7 @@ def checked_curve(
 def make_sources(
     table: dict[str, Any], place: Place, filters: Mapping[str, FilterCurve] | None = None
 ) -> Sources:
-    """Check the SOURCES table (fractions; kelvin): one row for a star, or one for each of its bands (FILTER).
-
-    A band is one of `filters`, built in, or photometric.
-    """
+    """Check the SOURCES table: one row for a star, or one for each of its bands (`filters`, built in, photometric)."""
     check(table, SOURCES, place)
     sources = Sources(**{name.lower(): table[name] for name in SOURCES})
     bands = {*(filters or ()), *BUILTIN_FILTERS, *PHOTOMETRIC_BANDS}
@@ -150,10 +144,7 @@ def make_exposures(
     place: Place,
     kinds: Collection[str] | None = KINDS.keys(),
 ) -> Exposures:
-    """Check the EXPOSURES table (degrees, days, kelvin, …) for the columns that every KIND needs.
-
-    `kinds` are those that KIND may have, None: any.
-    """
+    """Check the EXPOSURES table for the columns that every KIND needs; `kinds` are those allowed, None: any."""
     table["KIND"] = kind = np.char.lower(table["KIND"])
     for name in np.unique(kind).tolist():
         if kinds is not None and name not in kinds:

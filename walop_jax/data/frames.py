@@ -45,10 +45,7 @@ class Cube:
     stamp: tuple[int, int]
 
     def stored(self, start: int, stop: int) -> np.ndarray:
-        """Some rows of all planes as they lie in the file, mapped and not yet read.
-
-        Raises `DataError` if the file has gone or changed since it was checked.
-        """
+        """Some rows of all planes as in the file, mapped; `DataError` if that has gone or changed meanwhile."""
         self._check_stamp()
         try:
             # Mapped anew each time: no open file to keep, and pages are given back after the slab.
@@ -58,10 +55,7 @@ class Cube:
         return np.asarray(raw[:, start:stop])
 
     def read_into(self, planes: np.ndarray, start: int) -> None:
-        """Read the bytes of some rows of all planes, from row `start` on, into an array (plane, row, column).
-
-        Rows of the array must lie side by side. Raises what `stored` raises.
-        """
+        """Read rows of all planes, from `start` on, into an array (plane, row, column) without gaps."""
         self._check_stamp()
         _, height, width = self.shape
         row = width * self.dtype.itemsize
@@ -81,10 +75,7 @@ class Cube:
             raise fail("the file has changed since it was opened", file=self.path, advice="read it again")
 
     def rows(self, start: int, stop: int) -> Float[np.ndarray, "e y x"]:
-        """Read some rows of all planes; undefined integers (BLANK) become NaN.
-
-        Raises what `stored` raises.
-        """
+        """Read some rows of all planes; undefined integers (BLANK) become NaN. Raises what `stored` raises."""
         stored = self.stored(start, stop)
         values = stored.astype(np.float64)
         if (self.scale, self.zero) != (1.0, 0.0):
@@ -137,10 +128,7 @@ class FrameIntensities(Intensities):
         return sum(int(np.count_nonzero(self.block(start, start + step).used)) for start in starts)
 
     def block(self, start: int, stop: int) -> Block:
-        """Return the data of the pixels `start:stop`, dense in the exposures.
-
-        Raises `DataError` for an error that is zero or negative on an unflagged pixel.
-        """
+        """The pixels `start:stop`, dense in the exposures; `DataError` for an error not above zero on an open pixel."""
         start, stop, _ = slice(start, stop).indices(self.grid.pixels)
         stop = max(start, stop)
         block = empty_block(*self.grid.xy(start, stop), self.exposures, self.cameras)
@@ -281,10 +269,7 @@ class RowReader:
         self._own = threading.local()
 
     def __call__(self, start: int, stop: int) -> RawRows:
-        """The image rows `start:stop`.
-
-        Raises `DataError` if a file has gone or changed since it was checked.
-        """
+        """The image rows `start:stop`. Raises `DataError` if a file has gone or changed since it was checked."""
         counts, sigma, closed = self._buffers()
         inside = (slice(0, stop - start), slice(0, self.intensities.grid.width))
         closed[:] = True

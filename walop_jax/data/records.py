@@ -35,10 +35,7 @@ class DataFlag(enum.IntFlag):
 
 @dataclasses.dataclass(frozen=True)
 class Site:
-    """Place of the telescope.
-
-    `latitude` and `longitude` in degrees (east positive), `elevation` in metres.
-    """
+    """Place of the telescope. `latitude` and `longitude` in degrees (east positive), `elevation` in metres."""
 
     telescope: str
     latitude: float
@@ -172,10 +169,7 @@ class Exposures:
         return np.isin(self.kind, kinds) & ~self.clp_in
 
     def position(self, prefix: str) -> Position:
-        """The moving element of a column prefix.
-
-        Raises ValueError with the nearest names for one that the set does not have.
-        """
+        """The moving element of a column prefix; ValueError with the nearest names for one that is not there."""
         if prefix in self.positions:
             return self.positions[prefix]
         advice = f"give {prefix}_IN and {prefix}_ANGLE, in an observing plan moving = {{ {prefix} = [0, 22.5, 45] }}"

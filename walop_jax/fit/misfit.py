@@ -90,10 +90,7 @@ class Misfit:
 
 
 def describe(result: FitResult) -> Misfit:
-    """Group the residuals of a fit.
-
-    Of a very large set, those of `MISFIT_POINTS` points spread over the field, the worst point among them.
-    """
+    """Group the residuals of a fit; of a very large set those of `MISFIT_POINTS` points, the worst among them."""
     return misfit_at(result.likelihood, result.values)
 
 

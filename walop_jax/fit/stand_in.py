@@ -34,10 +34,7 @@ def on_field_points(result: FitResult) -> FitResult:
 def in_field_points(
     calset: CalibrationSet, model: Model, tell: Progress, look: Callable[[FitResult], Structure]
 ) -> CalibrationSet:
-    """Whole frames of many pixels as the set that stands for them at their minimum; any other set as it is.
-
-    `look` says by how much single pixels differ beyond the model of a fit.
-    """
+    """Whole frames as the set that stands for them, `look` giving the spread of pixels; any other set as it is."""
     likelihood = Likelihood.of(calset, model, runner=Runner(progress=tell))
     if not (likelihood.layout.large and stands_for_pixels(likelihood, model.start)):
         return calset

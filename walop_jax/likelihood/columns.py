@@ -71,10 +71,7 @@ def columns(likelihood: Likelihood, values: Vector, changes: Sequence[Change]) -
 def own_columns(
     likelihood: Likelihood, values: Vector, effects: Sequence[Effect]
 ) -> Float[np.ndarray, "d a"]:
-    """The same for effects of a user's own, amplitude by amplitude: the light path with each of them, differentiated.
-
-    Effects that differ in nothing but numbers share a program.
-    """
+    """The same for effects of a user's own, by differentiation; those that differ in numbers alone share a program."""
     columns, plans = [], {}
     for effect in effects:
         structure = jax.tree.structure(effect)

@@ -341,10 +341,7 @@ def strips_of(likelihood: Likelihood) -> int:
 
 
 def stands_for_pixels(likelihood: Likelihood, values: Vector) -> bool:
-    """True if cells can stand for the pixels of a set: counts linear in a flux of their own, smooth over the frames.
-
-    There may be a table beside the frames.
-    """
+    """True if cells can stand for the pixels of a set: counts linear in a flux of their own, smooth over the frames."""
     instrument, selection = likelihood.model.instrument(values), frames_among(likelihood.calset)
     if selection is None or not light.is_linear(instrument) or likelihood.plan.exposures.shared is not None:
         return False
@@ -456,12 +453,7 @@ class PixelExpansion(Expansion):
 def expand_pixels(
     likelihood: Likelihood, values: Vector, noise_scale: float = 1.0, every: int = 1
 ) -> PixelExpansion:
-    """As `Likelihood.expand`, by one pass over all pixels of frames, or over one strip in `every`.
-
-    A table beside the frames is expanded row by row.
-
-    Raises what `frame_sums` raises.
-    """
+    """As `Likelihood.expand`, by a pass over all pixels or one strip in `every`; a table beside them by its rows."""
     values = np.asarray(values, float)
     sums = frame_sums(likelihood, values, every)
     terms = DataTerms(sums.chi2, half_gradient(sums), gauss_newton(sums), sums.census)

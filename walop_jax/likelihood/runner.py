@@ -44,10 +44,7 @@ class Runner:
             self.progress(text)
 
     def each(self, label: str, work: Callable[[int], T], points: int, slab: int) -> Iterator[T]:
-        """The results of `work` for all slabs of `slab` points, in their order; `label` names the pass in progress.
-
-        Raises what `work` raises.
-        """
+        """The results of `work` for all slabs of `slab` points, in order; `label` names the pass in progress."""
         began = last = time.perf_counter()
         with contextlib.closing(self._each(-(-points // slab), work)) as results:
             for count, result in enumerate(results, start=1):

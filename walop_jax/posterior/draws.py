@@ -119,20 +119,14 @@ def read_draws(path: Any, names: tuple[str, ...], fit: str | None = None) -> Flo
 
 
 def with_draws(calibration: Calibration, path: Any, count: int = DRAWS) -> Calibration:
-    """The calibration with `count` draws of a posterior, in a file or in memory, over which its matrices are averaged.
-
-    `DataError` for a file of another model or another fit, or not trusted.
-    """
+    """The calibration with `count` draws of a posterior, a file or in memory, over which its matrices are averaged."""
     draws = _draws_of(calibration, path)
     chosen = np.random.default_rng(0).permutation(len(draws))[:count]
     return dataclasses.replace(calibration, draws=draws[chosen])
 
 
 def with_moments(calibration: Calibration, path: Any) -> Calibration:
-    """The calibration with mean and covariance of all draws of a `posterior.nc` in place of the fit's.
-
-    For linear propagation, star by star. `DataError` as in `with_draws`.
-    """
+    """The calibration with mean and covariance of all draws of a posterior, for linear propagation, star by star."""
     draws = _draws_of(calibration, path)
     return dataclasses.replace(calibration, values=draws.mean(axis=0), covariance=np.cov(draws, rowvar=False))
 

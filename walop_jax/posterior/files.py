@@ -30,10 +30,7 @@ _ADVICE = "sample into another folder, or start anew with --overwrite"
 
 
 def write_posterior(path: str | os.PathLike[str], sample: PosteriorSample) -> None:
-    """Write `posterior.nc` (netCDF 4), a group for each of ArviZ's.
-
-    It appears whole or not at all. Raises `DataError` as `atomic_path` does.
-    """
+    """Write `posterior.nc` (netCDF 4), a group for each of ArviZ's, whole or not at all."""
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 
@@ -63,10 +60,7 @@ def _write_hdf5(
 
 
 class Chain:
-    """The chain of emcee in the folder of a run: `emcee.backends.HDFBackend(path, name="ensemble0")`, … reads it.
-
-    `fingerprint` identifies data, model and options of the sample.
-    """
+    """The chain of emcee in the folder of a run, as `emcee.backends.HDFBackend(path, name="ensemble0")`, … reads it."""
 
     def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, str]) -> None:
         self.path, self.fingerprint = Path(folder) / CHAIN, dict(fingerprint)
@@ -88,10 +82,7 @@ class Chain:
         _write_hdf5(self.path, fill, overwrite=True)
 
     def load(self) -> tuple[list[State], list[Stretch], float]:
-        """All ensembles, their states at the end, and the seconds that they took.
-
-        `DataError` for a file that cannot be read, and for one of anything else.
-        """
+        """All ensembles, their states at the end, and seconds; `DataError` for a file of another sample."""
         from emcee.backends import HDFBackend
 
         try:

@@ -96,10 +96,7 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
 
     @functools.cached_property
     def calset(self) -> CalibrationSet:
-        """The data of the fit.
-
-        Raises `DataError` where the run does not name them, and where they are missing or have changed.
-        """
+        """The data of the fit; `DataError` where the run does not name them, or they are missing or have changed."""
         inputs = () if self.product is None else self.product.inputs
         if not inputs:
             advice = "make it with walop-jax refit"

@@ -244,10 +244,7 @@ def build_surrogate(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Surrogate:
-    """Fit the surrogate to exact residuals at about 1.5 design points per feature; `order` 2 or 3.
-
-    Raises ValueError for other orders.
-    """
+    """Fit the surrogate (`order` 2 or 3) to exact residuals at about 1.5 design points per feature."""
     if order not in (2, 3):
         raise ValueError(f"order {order}: the surrogate is of order 2 or 3")
     sampled = choose_sampled(target) if sampled is None else sampled
