@@ -177,6 +177,7 @@ def assembled(
     remarks += repeated_counts(intensities, exposures, points, path, compression)
     if compression is not None:
         remarks.append(remark(compression, len(points)))
+    used = np.unique(exposures.filter).tolist()
     return CalibrationSet(
         instrument=instrument,
         site=site,
@@ -184,7 +185,7 @@ def assembled(
         exposures=exposures,
         points=points,
         sources=sources,
-        filters=with_builtins(filters, exposures),
+        filters=filters | {name: builtin_filter(name) for name in sorted(set(used) - set(filters))},
         intensities=intensities,
         remarks=tuple(remarks),
         compression=compression,
@@ -232,12 +233,6 @@ def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], d
         remarks += [f"{opened.path} [{name}]: unknown extension, not used" for name in images]
         images.clear()
     return tables, images
-
-
-def with_builtins(filters: dict[str, FilterCurve], exposures: Exposures) -> dict[str, FilterCurve]:
-    """Add the built-in curves that the exposures name and the file does not bring; a file's own win."""
-    absent = {str(name) for name in exposures.filter} - set(filters)
-    return filters | {name: builtin_filter(name) for name in sorted(absent)}
 
 
 def _frames(

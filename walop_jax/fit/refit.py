@@ -239,15 +239,6 @@ class FitResult(Fitted):
         )
 
 
-def check_constrained(model: Model, expansion: Expansion) -> None:
-    """Raise ValueError for a free parameter without data and without a prior."""
-    idle = [model.parameters[i].name for i in model.free[np.diag(expansion.matrix) == 0.0]]
-    if idle:
-        what = f"nothing in the data depends on {', '.join(idle)}, free and without a prior"
-        them = "it" if len(idle) == 1 else "them"
-        raise ValueError(f"{what}: freeze {them} or set a prior in the model file")
-
-
 def covariance(model: Model, expansion: Expansion) -> Matrix:
     """Covariance of all parameters: the inverse of JᵀJ, priors included, ties expanded."""
     root = model.selection() @ whitening(expansion.matrix, 1e-15)
@@ -281,7 +272,10 @@ def fit(
         if likelihood is before:
             break
         best = find_minimum(likelihood, best.values, noise_scale, worth)
-    check_constrained(model, best.expansion)
+    if idle := [model.parameters[i].name for i in model.free[np.diag(best.expansion.matrix) == 0.0]]:
+        what = f"nothing in the data depends on {', '.join(idle)}, free and without a prior"
+        them = "it" if len(idle) == 1 else "them"
+        raise ValueError(f"{what}: freeze {them} or set a prior in the model file")
     return FitResult(
         likelihood=likelihood,
         values=best.values,
@@ -309,10 +303,10 @@ def with_honest_errors(result: FitResult) -> FitResult:
     """
     if result.explains_data or result.errors_from != STATED or result.dof <= 0 or not result.converged:
         return result
-    robust = robust_errors(result.likelihood, result.values, result.expansion)
+    robust, made_from = robust_errors(result.likelihood, result.values, result.expansion)
     select = result.model.selection()
-    errors = select @ robust.covariance @ select.T
-    return dataclasses.replace(result, covariance=errors, errors_from=robust.made_from, verdict=None)
+    errors = select @ robust @ select.T
+    return dataclasses.replace(result, covariance=errors, errors_from=made_from, verdict=None)
 
 
 def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noiseless: bool) -> Iterator[Doubt]:

@@ -55,12 +55,8 @@ class FoundMinimum:
 
     @property
     def misfit(self) -> float:
-        """χ² of the data with their errors as given, per degree of freedom."""
-        return _misfit(self.expansion)
-
-
-def _misfit(expansion: Expansion) -> float:
-    return expansion.data / max(expansion.dof, 1)
+        """`Expansion.misfit` at the minimum."""
+        return self.expansion.misfit
 
 
 def free_scales(model: Model) -> Vector:
@@ -95,14 +91,14 @@ def _search(
         return near
 
     def tell(step: int, best: Expansion) -> None:
-        likelihood.runner.tell(f"{label}: step {step} of at most {maximum_steps}, χ²/dof {_misfit(best):.6g}")
+        likelihood.runner.tell(f"{label}: step {step} of at most {maximum_steps}, χ²/dof {best.misfit:.6g}")
 
     minimum = minimise(
         evaluate,
         first[model.free],
         free_scales(model),
         maximum_steps=maximum_steps,
-        far_off=lambda found: not _misfit(found) < FAR_OFF,
+        far_off=lambda expansion: not expansion.misfit < FAR_OFF,
         progress=tell,
         **how,
     )

@@ -105,6 +105,11 @@ class Expansion:
         return self.data + self.priors
 
     @property
+    def misfit(self) -> float:
+        """χ² of the data with their errors as given, per degree of freedom."""
+        return self.data / max(self.dof, 1)
+
+    @property
     def objective(self) -> float:
         """Number that a fit minimises."""
         return self.data / self.noise_scale**2 + self.priors + self.loose

@@ -17,7 +17,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-from jaxtyping import Float
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
@@ -91,7 +90,9 @@ class Chain:
                 seconds = float(str(file.attrs["seconds"]))
             path = str(self.path)
             arrays: list[Any] = [HDFBackend(path, name=f"ensemble{n}", read_only=True) for n in range(count)]
-            stretches = [Stretch(k.get_chain(), k.get_log_prob(), _shares(k)) for k in arrays]
+            # Of the proposals accepted the file has the mean of each walker.
+            shares = (np.repeat(k.accepted[None] / k.iteration, k.iteration, axis=0) for k in arrays)
+            stretches = [Stretch(k.get_chain(), k.get_log_prob(), next(shares)) for k in arrays]
             ends = ((s.positions[-1], s.log_density[-1]) for s in stretches)
             states = [emcee_state(*end, k.random_state) for end, k in zip(ends, arrays, strict=True)]
         except Exception as error:  # whatever a damaged file brings about
@@ -101,8 +102,3 @@ class Chain:
         if changed := [f"{k} ({a[:12]} → {b[:12]})" for k, (a, b) in pairs.items() if a != b]:
             raise fail(f"was sampled with other {', '.join(changed)}", file=self.path, advice=_ADVICE)
         return states, stretches, seconds
-
-
-def _shares(kept: Any) -> Float[np.ndarray, "n w"]:
-    """Shares of proposals accepted: of a chain that was kept, the mean of each walker."""
-    return np.repeat(kept.accepted[None] / kept.iteration, kept.iteration, axis=0)

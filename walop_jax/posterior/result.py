@@ -158,24 +158,14 @@ def arviz_of_fit(result: FitResult, draws: int, seed: int) -> Any:
     normal = functools.partial(np.random.default_rng(seed).multivariate_normal, method="eigh")
     drawn = result.values[varies] + size[varies] * normal(np.zeros(len(varies)), correlation, (4, draws))
     names = [parameters[i].name for i in varies]
-    posterior = group_of_draws({name: drawn[..., k] for k, name in enumerate(names)})
-    for i, name in zip(varies, names, strict=True):
-        posterior[name].attrs["units"] = parameters[i].unit or "1"
+    units = {parameters[i].name: parameters[i].unit for i in varies}
+    posterior = group_of_draws({name: drawn[..., k] for k, name in enumerate(names)}, units)
     trusted = result.verdict is not None and result.trusted
     posterior.attrs.update(sampler="none: covariance of the fit", trusted=int(trusted))
     from xarray import DataTree
 
     rows = {} if result.likelihood.layout.large else _of_rows(result.likelihood)
     return as_arviz(DataTree.from_dict({"posterior": posterior, **rows}))
-
-
-def interval_in_words(row: Any) -> dict[str, str]:
-    """A row of `PosteriorSample.intervals` as texts: median, half the 68 % interval, ends of that of 95 %."""
-    half = 0.5 * float(row["HIGH68"] - row["LOW68"])
-    low, high = (value_and_error(float(row[f"{end}95"]), half)[0] for end in ("LOW", "HIGH"))
-    median, sigma = value_and_error(float(row["MEDIAN"]), half)
-    names = {"name": str(row["NAME"]), "unit": str(row["UNIT"]), "ess": f"{float(row['ESS']):.0f}"}
-    return names | {"low": low, "high": high, "median": median, "sigma": sigma}
 
 
 def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence:
@@ -456,9 +446,7 @@ class PosteriorSample(Drawn):
         draws = {self.names[i]: self.draws[:, :, i] for i in varies}
         if self.ln_f is not None:
             draws[INFLATION] = self.ln_f
-        posterior = group_of_draws(draws)
-        for i in varies:
-            posterior[self.names[i]].attrs["units"] = self.units[i] or "1"
+        posterior = group_of_draws(draws, {self.names[i]: self.units[i] for i in varies})
         v = self.convergence
         for k, name in enumerate(v.names):
             if name not in posterior:  # it never moved
@@ -501,9 +489,13 @@ class PosteriorSample(Drawn):
     def display(self) -> Display:
         """The verdict on the chains and the sampled coefficients."""
         table = self.to_table()
-        shown = map(interval_in_words, table[np.isin(np.asarray(table["NAME"]), self.sampled)])
-        texts = (t | {"ends": f"{t['low']} … {t['high']}"} for t in shown)
-        rows = [tuple(t[n] for n in ("name", "median", "sigma", "unit", "ends", "ess")) for t in texts]
+        rows = []
+        for row in table[np.isin(np.asarray(table["NAME"]), self.sampled)]:
+            half = 0.5 * float(row["HIGH68"] - row["LOW68"])
+            low, high = (value_and_error(float(row[f"{end}95"]), half)[0] for end in ("LOW", "HIGH"))
+            median = value_and_error(float(row["MEDIAN"]), half)
+            ess = f"{float(row['ESS']):.0f}"
+            rows.append((str(row["NAME"]), *median, str(row["UNIT"]), f"{low} … {high}", ess))
         return Display(
             title=f"Posterior: {'trusted' if self.trusted else 'not converged, or not exact enough'}",
             facts=(("sampler", self.sampler), ("chains", self.convergence.message())),
