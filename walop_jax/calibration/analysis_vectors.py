@@ -254,8 +254,6 @@ class AnalysisVectors:
     ) -> FieldTable:
         table, off = accurate_table(exact, self._rectangle, counts, tolerance, error, truth=truth, total=True)
         if table is None or not off <= tolerance:
-            raise RuntimeError(
-                f"the optics vary too fast over the field to be interpolated (error {off:.1e}, {tolerance:g} is "
-                "needed); an effect of the model has a very small scale"
-            )
+            what = f"the optics vary too fast over the field to be interpolated (error {off:.1e}, {tolerance:g} is"
+            raise RuntimeError(f"{what} needed); an effect of the model has a very small scale")
         return table

@@ -39,7 +39,7 @@ from walop_jax.data.settings import (
     single_wavelength,
 )
 from walop_jax.fit.model_file import model_without_data, render
-from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
+from walop_jax.fit.parameter_table import Fitted, parameter_notes
 from walop_jax.fit.verdict import NOT_MEASURED, Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
 from walop_jax.io.code import software_versions
@@ -286,13 +286,8 @@ class Calibration(Contents, Fitted):
             "effects": ", ".join(self.model.effect_names) or "none beyond the base model",
             "errors from": f"covariance of the {v.covariance_from}, {v.errors_from}",
         }
-        return Display(
-            title=f"Calibration of {self.model.name}: {v.words}",
-            facts=tuple(facts.items()),
-            head=HEAD,
-            rows=parameter_rows(self.model, self.values, self.sigma),
-            notes=(*parameter_notes(self.model, self.sigma), *v.warnings),
-        )
+        notes = (*parameter_notes(self.model, self.sigma), *v.warnings)
+        return self.shown(f"Calibration of {self.model.name}: {v.words}", facts, notes)
 
     # ------------------------------------------------------------------------------- asking for the matrix
 

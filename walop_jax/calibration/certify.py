@@ -135,10 +135,8 @@ def _physics(calibration: Calibration) -> Check:
     vectors = analysis.exact(setting, x, y)[:, 0]
     least = np.min(1.0 - np.hypot(vectors[..., 1], vectors[..., 2]) / vectors[..., 0], axis=0)
     cameras = analysis.instrument.cameras
-    transmissions = ", ".join(
-        f"{'/'.join(cameras.names[k] for k in arm)} {rounded(least[list(arm)].min(), '.2g')}"
-        for arm in cameras.arms
-    )
+    arms = (("/".join(cameras.names[k] for k in arm), least[list(arm)].min()) for arm in cameras.arms)
+    transmissions = ", ".join(f"{names} {rounded(value, '.2g')}" for names, value in arms)
     good = bool(np.all(vectors[..., 0] > 0)) and bool(np.all(least > -DARKEST))
     what = "least transmission for any polarisation, over that of unpolarised light"
     return Check("physics", good, f"{what}: {transmissions}")

@@ -186,12 +186,8 @@ def residual_map_of_pixels(frame: FrameSums) -> ResidualMap:
         matrix += np.einsum("cdk,klc,cfl->dfc", change, matrices[:, :, exposure], change, optimize=True)
     degrees = likelihood.cameras - np.where(likelihood.flux_known, 0.0, frame.instrument.cameras.fluxes)
     freedom = np.einsum("e,erc->rc", degrees[chosen], frame.sums.used[chosen])
-    shaped = (
-        frame.sums.chi2[chosen].sum(axis=0),
-        freedom,
-        right.reshape(n, *s.shape),
-        matrix.reshape(n, n, *s.shape),
-    )
+    right, matrix = right.reshape(n, *s.shape), matrix.reshape(n, n, *s.shape)
+    shaped = (frame.sums.chi2[chosen].sum(axis=0), freedom, right, matrix)
     sums = [in_blocks(values, together) for values in shaped]
     grid = cells.blocks(together, sums[0].shape)
     chi2, freedom, right, matrix = (values.reshape(*values.shape[:-2], -1) for values in sums)

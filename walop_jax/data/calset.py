@@ -382,10 +382,8 @@ def _spoilt(counts: np.ndarray) -> Iterator[str]:
     finite = np.isfinite(counts)
     places = np.argwhere(finite.any(axis=2) & ~finite.all(axis=2))
     if len(places):
-        shown = ", ".join(
-            f"counts[{p}, {e}] (camera {' and '.join(str(k) for k in np.flatnonzero(~finite[p, e]))})"
-            for p, e in places[:_SHOWN].tolist()
-        )
+        cameras = {(p, e): map(str, np.flatnonzero(~finite[p, e])) for p, e in places[:_SHOWN].tolist()}
+        shown = ", ".join(f"counts[{p}, {e}] (camera {' and '.join(k)})" for (p, e), k in cameras.items())
         suffix = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
         yield f"{NAME}: not finite in {shown}{suffix}: not used in any camera"
 

@@ -263,12 +263,10 @@ def _row(record: Mapping[str, Any], words: Mapping[str, Word], file: str) -> dic
             what = f"the word {listed} is {'empty' if empty else 'missing'}"
             raise place.fail(what, name, f"{like}optional = true where it may be absent")
         converted[name] = _value(value, name, rules[name], word, place)
-    return {
-        name: _evaluated(expression, {**converted, "x": value}, name, place)
-        if (expression := words[name].expression)
-        else value
-        for name, value in converted.items()
-    }
+    stated = {name: word.expression for name, word in words.items() if word.expression and name in converted}
+    operands = ({**converted, "x": converted[name]} for name in stated)
+    made = zip(stated, stated.values(), operands, strict=True)
+    return converted | {name: _evaluated(text, values, name, place) for name, text, values in made}
 
 
 def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any:

@@ -108,10 +108,8 @@ class Inspection(Displayed):
         sampled_points = f" at {self.looked_at} points looked at" if self.looked_at < self.points else ""
         place = ", ".join(filter(None, (self.instrument, self.telescope)))
         noise = f"{self.noise_ratio**0.5:.4g} × the photon noise √N (median)"
-        uses = {
-            f"element {use.prefix}": f"in {use.exposures} exposures, {len(use.angles)} angles"
-            for use in self.elements
-        }
+        counts = {use.prefix: (use.exposures, len(use.angles)) for use in self.elements}
+        uses = {f"element {p}": f"in {n} exposures, {angles} angles" for p, (n, angles) in counts.items()}
         facts = {
             "instrument": f"{place} ({self.origin or 'origin not stated'})",
             "field points": f"{self.points}, X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
@@ -182,12 +180,8 @@ def inspect(calset: CalibrationSet) -> Inspection:
         filters=tuple(calset.filters),
         findings=(),
     )
-    findings = [
-        *_findings(calset, inspection),
-        *_about_cameras(by_camera),
-        *_about_settings(calset.exposures, live),
-    ]
-    notes = [Finding("note", remark) for remark in calset.remarks]
+    findings = (*_findings(calset, inspection), *_about_cameras(by_camera), *_about_settings(e, live))
+    notes = (Finding("note", remark) for remark in calset.remarks)
     return dataclasses.replace(inspection, findings=(*findings, *notes))
 
 

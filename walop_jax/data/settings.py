@@ -93,12 +93,8 @@ class Settings:
     @classmethod
     def default(cls, count: int, filter_name: str = DEFAULT_FILTER) -> Settings:
         """SDSS-r, flat photon spectrum, all moving elements out, 10 °C, on the meridian."""
-        return cls(
-            filter=np.full(count, filter_name),
-            teff=np.full(count, np.nan),
-            temperature=np.full(count, TEMPERATURE),
-            hour_angle=np.zeros(count),
-        )
+        teff, temperature = np.full(count, np.nan), np.full(count, TEMPERATURE)
+        return cls(np.full(count, filter_name), teff, temperature, hour_angle=np.zeros(count))
 
     @classmethod
     def of(cls, exposures: Exposures, moving: Iterable[str]) -> Settings:

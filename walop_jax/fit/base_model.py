@@ -102,9 +102,9 @@ def gauges(model: Model, flux_known: bool) -> list[str]:
 def instrument_of(calset: CalibrationSet) -> Instrument:
     """The instrument of a set as designed, if it comes with the package; `DataError` with advice if not."""
     if calset.instrument not in shipped():
+        what = f"INSTRUME is {calset.instrument!r}, which does not come with the package ({', '.join(shipped())})"
         raise DataError(
-            f"INSTRUME is {calset.instrument!r}, which does not come with the package ({', '.join(shipped())}): give "
-            "its description, --instrument FILE or instrument=Instrument.read(FILE)"
+            f"{what}: give its description, --instrument FILE or instrument=Instrument.read(FILE)"
         )
     return nominal_instrument(calset.instrument)
 

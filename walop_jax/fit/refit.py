@@ -14,7 +14,7 @@ from jaxtyping import Float
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.minimise import Minimum
-from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
+from walop_jax.fit.parameter_table import Fitted, parameter_notes
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum
 from walop_jax.fit.verdict import (
@@ -230,13 +230,7 @@ class FitResult(Fitted):
             "effects": ", ".join(self.model.effect_names) or "none beyond the base model",
             "errors from": self.errors_from,
         }
-        return Display(
-            title=f"Fit of {self.model.name}: {verdict}",
-            facts=tuple(facts.items()),
-            head=HEAD,
-            rows=parameter_rows(self.model, self.values, self.sigma),
-            notes=(*self.notes, *self.warnings),
-        )
+        return self.shown(f"Fit of {self.model.name}: {verdict}", facts, (*self.notes, *self.warnings))
 
 
 def covariance(model: Model, expansion: Expansion) -> Matrix:
@@ -328,11 +322,11 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
         what = f"χ²/dof = {ratio:.4g} with nothing but noise in the residuals: the stated errors N_ERR are"
         yield Doubt(excess, f"{what} {100 * (np.sqrt(ratio) - 1):.2g} % too small", blocking=False)
     elif not result.explains_data:
-        yield Doubt(
-            Quality.UNEXPLAINED | excess,
-            f"the model does not explain the data: χ²/dof = {ratio:.4g}, where 1 is expected; do not use this "
-            "calibration (walop-jax diagnose looks for missing effects)",
+        text = (
+            f"the model does not explain the data: χ²/dof = {ratio:.4g}, where 1 is expected; do not use this"
         )
+        text += " calibration (walop-jax diagnose looks for missing effects)"
+        yield Doubt(Quality.UNEXPLAINED | excess, text)
     elif result.errors_too_large and not noiseless:
         what = (
             f"χ²/dof = {ratio:.4g}: N_ERR is not the standard error of N; check the gain, and whether N_ERR"
@@ -341,12 +335,9 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
     elif excess:
         yield Doubt(excess, "", blocking=False)  # so few degrees of freedom that noise alone may do it
     if result.noise_scale > 1.0:
-        large = result.noise_scale**2 > 1.0 + EXCESS_NOISE**2
-        yield Doubt(
-            Quality.EXCESS_NOISE if large else Quality(0),
-            f"to reach a solution the errors of the data were multiplied by {result.noise_scale:.3g}: the fit is poor",
-            blocking=False,
-        )
+        bit = Quality.EXCESS_NOISE if result.noise_scale**2 > 1.0 + EXCESS_NOISE**2 else Quality(0)
+        text = f"to reach a solution the errors of the data were multiplied by {result.noise_scale:.3g}"
+        yield Doubt(bit, f"{text}: the fit is poor", blocking=False)
     instrument = result.model.instrument(result.values).patched()
     for sentence in extrapolations(instrument, curves_of(result.calset)):
         yield Doubt(Quality(0), sentence, blocking=False)

@@ -381,10 +381,7 @@ class ResponseBlock:
             return {}
         sites = [np.stack([c, -c], 1)[:, : self.sites] for c in (self.x, self.y)]
         padded = np.pad(np.array(distinct), (0, -len(distinct) % GAPS_TOGETHER), mode="edge")
-        at, batches = (
-            (self.of.instrument, self.of.fringe_plan),
-            np.split(padded, len(padded) // GAPS_TOGETHER),
-        )
+        at, batches = (self.of.instrument, self.of.fringe_plan), padded.reshape(-1, GAPS_TOGETHER)
         joined = np.concatenate([_fringes_at(*at, batch, *sites) for batch in batches], axis=3)
         return {
             ("fringes", place, gap): joined[:, :, plate, i]

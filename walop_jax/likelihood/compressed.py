@@ -93,13 +93,8 @@ def compressed(expansion: PixelExpansion) -> CalibrationSet:
         values=dict(zip(names, sums.values.tolist(), strict=True)),
         frames=calset.inputs,
     )
-    return dataclasses.replace(
-        calset,
-        points=points,
-        intensities=TableIntensities.dense(points, block),
-        compression=record,
-        remarks=(),
-    )
+    table = TableIntensities.dense(points, block)
+    return dataclasses.replace(calset, points=points, intensities=table, compression=record, remarks=())
 
 
 def _with_gradient(

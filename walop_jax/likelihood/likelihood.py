@@ -203,14 +203,9 @@ class Likelihood:
         instrument = self.model.instrument(values)
         if not outgrown(planned_instrument(self.calset, self.model), instrument, curves_of(self.calset)):
             return self
-        return Likelihood.of(
-            self.calset,
-            dataclasses.replace(self.model, template=instrument),
-            memory=self.layout.allowed,
-            runner=self.runner,
-            interpolate=self.layout.interpolated,
-            sets=self.layout.sets,
-        )
+        model, layout = dataclasses.replace(self.model, template=instrument), self.layout
+        how = {"memory": layout.allowed, "interpolate": layout.interpolated, "sets": layout.sets}
+        return Likelihood.of(self.calset, model, runner=self.runner, **how)
 
     @property
     def calset(self) -> CalibrationSet:

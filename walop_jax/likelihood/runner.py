@@ -51,10 +51,8 @@ class Runner:
                 time_now = time.perf_counter()
                 if time_now - last > TOLD_EVERY:
                     last, ready, rate = time_now, min(count * slab, points), count * slab / (time_now - began)
-                    self.tell(
-                        f"{label}: {ready:,} of {points:,} points, {rate:,.0f} points/s, "
-                        f"{(points - ready) / rate:.0f} s left of this pass"
-                    )
+                    seconds = f"{(points - ready) / rate:.0f} s left of this pass"
+                    self.tell(f"{label}: {ready:,} of {points:,} points, {rate:,.0f} points/s, {seconds}")
                 yield result
 
     def _each(self, slabs: int, work: Callable[[int], T]) -> Generator[T, None, None]:

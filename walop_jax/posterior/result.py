@@ -76,11 +76,10 @@ class Convergence:
     def message(self, seconds_per_step: float = math.nan) -> str:
         """One sentence for people."""
         if self.converged:
-            return (
-                f"converged: {self.steps} steps, {self.steps / self.tau.max():.0f} τ, "
-                f"τ = {self.tau.max():.1f}, at least {self.ess.min():.0f} effective samples, "
-                f"R-hat {self.rhat.max():.4f}"
-            )
+            tau = self.tau.max()
+            length = f"{self.steps} steps, {self.steps / tau:.0f} τ, τ = {tau:.1f}"
+            samples = f"at least {self.ess.min():.0f} effective samples, R-hat {self.rhat.max():.4f}"
+            return f"converged: {length}, {samples}"
         time = "" if not np.isfinite(seconds_per_step) else f" (about {self.needed * seconds_per_step:.0f} s)"
         reasons = "; ".join(self.reasons)
         return f"NOT converged: {reasons}. Go on for {self.needed} steps or more{time} with --resume"
@@ -135,13 +134,10 @@ def _of_rows(likelihood: Likelihood) -> dict[str, Dataset]:
         "exposure": ("row", calset.exposures.exposure[exposure]),
         "camera": list(likelihood.model.template.cameras.names),
     }
+    x, y, errors = calset.points.x[point], calset.points.y[point], 1.0 / gathered("weight")[used]
     columns = {
         "observed_data": {"N": gathered("counts")[used]},
-        "constant_data": {
-            "N_ERR": 1.0 / gathered("weight")[used],
-            "X": calset.points.x[point],
-            "Y": calset.points.y[point],
-        },
+        "constant_data": {"N_ERR": errors, "X": x, "Y": y},
     }
     dims = ("row", "camera")
     return {

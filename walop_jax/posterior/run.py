@@ -112,11 +112,11 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
             for candidate in (folder / path, folder / path.name):
                 if candidate.exists():
                     return candidate
-        raise fail(
-            f"cannot be found, neither from {Path.cwd()} nor beside {self.folder}",
-            file=path,
-            advice="give its place (--data FILE, for each set of the fit), or copy it into the folder of the run",
+        advice = (
+            "give its place (--data FILE, for each set of the fit), or copy it into the folder of the run"
         )
+        what = f"cannot be found, neither from {Path.cwd()} nor beside {self.folder}"
+        raise fail(what, file=path, advice=advice)
 
     def fit(self, model_text: str | None = None) -> FitResult:
         """The fit of the run, made once more from where it ended; `model_text` is the model file of the fit.
@@ -170,11 +170,8 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
             facts.append(
                 ("p of a star", f"{two_digits(100 * accuracy['median'])} % (median of the field), {share}")
             )
-        facts += [
-            (name, document["shown"]["title"])
-            for name, document in documents.items()
-            if "shown" in document and name != "summary"
-        ]
+        others = {n: d["shown"]["title"] for n, d in documents.items() if "shown" in d and n != "summary"}
+        facts += others.items()
         inner = Display("") if self.calibration is None else self.calibration.display()
         return dataclasses.replace(
             inner, title=f"Run {self.folder}. {inner.title}".removesuffix(". "), facts=(*facts, *inner.facts)

@@ -104,11 +104,10 @@ class Ensembles:
         shape = np.shape(stretch.positions)
         shapes = (np.shape(stretch.log_density), np.shape(stretch.acceptance))
         if len(shape) != 3 or (shape[0], shape[2]) != (n, k) or shapes != (shape[:2], shape[:2]):
-            raise fail(
-                f"the sampler {self.sampler.name!r} gave positions of shape {shape} and numbers of shapes {shapes}",
-                advice=f"for {n} steps of {k} coordinates it must be (steps, walkers, coordinates) = ({n}, …, {k}), "
-                "and (steps, walkers)",
-            )
+            name, wanted = self.sampler.name, f"(steps, walkers, coordinates) = ({n}, …, {k})"
+            what = f"the sampler {name!r} gave positions of shape {shape} and numbers of shapes {shapes}"
+            advice = f"for {n} steps of {k} coordinates it must be {wanted}, and (steps, walkers)"
+            raise fail(what, advice=advice)
         stored = (np.array(series[self.thin - 1 :: self.thin], float) for series in stretch[:3])
         return Stretch(*stored, counts=stretch.counts)
 
