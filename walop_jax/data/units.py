@@ -45,10 +45,7 @@ def is_sexagesimal(value: Any) -> bool:
 
 
 def degrees_of(text: str | Sequence[str], unit: str) -> Any:
-    """The angle (deg) of a text, or those of several; `unit` (hourangle, deg) is that of one that has none in it.
-
-    Raises ValueError for anything but an angle, minutes beyond 60 included.
-    """
+    """The angles (deg) of texts; `unit` (hourangle, deg) is that of one without; ValueError for what is no angle."""
     from astropy.coordinates import Angle  # imported here: it takes a seventh of a second
 
     return Angle(text, unit=unit).deg

@@ -167,10 +167,7 @@ def _input_table(path: Path, table: Any, remarks: Sequence[str] = ()) -> InputTa
 
 
 def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
-    """A column as an array in the unit, and of the kind, that `rule` asks for.
-
-    Raises `DataError` naming file, column and rows for what cannot be converted.
-    """
+    """A column in the unit and of the kind of `rule`; `DataError`, with rows, for what cannot be converted."""
     place, column = Place(source.path, ""), source.column(name)
     if column is not None:
         if (partner := partner_of(name)) in source.names and rule.kind == "float":

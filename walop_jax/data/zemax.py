@@ -345,10 +345,7 @@ def _dense(
     yx: Float[np.ndarray, "p 2"],
     configurations: tuple[int, ...],
 ) -> tuple[Float[np.ndarray, "w s p 4"], Float[np.ndarray, "w s p 4"]]:
-    """Transmissions of all exports and the steps they are printed in, NaN where there are none.
-
-    Duplicates are refused, and so is a configuration that is none of the cameras.
-    """
+    """Transmissions of all exports and their printed steps, NaN where there are none; duplicates are refused."""
     values, step = np.full((2, len(wavelengths), len(angles), len(yx), 4), np.nan)
     owner = np.full(values.shape, -1)
     place = {(y, x): n for n, (y, x) in enumerate(yx.tolist())}

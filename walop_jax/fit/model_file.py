@@ -97,10 +97,7 @@ def render(model: Model) -> str:
 
 
 def parse(text: str, build: Callable[[ModelTable], Model]) -> Model:
-    """The model that a TOML text describes; `build` makes the base model for its [model] table.
-
-    Raises ValueError naming the table and key that is wrong, and what to write instead.
-    """
+    """The model of a TOML text, `build` making the base model; ValueError names table, key and remedy."""
     try:
         content = parse_toml(text)
     except ValueError as error:

@@ -187,10 +187,7 @@ class FitResult(Fitted):
 
     @property
     def trusted(self) -> bool:
-        """True if no doubt about the fit forbids its use (`Verdict.trusted`).
-
-        Raises RuntimeError for a fit without a verdict.
-        """
+        """True if no doubt about the fit forbids its use (`Verdict.trusted`); RuntimeError without a verdict."""
         return self.checked_verdict().trusted
 
     @property

@@ -54,10 +54,7 @@ def _shares(edges: Vector) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "
 
 
 def compressed(expansion: PixelExpansion) -> CalibrationSet:
-    """The calibration set of field points that stands for all pixels, near the values of an expansion.
-
-    The rows of a table beside the frames are in it as they are.
-    """
+    """The set of points that stands for all pixels near the values of an expansion, and the rows of a table beside."""
     sums = expansion.sums
     cells, likelihood = sums.cells, sums.likelihood
     (s, over), (t, up) = (_shares(edges) for edges in cells.edges())

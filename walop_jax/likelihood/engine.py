@@ -191,10 +191,7 @@ def _linear_unit_counts(
 def _star_responses(
     instrument: Instrument, plan: Plan, fields: Float[Array, "f s"], data: PointData
 ) -> Float[Array, "p e k c"]:
-    """Share by which the counts of a star change for 1 rms of q in each field, then of u.
-
-    `fields` are rms of the values of standards, field by field.
-    """
+    """Share by which counts of a star change for 1 rms (`fields`, field by field) of q, then of u."""
     standard = instrument.standard
 
     def counts(off: Float[Array, "2 f"], point: PointData) -> Float[Array, "e k"]:
@@ -268,10 +265,7 @@ def normal_equations(
 
 
 def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:
-    """Sums over blocks of points, so that intermediate results stay in the processor's cache.
-
-    Points that make no whole number of blocks, and few points, are one block.
-    """
+    """Sums over blocks of points, whose intermediate results stay in the processor's cache; few are one block."""
     points, block = data.x.shape[0], limits.JACOBIAN_BLOCK
     if points <= block or points % block:
         return _block_equations(instrument, plan, data, nodes)

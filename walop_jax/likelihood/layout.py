@@ -153,10 +153,7 @@ def curves_of(calset: CalibrationSet) -> list[FilterCurve]:
 
 
 def bytes_per_point(exposures: int, cameras: int = 4, *, mirrored: bool = False, fields: int = 0) -> int:
-    """Size of the point data of one field point: per exposure counts and weights, sky, source and band.
-
-    For each field of stars that scatter as much as counts and weights once more.
-    """
+    """Bytes of one field point: counts, weights, sky, source, band; the first two again for each field of stars."""
     return 8 * (2 + exposures * (2 * (1 + fields) * cameras + (4 if mirrored else 2) + 1 + 1))
 
 
