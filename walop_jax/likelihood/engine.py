@@ -257,7 +257,8 @@ def normal_equations(
     size, chi2, gradient, matrix = values_of(instrument).size, 0.0, 0.0, 0.0
     for start in range(0, len(data.x), limits.BATCH):
         rows = slice(start, start + limits.BATCH)
-        points = jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], data)
+        few = len(data.x) <= limits.BATCH
+        points = data if few else jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], data)
         residual, slope = map(np.asarray, linearised_residuals(instrument, plan, points))
         r, jacobian = residual.reshape(-1), slope.reshape(-1, size)
         chi2, gradient, matrix = chi2 + r @ r, gradient + jacobian.T @ r, matrix + jacobian.T @ jacobian

@@ -344,7 +344,8 @@ class Likelihood:
     @cached_property
     def used(self) -> Bool[np.ndarray, "p e"]:
         """True where the intensities of a (point, exposure) are used."""
-        return self.points.gathered("weight")[..., 0] > 0
+        used = [np.asarray(batch.weight)[..., 0] > 0 for batch in self.points]
+        return np.concatenate(used)[: self.layout.points]
 
     # ----------------------------------------------------------------------------------------- row by row
 
