@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_average import known_apart_from, mixture
 from walop_jax.fit.refit import FitResult
