@@ -92,7 +92,7 @@ def said(laid, request):
     if not request.config.getoption("--long"):
         found = [probe for probe in found if probe.name in QUICK]
         assert len(found) == len(QUICK)
-    made = all_candidates(Columns(laid.likelihood, laid.values), (), found)[1]
+    made = all_candidates(Columns(laid.likelihood, laid.values), found)
     return {name: candidate.columns for name, candidate in made.items()}
 
 
@@ -106,7 +106,7 @@ def test_names_are_sentences(laid, said):
     single = {}
     for name, columns in said.items():
         single |= dict(zip(name.split("; "), columns.T, strict=True))
-    theirs = all_candidates(Columns(laid.likelihood, laid.values), wanted, ())[0]
+    theirs = all_candidates(Columns(laid.likelihood, laid.values), wanted)
     assert {p.effect.name for p in wanted if p.name not in theirs} == {"etalon"}, (
         "wide gaps, blurred by the bands"
     )
@@ -188,7 +188,7 @@ def turning():
     calset = simulate(TURNING, seed=5).calset
     design = Design.of(fit(Likelihood.of(calset, base_model(calset))))
     every = grammar.sentences(design.fit.model.template, calset.exposures, len(calset.points))
-    made = all_candidates(design.columns, (), every)[1].values()
+    made = all_candidates(design.columns, every).values()
     columns = [candidate.columns for candidate in made]
     names, widths = [candidate.name for candidate in made], [candidate.widths for candidate in made]
     return design, columns, ScoreSpace.projected(design.projector, names, widths, columns, exact=0)

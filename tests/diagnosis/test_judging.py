@@ -201,7 +201,7 @@ def test_what_has_no_name_stays_unexplained_and_is_carried_along():
     found = diagnose(calset)
     assert found.verdict == "unexplained"
     assert "4θ of O1" in found.unexplained.description
-    assert "harmonics" in found.unexplained.term
+    assert "harmonics" in found.unexplained.free_form
     assert found.unexplained.chi2_after < found.unexplained.chi2_before
     assert found.after.explains_data
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -71,25 +71,10 @@ class Dependences:
     def of(self, form: str) -> Iterator[tuple[str, ...]]:
         """The groups of one form."""
         name, _, limit = form.partition(" to ")
-        yield from getattr(self, f"_{name.replace(' ', '_').lower()}")(*map(int, limit.split()))
-
-    def _steady(self) -> Iterator[tuple[str, ...]]:
-        yield ("",)
-
-    def _colour(self) -> Iterator[tuple[str, ...]]:
-        if len(np.unique(self.exposures.filter)) > 1:
-            yield ("colour",)
-
-    def _hours(self) -> Iterator[tuple[str, ...]]:
-        if varies(self.exposures.mjd):
-            yield ("hours",)
-
-    def _kelvin(self) -> Iterator[tuple[str, ...]]:
-        if varies(self.exposures.temp):
-            yield ("kelvin",)
-
-    def _counts(self) -> Iterator[tuple[str, ...]]:
-        yield ("counts",)
+        if name not in _SHOWS:
+            yield from getattr(self, f"_{name}")(*map(int, limit.split()))
+        elif _SHOWS[name](self):
+            yield (name.removeprefix("steady"),)
 
     def _harmonics(self, most: int) -> Iterator[tuple[str, ...]]:
         """Cosine and sine of the harmonics that the angles of a moving element can show."""
@@ -100,35 +85,26 @@ class Dependences:
                 if len(angles) >= 2 * order + 1:
                     yield f"cos {order} {prefix}", f"sin {order} {prefix}"
 
-    def _hour_angle(self) -> Iterator[tuple[str, ...]]:
-        """The hour angle, where it is not degenerate with time."""
+    def _shows_hour_angle(self) -> bool:
+        """True where the hour angle is not degenerate with time."""
         angle, time = self.exposures.ha, self.exposures.mjd
         remainder = angle - angle.mean()
-        if varies(self.exposures.mjd):
+        if varies(time):
             time = time - time.mean()
             remainder = remainder - time * (time @ remainder) / (time @ time)
-        if np.isfinite(angle).all() and np.ptp(remainder) > 1e-3 * np.ptp(angle):
-            yield ("hour angle",)
+        return bool(np.isfinite(angle).all() and np.ptp(remainder) > 1e-3 * np.ptp(angle))
 
-    def _per_exptime(self) -> Iterator[tuple[str, ...]]:
+    def _shows_exptime(self) -> bool:
         seconds = self.exposures.exptime
-        if np.isfinite(seconds).all() and seconds.min() > 0 and np.ptp(seconds) > 1e-3 * seconds.max():
-            yield ("per EXPTIME",)
+        return bool(
+            np.isfinite(seconds).all() and seconds.min() > 0 and np.ptp(seconds) > 1e-3 * seconds.max()
+        )
 
-    def _order(self) -> Iterator[tuple[str, ...]]:
-        """The order of the exposures, where it is not degenerate with time."""
+    def _shows_order(self) -> bool:
+        """True where the order of the exposures is not degenerate with time."""
         hours, order = hours_of(self.exposures), np.arange(len(self.exposures), dtype=float)
-        if (
-            varies(self.exposures.mjd)
-            and len(order) > 2
-            and abs(np.corrcoef(hours, order)[0, 1]) < NEARLY_TIME
-        ):
-            yield ("order",)
-
-    def _night_hours(self) -> Iterator[tuple[str, ...]]:
-        """The time since the beginning of a night, where there are several."""
-        if self._nights():
-            yield ("night hours",)
+        timed = varies(self.exposures.mjd) and len(order) > 2
+        return bool(timed and abs(np.corrcoef(hours, order)[0, 1]) < NEARLY_TIME)
 
     def _side(self) -> Iterator[tuple[str, ...]]:
         """The side from which a moving element came, where it came from both."""
@@ -189,6 +165,20 @@ class Dependences:
             yield from zip(patches)
             if len(patches) > 1:
                 yield tuple(patches)
+
+
+_SHOWS: Mapping[str, Callable[[Dependences], bool]] = {
+    "steady": lambda of: True,
+    "colour": lambda of: len(np.unique(of.exposures.filter)) > 1,
+    "hours": lambda of: varies(of.exposures.mjd),
+    "kelvin": lambda of: varies(of.exposures.temp),
+    "counts": lambda of: True,
+    "hour angle": Dependences._shows_hour_angle,
+    "per EXPTIME": Dependences._shows_exptime,
+    "order": Dependences._shows_order,
+    "night hours": lambda of: bool(of._nights()),
+}
+"""Forms of a single factor of that name, and whether exposures show it."""
 
 
 def varies(values: np.ndarray) -> bool:

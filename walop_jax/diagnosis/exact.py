@@ -77,10 +77,6 @@ class Trial:
         return self.instance.sentences  # type: ignore[attr-defined]
 
 
-def _log_determinant(result: FitResult) -> float:
-    return float(np.linalg.slogdet(result.expansion.matrix)[1])
-
-
 def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
     """Laplace evidence of an extended fit against the base (parameters without a prior carry no Occam factor).
 
@@ -95,7 +91,8 @@ def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
     amplitudes = [i for effect in model.effect_names for i in amplitude_positions(model, effect)]
     at = [i for i in amplitudes if model.names[i] not in base_names]
     gain = 0.5 * (base.expansion.objective - extended.expansion.objective)
-    occam = 0.5 * (_log_determinant(extended) - _log_determinant(base))
+    first, second = (np.linalg.slogdet(fitted.expansion.matrix)[1] for fitted in (base, extended))
+    occam = 0.5 * float(second - first)
     at_all_scales = _of_amplitudes(extended, at) - _of_amplitudes(extended, at, np.ones(1))
     return gain - occam - float(np.sum(np.log(widths))) + at_all_scales
 
@@ -156,19 +153,14 @@ def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int) -> 
         try_effect(base, item.effect.combine(probe.group, score.amplitudes), context, shapes)
         for probe, score in places
     ]
-    best = max(trials, key=lambda t: t.evidence if _converged(t) else -np.inf)
-    alike = [t for t in trials if _converged(t) and t.evidence > best.evidence - thresholds.EVEN_ODDS]
-    alternatives = dict.fromkeys(
-        in_words(t.instance) for t in alike if _differ(t, best, thresholds.SEPARATION)
-    )
+    converged = [t for t in trials if t.fit is not None and t.fit.converged]
+    best = max(converged or trials[:1], key=lambda t: t.evidence)
+    alike = [t for t in converged if t.evidence > best.evidence - thresholds.EVEN_ODDS]
+    alternatives = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best))
     return dataclasses.replace(best, alternatives=tuple(alternatives))
 
 
-def _converged(trial: Trial) -> bool:
-    return trial.fit is not None and trial.fit.converged
-
-
-def _differ(first: Trial, second: Trial, separation: float) -> bool:
+def _differ(first: Trial, second: Trial) -> bool:
     assert first.fit is not None
     assert second.fit is not None
     if first.instance.choices() != second.instance.choices():
@@ -176,7 +168,7 @@ def _differ(first: Trial, second: Trial, separation: float) -> bool:
     at = first.fit.model.positions(first.effect.name)
     sigma = np.maximum(first.fit.sigma[at], second.fit.sigma[at])
     away = np.asarray(values_of(first.instance)) - np.asarray(values_of(second.instance))
-    return bool(np.any(np.abs(away) > separation * np.where(sigma > 0, sigma, np.inf)))
+    return bool(np.any(np.abs(away) > thresholds.SEPARATION * np.where(sigma > 0, sigma, np.inf)))
 
 
 def in_words(effect: Effect) -> str:

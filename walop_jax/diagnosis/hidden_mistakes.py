@@ -71,7 +71,7 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     instrument = fit.model.instrument(fit.values)
     mistakes = list(_mistakes(design, singles, usual))
     along = np.array([m.along for m in mistakes]).reshape(len(mistakes), -1).T
-    changes = (fit.model.selection() @ design.taken_up(along)).T
+    changes = (fit.model.selection() @ design.projector.taken_up(along)).T
     turns = np.array([0.0 if m.effect is None else abs(turn_of(instrument, m.effect)) for m in mistakes])
     errors = _errors_of_stars(design, mistakes, changes, usual) + 2.0 * LARGEST_P * turns
     least, strong = _FAINT * errors.max(initial=0.0), np.linalg.norm(along, axis=0) > 1.0

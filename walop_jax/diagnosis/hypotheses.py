@@ -140,44 +140,35 @@ def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Pr
     return [probe for probe in wanted if shown[probe.effect]]
 
 
-def all_candidates(
-    columns: Columns, effects: Sequence[Probe], sentences: Sequence[Probe]
-) -> tuple[dict[str, Candidate], dict[str, Candidate]]:
+def all_candidates(columns: Columns, wanted: Sequence[Probe]) -> dict[str, Candidate]:
     """Columns of effects and, in single precision, of sentences, by name.
 
     Without effects that the set cannot show, and without fringes that the bands blur away.
     """
-    likelihood, values = columns.likelihood, columns.values
-    template = likelihood.model.template
-    shown = showable(likelihood.calset, template, effects)
+    likelihood, template = columns.likelihood, columns.likelihood.model.template
+    effects = showable(likelihood.calset, template, [p for p in wanted if p.effect is not Described])
+    shown = [*effects, *(p for p in wanted if p.effect is Described)]
     linear: dict[str, list[Change]] = {}
-    for probe in (*shown, *sentences):
+    for probe in shown:
         members = [member.first_order(template) for member in probe.group]
         if all(terms and all(map(columns.has, terms)) for terms in members):
             linear[probe.name] = list(itertools.chain(*members))
-    gaps = {
-        name: [sentence.gap for change in sums for sentence in fringes_of(change)]
-        for name, sums in linear.items()
-    }
+    gaps = {name: [s.gap for change in sums for s in fringes_of(change)] for name, sums in linear.items()}
     survives = columns.survives(list(itertools.chain(*gaps.values())))
-    blurred = {name for name in gaps if not all(survives[gap] for gap in gaps[name])}
-    linear = {name: sums for name, sums in linear.items() if name not in blurred}
-    exact = sum(len(linear.get(probe.name, ())) for probe in shown)
-    computed = columns.rounded(list(itertools.chain(*linear.values())), exact)
-    candidates: list[dict[str, Candidate]] = []
-    for listed, block in zip((shown, sentences), computed, strict=True):
-        sizes = [len(linear[probe.name]) for probe in listed if probe.name in linear]
-        blocks = iter(np.split(block, np.cumsum(sizes)[:-1], axis=1))
-        candidates.append({
-            probe.name: Candidate(
-                probe.name,
-                next(blocks) if probe.name in linear else own_columns(likelihood, values, probe.group),
-                probe.widths,
-            )
-            for probe in listed
-            if probe.name not in blurred
-        })  # fmt: skip
-    return candidates[0], candidates[1]
+    shown = [probe for probe in shown if all(survives[gap] for gap in gaps.get(probe.name, ()))]
+    linear = {probe.name: linear[probe.name] for probe in shown if probe.name in linear}
+    exact = sum(len(linear.get(probe.name, ())) for probe in effects)
+    blocks = columns.rounded(list(itertools.chain(*linear.values())), exact)
+    used, candidates = [0, 0], {}
+    for probe in shown:
+        if probe.name in linear:
+            single = int(probe.effect is Described)
+            first, used[single] = used[single], used[single] + len(linear[probe.name])
+            block = blocks[single][:, first : used[single]]
+        else:
+            block = own_columns(likelihood, columns.values, probe.group)
+        candidates[probe.name] = Candidate(probe.name, block, probe.widths)
+    return candidates
 
 
 def fringes_of(change: Change) -> Iterator[Sentence]:

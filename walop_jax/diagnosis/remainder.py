@@ -31,7 +31,7 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
     state, remainder = _leftover(first, prune(first, state, judge), judge)
     if state.steps and (worse := _worse(first.evidence, state.evidence)):
         return _not_adopted(first, state, worse)
-    added = _descriptions(state)
+    added = tuple(name for step in state.steps for name in step.groups)  # groups of sentences
     if remainder is not None:
         against = tuple(text for name, text in _contradicted(state).items() if name not in added)
         return state, dataclasses.replace(remainder, parts=(*remainder.parts, *against))
@@ -141,7 +141,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     """Remainder, and a fit with a free-form term for it (None: it would be of no use)."""
     evidence = state.evidence
     result, measured = evidence.result, evidence.design.measured
-    patterns = tuple(evidence.patterns_needed())
+    patterns = tuple(evidence.beside_patterns[0])
     remainder = _unexplained(evidence, patterns)
     blocks = dict.fromkeys(block for name, _ in patterns if (block := evidence.candidates[name].block))
     if len(result.calset.exposures) > limits.FREE_EXPOSURES:
@@ -161,7 +161,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     after = settled(trial.fit, [step.effect.name for step in state.steps])
     change = largest_change(instrument_matrices(result), instrument_matrices(after))
     remainder = dataclasses.replace(
-        remainder, term=useful, chi2_before=result.chi2, chi2_after=after.chi2, change_of_qu=change
+        remainder, free_form=useful, chi2_before=result.chi2, chi2_after=after.chi2, change_of_qu=change
     )
     return remainder, after
 
@@ -210,7 +210,7 @@ def _not_adopted(first: State, state: State, worse: str) -> Remainder:
     text = (
         f"with what was found the model predicts worse {worse}, so nothing was adopted: {'; '.join(partial)}"
     )
-    remainder = _and(_unexplained(first.evidence, tuple(first.evidence.patterns_needed())), text)
+    remainder = _and(_unexplained(first.evidence, tuple(first.evidence.beside_patterns[0])), text)
     remainder = dataclasses.replace(remainder, parts=(*partial, *_contradicted(state).values()))
     return back_to(first, state), remainder
 
@@ -223,11 +223,6 @@ def back_to(first: State, state: State) -> State:
 def _contradicted(state: State) -> dict[str, str]:
     """All candidates contradicted by exposures of another KIND, in words."""
     return {r.name: f"{r.name} ({r.reason})" for turn in state.rounds for r in turn.asked if r.against}
-
-
-def _descriptions(state: State) -> tuple[str, ...]:
-    """Names of the added groups of sentences."""
-    return tuple(name for step in state.steps for name in step.groups)
 
 
 _LEFT_OUT = (

@@ -55,8 +55,8 @@ LEAST_SHARE_OF_NAME = 0.25
 """Of what is surely missing (2 σ of χ²) a name, where the fit is not poor: else it stands in for what has none.
 Ablation."""
 PART = 10.0
-"""Factor by which names must bring down χ²/dof − 1 of a poor fit; else they are reported as parts, and not added. Not
-measured."""
+"""Factor by which names must bring down χ²/dof − 1 of a poor fit, else they are reported as parts, and not added; and
+by which another reading of the data must, to be reported. Not measured."""
 HOPEFUL = 1.0
 """Standard errors by which a sentence must predict unseen settings better, by its linear step, to be fitted. Not
 measured."""
@@ -102,8 +102,6 @@ LEAST_GAIN = 12.0
 """Gain in χ² behind one linear step above which a description is worth a fit. Not measured."""
 READING_COARSE = 0.01
 """Share of the light that a fit of mixed-up data misses at least. Not measured."""
-READING_GAIN = 10.0
-"""Factor by which a reading must bring down χ²/dof − 1 to be reported. Not measured."""
 READING_ALIKE = 1.5
 """Factor in χ² within which two readings are both reported. Not measured."""
 READING_SURE = 1.2

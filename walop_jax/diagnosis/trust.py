@@ -14,7 +14,7 @@ Components  the variance of what field points, exposures, states, standards, nig
             model, finer than any pattern (`variance_components`).
 Conditions  the efficient score of every number that the set states of itself: field, filters, colours, sky; of every
             prior, term of a camera and effect of the catalogue (`stated_conditions`).
-Candidates  the efficient score of every effect and description of a diagnosis (`candidate_scores`).
+Candidates  the efficient score of every effect and description of a diagnosis.
 Repeats     the correlation of the residuals of two exposures (`repeated_noise`).
 Errors      χ²/dof far below 1: N_ERR is overestimated. A few per cent are attributed to the stated errors,
             not to the model.
@@ -34,15 +34,15 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Bool
-from scipy import special
+from scipy import linalg, special
 
-from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.candidate_scores import candidate_scores
+from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design, pattern_scores
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
+from walop_jax.diagnosis.hypotheses import Probe, all_candidates
 from walop_jax.diagnosis.readings import refuse_dead_cameras, refuse_mixups
 from walop_jax.diagnosis.repeated_noise import repeated_noise
-from walop_jax.diagnosis.score import Projector, ScoreTable, local_p
+from walop_jax.diagnosis.score import Projector, ScoreSpace, ScoreTable, effective_trials, local_p
 from walop_jax.diagnosis.stated_conditions import Singles, stated_conditions
 from walop_jax.diagnosis.variance_components import (
     VarianceComponent,
@@ -63,6 +63,8 @@ from walop_jax.likelihood.likelihood import Likelihood
 
 TRUST_ROWS = 20_000
 """(Exposure, point) pairs whose residuals are searched for patterns after every fit: a second, and half a GB."""
+TOGETHER = 1e8  # numbers in the columns of a batch of candidates
+DRAWS = 200  # of noise: a fifth of them give the number of trials to 16 %
 
 UNEVEN = 1.25
 """Factor between the squared residuals of a group and those of all below which it is a matter of the stated errors."""
@@ -108,7 +110,8 @@ def examined(
             *stated_conditions(design, singles),
             *_significant("hold patterns that noise does not make", pattern_scores(design, seed)),
             *_significant(
-                "are explained better by a missing effect", candidates or candidate_scores(design, seed)
+                "are explained better by a missing effect",
+                candidates or candidate_scores(design, seed, singles),
             ),
             *in_words(components),
             *_groups(design),
@@ -127,6 +130,49 @@ def examined(
     if unseen := hidden.not_measured() if hidden is not None else ():
         final = final.remarked(NOT_MEASURED.format("; ".join(unseen)))
     return dataclasses.replace(final, hidden=hidden)
+
+
+def candidate_scores(design: Design, seed: int = 0, singles: Singles | None = None) -> ScoreTable:
+    """Scores of all effects and descriptions that a model may lack (`grammar.hypotheses`), with their corrected p.
+
+    Only products of the columns of a candidate with each other, the residuals and the projection are needed, so the
+    columns are made in batches; those of `singles` are there already. Their scores in draws of noise give the number of
+    independent trials, as in a diagnosis, so that both correct p alike.
+    """
+    fit, calset, basis, count = design.fit, design.fit.calset, design.projector.basis, design.rows
+    listed = grammar.hypotheses(fit.model.catalogue, fit.model.template, calset.exposures, len(calset.points))
+    absent = [probe for probe in listed.names if probe.effect.name not in fit.model.effect_names]
+    probes = (*absent, *listed.sentences, *(probe for probe, _ in listed.parts))
+    known = {
+        r.candidate.name: r.candidate.columns[:count] for r in (singles.rivals if singles else ()) if r.probe
+    }
+    residual = design.projector(design.residual)
+    noise = float(np.sqrt(residual @ residual / max(design.projector.free, 1))) or 1.0
+    normal = np.random.default_rng(seed).standard_normal((len(residual), DRAWS), dtype=np.float32)
+    normal = design.projector(normal).astype(np.float32)
+    scored, blocks, limit = list[Probe](), [], max(1, int(TOGETHER / len(residual)))
+    batch_of = np.cumsum([len(probe.widths) for probe in probes]) // limit
+    for number in np.unique(batch_of):
+        batch = [probe for probe, of in zip(probes, batch_of, strict=True) if of == number]
+        made = all_candidates(design.columns, [probe for probe in batch if probe.name not in known])
+        for probe in batch:
+            if probe.name in known or probe.name in made:
+                c = known.get(probe.name)
+                c = made[probe.name].columns.astype(float) / fit.noise_scale if c is None else c
+                along, square = basis[:count].T @ c, c.T @ c
+                drawn = c.T.astype(np.float32) @ normal[:count]
+                scored.append(probe)
+                blocks.append((np.diag(square), c.T @ residual[:count], drawn, square - along.T @ along))
+    if not scored:
+        return ScoreTable((), noise, 1.0, 1.0)
+    before, scores, drawn = (np.concatenate(arrays) for arrays in list(zip(*blocks, strict=True))[:3])
+    names, widths = tuple(probe.name for probe in scored), [probe.widths for probe in scored]
+    gram = np.asarray(linalg.block_diag(*(block for *_, block in blocks)))
+    space = ScoreSpace(
+        names, tuple(map(len, widths)), np.concatenate(widths), before, gram, design.projector.free
+    )
+    trials = effective_trials(space.smallest_of(drawn))
+    return space.table_after(ScoreTable((), noise, 1.0, trials), scores)
 
 
 def _of_pixels(result: FitResult) -> list[VarianceComponent]:

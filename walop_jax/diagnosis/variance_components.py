@@ -129,7 +129,7 @@ def with_structure(
         if not component.grouping.structure or blocks is None:
             continue
         places, basis = len(blocks[0]), design.projector.basis
-        response = design.taken_up(blocks[1].reshape(-1, basis.shape[1]).T)
+        response = design.projector.taken_up(blocks[1].reshape(-1, basis.shape[1]).T)
         added += component.size**2 * response @ response.T
     share = len(design.fit.calset.points) ** 2 / (places * points)
     select = result.model.selection()

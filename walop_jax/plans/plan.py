@@ -27,7 +27,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind
-from walop_jax.plans.available import Available
+from walop_jax.plans.available import Available, with_stops
 from walop_jax.plans.criteria import (
     APART,
     NAMED,
@@ -325,13 +325,9 @@ def plan_from(
             reason = f"no time reaches {digits(goal, '.3g')} {criterion.unit}"
             endless = (f"{criterion.what}: {reason}; add other settings to the candidates",)
     total = experiment.known + information_of_weights(experiment, best.weights)[0]
-    plan = dataclasses.replace(
-        chosen.available.plan,
-        stops=tuple(chosen.choices[line.choice].stop(line.place, line.times) for line in lines),
-        patches=(),
-        stars=(),
-        spacing=round(minutes / max(sum(line.times for line in lines), 1), 3),
-    )
+    stops = (chosen.choices[line.choice].stop(line.place, line.times) for line in lines)
+    spacing = round(minutes / max(sum(line.times for line in lines), 1), 3)
+    plan = with_stops(chosen.available.plan, stops, spacing=spacing)
     # Earlier measurements may hold what these lack.
     unseen = () if known is not None else tuple(map(str, about_exposures(plan.exposures())))
     return ExposurePlan(
@@ -504,7 +500,7 @@ def _pointings(found: Candidates, lines: list[Line]) -> list[tuple[float, float]
     stops = tuple(found.choices[line.choice].stop(line.place) for line in lines)
     if not stops:
         return []
-    exposures = dataclasses.replace(found.available.plan, stops=stops, patches=(), stars=()).exposures()
+    exposures = with_stops(found.available.plan, stops).exposures()
     return list(zip(exposures.ra.tolist(), exposures.dec.tolist(), strict=True))
 
 
