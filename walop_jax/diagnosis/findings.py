@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
@@ -150,9 +149,6 @@ Outcome = Literal["consistent", "effect_found", "unexplained"]
 Cube = Float[np.ndarray, "p e k"]
 
 
-_NO_CUBE = functools.partial(np.zeros, (0, 0, 4))
-
-
 @dataclasses.dataclass(frozen=True)
 class Step:
     """One identified, added and confirmed effect; `parameters` hold (value, sigma, unit).
@@ -192,8 +188,8 @@ class Step:
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
     descriptions: tuple[tuple[Change, float, float], ...] = ()
     nameless: tuple[str, ...] = ()
-    residual_before: Cube = dataclasses.field(default_factory=_NO_CUBE)
-    residual_after: Cube = dataclasses.field(default_factory=_NO_CUBE)
+    residual_before: Cube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
+    residual_after: Cube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
 
     @property
     def confirmed(self) -> bool:

@@ -53,12 +53,12 @@ ROUNDED = 1e-4  # hours, of times in descriptions
 def sentences(instrument: Instrument, exposures: Exposures, points: int) -> tuple[Probe, ...]:
     """All groups that an instrument and its exposures allow, short ones first; `points` counts the field points."""
     groups = dict.fromkeys(_groups(dataclasses.replace(instrument, effects=()), exposures, points))
-    return tuple(_probe(group) for group in sorted(groups, key=len))
-
-
-def _probe(group: tuple[Sentence, ...]) -> Probe:
-    members = tuple(Described.of(Context(), sentences=(sentence.text,)) for sentence in group)
-    return Probe("; ".join(sentence.text for sentence in group), Described, members)
+    texts = ([sentence.text for sentence in group] for group in sorted(groups, key=len))
+    bare = Context()
+    return tuple(
+        Probe("; ".join(group), Described, tuple(Described.of(bare, sentences=(text,)) for text in group))
+        for group in texts
+    )
 
 
 # --------------------------------------------------------------------------------------------- possible omissions
@@ -84,19 +84,15 @@ def beside_names(
 
     A part is a group that effects hold, none of them as a whole: one patch of all, the light in one camera.
     """
-    effects_as_sentences = []  # shape by shape, where each sentence has an amplitude
-    for effect in catalogue:
-        for group in effect.probes(context):
-            texts = frozenset(group[0].in_sentences(instrument))
-            if len(texts) <= sum(
-                np.size(getattr(member, name)) for member in group for name in effect.amplitudes()
-            ):
-                effects_as_sentences.append((texts, effect))
+    # Shape by shape, where each sentence has an amplitude.
+    shapes = [Probe(effect.name, effect, group) for effect in catalogue for group in effect.probes(context)]
+    named = [(frozenset(shape.group[0].in_sentences(instrument)), shape) for shape in shapes]
+    named = [(texts, shape.effect) for texts, shape in named if len(texts) <= len(shape.parameters)]
     alone, partial = [], []
     for probe in all_probes:
-        texts_of_probe = frozenset(sentences_of(probe))
-        holders = frozenset(effect for texts, effect in effects_as_sentences if texts > texts_of_probe)
-        if any(texts == texts_of_probe for texts, _ in effects_as_sentences):
+        own = frozenset(sentences_of(probe))
+        holders = frozenset(effect for texts, effect in named if texts > own)
+        if any(texts == own for texts, _ in named):
             continue
         if holders:
             partial.append((probe, holders))
@@ -217,13 +213,9 @@ def _places(instrument: Instrument, exposures: Exposures) -> Iterator[list[tuple
 
 
 def _of_plates(instrument: Instrument, exposures: Exposures) -> Iterator[Subject]:
-    every_plate = {place: instrument.element(place) for place in instrument.places(WavePlate)}
-    inside = {
-        place: exposures.position(plate.moves).inside for place, plate in every_plate.items() if plate.moves
-    }
-    plates = {
-        place: plate for place, plate in every_plate.items() if place not in inside or inside[place].any()
-    }
+    plates = {place: instrument.element(place) for place in instrument.places(WavePlate)}
+    inside = {place: exposures.position(plate.moves).inside for place, plate in plates.items() if plate.moves}
+    plates = {place: plate for place, plate in plates.items() if place not in inside or inside[place].any()}
     if fixed := [place for place in plates if place not in inside]:
         yield Subject.of(*(_base(("axis",), "of", place) for place in fixed))
     for place in [place for place in plates if place in inside]:

@@ -40,27 +40,22 @@ class Probe:
     effect: EffectKind
     group: tuple[Effect, ...]
 
-    def _fields(self) -> Iterator[str]:
-        """The parameter that each amplitude belongs to, member by member."""
-        for member in self.group:
-            for name in self.effect.amplitudes():
-                yield from [name] * np.size(getattr(member, name))
-
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that the amplitudes belong to, one for each."""
-        return tuple(self._fields())
+        """Names of the parameters that the amplitudes belong to, one for each, member by member."""
+        pairs = itertools.product(self.group, self.effect.amplitudes())
+        return tuple(name for member, name in pairs for _ in range(np.size(getattr(member, name))))
 
     @functools.cached_property
     def widths(self) -> Vector:
         """Prior widths of the amplitudes, member by member."""
         declared = self.effect.numbers()
-        return np.array([declared[name].width or DEFAULT_WIDTH for name in self._fields()])
+        return np.array([declared[name].width or DEFAULT_WIDTH for name in self.parameters])
 
     @property
     def one_sided(self) -> Bool[np.ndarray, " _"]:
         """True for amplitudes that physics keeps above neutral, member by member."""
-        return np.array([name in self.effect.one_sided for name in self._fields()], bool)
+        return np.array([name in self.effect.one_sided for name in self.parameters], bool)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,23 +116,17 @@ def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) ->
     """True if a set is sensitive to an effect: enough field points, and the conditions of its elements."""
     if effect.kind.over_field and len(calset.points) < FEWEST_POINTS:
         return False
-    exposures = calset.exposures
-    unstated = {
-        name
-        for name, column in CONDITIONS.items()
-        if not np.isfinite(getattr(exposures, column.lower())).any()
-    }
+    columns = {name: getattr(calset.exposures, column.lower()) for name, column in CONDITIONS.items()}
+    unstated = {name for name, values in columns.items() if not np.isfinite(values).any()}
     bare = dataclasses.replace(instrument, effects=())
     return not unstated or unstated.isdisjoint(conditions_of_effect(bare, effect))
 
 
 def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Probe]) -> list[Probe]:
     """The probes of effects that a set is sensitive to; all shapes of one effect have the same requirements."""
-    shown: dict[EffectKind, bool] = {}
-    for probe in wanted:
-        if probe.effect not in shown:
-            shown[probe.effect] = _can_show(calset, instrument, probe.group[0])
-    return [probe for probe in wanted if shown[probe.effect]]
+    first = {probe.effect: probe.group[0] for probe in reversed(wanted)}
+    shown = {kind for kind, effect in first.items() if _can_show(calset, instrument, effect)}
+    return [probe for probe in wanted if probe.effect in shown]
 
 
 def all_candidates(columns: Columns, wanted: Sequence[Probe]) -> dict[str, Candidate]:

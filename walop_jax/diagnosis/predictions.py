@@ -56,17 +56,14 @@ def predicts_unseen(
     Symbols     d prediction error of the unit, A its rows of the Jacobian, H normal matrix of all others and priors
     """
     widths = np.concatenate([term.widths for term in terms])
-    term_columns = design.stacked([term.columns for term in terms])
+    columns = design.stacked([term.columns for term in terms])
     prior = np.zeros((len(widths), design.jacobian.shape[1]))
-    rows = np.vstack([np.hstack([design.jacobian, term_columns]), np.hstack([prior, np.diag(1.0 / widths)])])
+    rows = np.block([[design.jacobian, columns], [prior, np.diag(1.0 / widths)]])
     residual = np.append(design.residual, np.zeros(len(widths)))
     calset = design.fit.calset
-    units = {"cells": field_cells(calset)[design.point]}
-    if of_states:
-        units["states"] = states(calset)[design.exposure]
-    for kind, unit in units.items():
-        if kind == "cells" and len(np.unique(unit)) < 2:
-            continue
+    cells, state = field_cells(calset)[design.point], states(calset)[design.exposure]
+    units = [("cells", cells)] * (len(np.unique(cells)) > 1) + [("states", state)] * of_states
+    for kind, unit in units:
         before = _predictions(design.jacobian, design.residual, unit, design.projector.free)
         after = _predictions(rows, residual, unit, design.projector.free)
         gain, closer = (after - before).T

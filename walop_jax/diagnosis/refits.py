@@ -115,12 +115,7 @@ class Refits:
                 self.tell(f"trying {effect.name}")
                 trials.append(try_effect(result, effect.neutral(self.context), self.context))
         described, compared = other_descriptions(
-            result,
-            self.context,
-            allowed,
-            self.tell,
-            all_of_them=state.evidence.poor,
-            earlier=state.choices,
+            result, self.context, allowed, self.tell, all_of_them=state.evidence.poor, earlier=state.choices
         )
         return [*trials, *described], {**state.choices, **compared}
 
@@ -129,31 +124,23 @@ class Refits:
         assert trial.fit is not None
         after = Design.of(trial.fit)
         compared = before_and_after(trial.effect.name, evidence.design, after)
-        against = ""
-        if compared["heldout_after"] < compared["heldout_before"]:
-            against = contradicting(evidence.design, after)
-            if against:
-                self.tell(f"{trial.name}: exposures of {against} speak against it")
+        closer = compared["heldout_after"] < compared["heldout_before"]
+        against = contradicting(evidence.design, after) if closer else ""
+        if against:
+            self.tell(f"{trial.name}: exposures of {against} speak against it")
         return dataclasses.replace(trial, compared=compared, against=against)
 
     def decided(self, trials: list[Trial]) -> list[Trial]:
         """Trials in order of evidence; what scaled errors leave even at the top is decided with errors as stated."""
         even = [trial for trial in trials if trials[0].evidence - trial.evidence < thresholds.EVEN_ODDS]
-        scaled = len(even) > 1 and all(
-            trial.fit is not None and trial.fit.noise_scale > 1.0 for trial in even
-        )
-        if not scaled:
+        fits = [trial.fit for trial in even if trial.fit is not None and trial.fit.noise_scale > 1.0]
+        if len(even) < 2 or len(fits) < len(even):
             return trials
-        exact = [
-            fit(trial.fit.likelihood, start=trial.fit.values, noise_scale=1.0) for trial in even if trial.fit
-        ]
-        best = min(trial.expansion.objective for trial in exact)
-        clearly = [
-            dataclasses.replace(
-                trial, fit=again, evidence=trial.evidence - 0.5 * (again.expansion.objective - best)
-            )
-            for trial, again in zip(even, exact, strict=True)
-        ]
+        exact = [fit(scaled.likelihood, start=scaled.values, noise_scale=1.0) for scaled in fits]
+        best, clearly = min(again.expansion.objective for again in exact), []
+        for trial, again in zip(even, exact, strict=True):
+            evidence = trial.evidence - 0.5 * (again.expansion.objective - best)
+            clearly.append(dataclasses.replace(trial, fit=again, evidence=evidence))
         remaining = [trial for trial in trials if all(trial is not t for t in even)]
         return [*sorted(clearly, key=names_first), *remaining]
 
@@ -172,9 +159,8 @@ class Refits:
         steps = [step for step in state.steps if step.effect is not trial.effect]
         # A further change of the description joins those before.
         for earlier in (step for step in state.steps if step.effect is trial.effect):
-            compared |= {
-                key: earlier.compared[key] for key in ("chi2_before", "heldout_before", "residual_before")
-            }
+            before = "chi2_before", "heldout_before", "residual_before"
+            compared |= {key: earlier.compared[key] for key in before}
             groups = (*earlier.groups, *groups)
         step = dataclasses.replace(trial, compared=compared, groups=groups)
         self.tell(f"added {name}; scoring the residuals")

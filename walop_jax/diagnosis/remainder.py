@@ -122,17 +122,13 @@ def _parts(first: State, state: State) -> dict[str, str]:
     Such a name explains no more than it can borrow from missing effects, and the matrix between the points is worse
     with it. Other descriptions of the instrument stay: they have no amplitude that could bend.
     """
-    names = [step for step in state.steps if step.effect is not OtherDescription]
-    remaining, missing = (
-        fit.chi2 / max(fit.dof, 1) - 1.0 for fit in (state.evidence.result, first.evidence.result)
-    )
-    if not names or remaining < thresholds.POOR_FIT - 1.0 or remaining * thresholds.PART < missing:
+    results, freedom = (state.evidence.result, first.evidence.result), max(first.evidence.dof, 1)
+    remaining, missing = (result.chi2 / max(result.dof, 1) - 1.0 for result in results)
+    if remaining < thresholds.POOR_FIT - 1.0 or remaining * thresholds.PART < missing:
         return {}
     partial = {}
-    for step in names:
-        before, after = (
-            step.compared[f"chi2_{when}"] / max(first.evidence.dof, 1) for when in ("before", "after")
-        )
+    for step in (step for step in state.steps if step.effect is not OtherDescription):
+        before, after = (step.compared[f"chi2_{when}"] / freedom for when in ("before", "after"))
         partial[step.effect.name] = f"{step.effect.name} (χ²/dof {before:.3g} → {after:.3g})"
     return partial
 
@@ -150,9 +146,8 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
         return remainder, None
     # A block has all patterns of its kind: those that are not needed cost errors as well.
     terms = {block: [measured.candidate(s) for s in strata(measured) if s.block == block] for block in blocks}
-    useful = tuple(
-        block for block in blocks if predicts_unseen(evidence.design, terms[block], thresholds.USEFUL)
-    )
+    design = evidence.design
+    useful = tuple(block for block in blocks if predicts_unseen(design, terms[block], thresholds.USEFUL))
     if not useful:
         return _and(remainder, _LEFT_OUT), None
     trial = try_effect(result, FreeForm.of(judge.context, blocks=useful), judge.context)
@@ -203,10 +198,8 @@ def _worse(first: Examination, last: Examination) -> str:
 
 def _not_adopted(first: State, state: State, worse: str) -> Remainder:
     """The first model again: the additions are reported as parts."""
-    partial = tuple(
-        f"{step.effect.name} (χ² {step.compared['chi2_before']:.4g} → {step.compared['chi2_after']:.4g})"
-        for step in state.steps
-    )
+    changes = ((s.effect.name, s.compared["chi2_before"], s.compared["chi2_after"]) for s in state.steps)
+    partial = tuple(f"{name} (χ² {before:.4g} → {after:.4g})" for name, before, after in changes)
     text = (
         f"with what was found the model predicts worse {worse}, so nothing was adopted: {'; '.join(partial)}"
     )

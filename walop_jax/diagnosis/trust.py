@@ -97,7 +97,7 @@ def examined(
     field_fit = on_field_points(result)
     if not near and (scaled := tuple(_errors_too_small(result, seed))):
         return result.judged(scaled)
-    design = Design.of(sampled(field_fit, _most(field_fit)))
+    design = Design.of(sampled(field_fit))
     if result.errors_too_large and _hold_no_noise(design):
         return result.judged(noiseless=True)
     pixels = _of_pixels(result)
@@ -177,9 +177,8 @@ def candidate_scores(design: Design, seed: int = 0, singles: Singles | None = No
 
 def _of_pixels(result: FitResult) -> list[VarianceComponent]:
     """Variance components common to exposures in single pixels of whole frames, of a sample of them."""
-    if not isinstance(result.expansion, PixelExpansion):
-        return []
-    return variance_components(Design.of(sampled(result, _most(result))), pixels=True)
+    pixels = isinstance(result.expansion, PixelExpansion)
+    return variance_components(Design.of(sampled(result)), pixels=True) if pixels else []
 
 
 def _summed_pixels(result: FitResult) -> Iterator[str]:
@@ -202,10 +201,10 @@ def _summed_pixels(result: FitResult) -> Iterator[str]:
 def _with_summed_pixels(result: FitResult, structure: Structure) -> Structure:
     """The structure of field points with that of the pixels that they stand for."""
     compression = result.calset.compression
-    if compression is None:
-        return structure
-    gain = np.hypot(structure.gain, compression.gain or 0.0)
-    return Structure(float(gain), float(np.hypot(structure.response, compression.response or 0.0)))
+    gain, response = (
+        (0.0, 0.0) if compression is None else (compression.gain or 0.0, compression.response or 0.0)
+    )
+    return Structure(float(np.hypot(structure.gain, gain)), float(np.hypot(structure.response, response)))
 
 
 def pixel_structure(result: FitResult) -> Structure:
@@ -213,17 +212,12 @@ def pixel_structure(result: FitResult) -> Structure:
     return structure_of(found_components(_of_pixels(result)))
 
 
-def _most(result: FitResult) -> int:
-    """Field points that are looked at."""
-    return max(1, TRUST_ROWS // max(len(result.calset.exposures), 1))
-
-
 def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:
     """A warning if residuals far larger than the stated errors are nothing but noise."""
     factor = float(np.sqrt(result.chi2 / max(result.dof, 1)))
     scaled = fit(result.likelihood, start=result.values, noise_scale=factor)
     field_fit = on_field_points(scaled)
-    design = Design.of(sampled(field_fit, _most(field_fit)))
+    design = Design.of(sampled(field_fit))
     rough = found_components([*variance_components(design), *_of_pixels(scaled)])
     rough = rough or any(_summed_pixels(result))
     if pattern_scores(design, seed).p_global >= thresholds.ALARM and not (rough or any(_groups(design))):
@@ -250,8 +244,9 @@ def _hold_no_noise(design: Design) -> bool:
     return float(remainder @ remainder) < NOISELESS * design.rows
 
 
-def sampled(result: FitResult, most: int) -> FitResult:
-    """The fit seen at no more than `most` field points, spread over the field."""
+def sampled(result: FitResult, most: int = 0) -> FitResult:
+    """The fit seen at no more than `most` field points (0: those of `TRUST_ROWS`), spread over the field."""
+    most = most or max(1, TRUST_ROWS // max(len(result.calset.exposures), 1))
     if len(result.calset.points) <= most:
         return result
     calset = thinned(result.calset, most, neighbours=1)

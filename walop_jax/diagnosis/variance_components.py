@@ -80,11 +80,11 @@ def variance_components(design: Design, *, pixels: bool = False) -> list[Varianc
     residual = design.projector(design.residual)
     square = float(residual @ residual)
     ready = (asked(design, grouping, residual[:, None]) for grouping in groupings(design, pixels=pixels))
-    return [
-        prepared[0].answered(prepared[1][:, 0], square)
-        for prepared in ready
-        if prepared is not None and square > 0
-    ]
+    return (
+        [question.answered(pull[:, 0], square) for question, pull in filter(None, ready)]
+        if square > 0
+        else []
+    )
 
 
 def found_components(components: list[VarianceComponent]) -> list[VarianceComponent]:
@@ -99,10 +99,8 @@ def in_words(components: list[VarianceComponent]) -> Iterator[str]:
         return
     first = components[0]
     further = ", ".join(f"{c.grouping.name} {c.deviate:.2g} σ" for c in components[1 : 1 + thresholds.SHOWN])
-    yield (
-        f"residuals {first.grouping.words}, {first.deviate:.2g} σ: structure of {first.size:.2g} that the model does "
-        f"not have" + (f" (also {further})" if further else "")
-    )
+    text = f"residuals {first.grouping.words}, {first.deviate:.2g} σ: structure of {first.size:.2g} that the model does"
+    yield f"{text} not have" + (f" (also {further})" if further else "")
 
 
 def structure_of(components: list[VarianceComponent]) -> Structure:
@@ -162,9 +160,8 @@ def groupings(design: Design, *, pixels: bool = False) -> Iterator[_Grouping]:
         yield _Grouping(f"{point}s in q and u", agree_in_qu, at_points, stokes, "response")
     if pixels:
         return
-    positions = [
-        np.where(at.inside, at.angle, np.nan) for at in map(e.position, design.fit.likelihood.plan.moving)
-    ]
+    moving = map(e.position, design.fit.likelihood.plan.moving)
+    positions = [np.where(at.inside, at.angle, np.nan) for at in moving]
     night = night_of(e.mjd, calset.site.longitude)
     source = calset.intensities.block(0, len(points)).source
     cuts = [np.zeros(used.shape, int)]
@@ -203,10 +200,8 @@ class _Question(NamedTuple):
         deviate = 0.5 * self.error * (float(np.sum(pull**2)) / noise - self.share * self.free)
         error = noise * self.error  # of τ²
         size = float(np.sqrt(max(deviate * error, 0.0)))
-        p_value = _tail(deviate, self.skew)
-        return VarianceComponent(
-            self.grouping, deviate, p_value, size, 0.5 * error / max(size, np.sqrt(error))
-        )
+        of_size = 0.5 * error / max(size, np.sqrt(error))
+        return VarianceComponent(self.grouping, deviate, _tail(deviate, self.skew), size, of_size)
 
 
 def asked(
