@@ -69,8 +69,8 @@ class Task(NamedTuple):
     data: Data
     night: Night | None = None
     values: Mapping[str, float] = {}
-    candidates: bool = False
-    """True: those of `night` are linearised at `values` as well."""
+    candidates: frozenset[str] = frozenset()
+    """Candidates of `night` that are linearised at `values` as well."""
 
 
 class Made(NamedTuple):
@@ -125,13 +125,16 @@ class Maker:
         return Made(nights, source_of(calset), measured)
 
     def _again(self, night: Night, task: Task) -> Made:
-        """The night linearised at other values; its candidates as well, or they follow (`with_candidates_of`)."""
+        """The night linearised at other values, with some candidates; the others follow (`with_candidates_of`)."""
         calset, model = self._set_and_model(task.data)
-        candidates = self._candidates_of(model, calset) if task.candidates else {}
-        values = dict(task.values)
-        if not task.candidates:  # a gauge stays where its column was made
-            cut = len(night.names) - night.candidates
-            values |= dict(zip(night.names[cut:], night.reference[cut:].tolist(), strict=True))
+        candidates = {}
+        if task.candidates:
+            every = self._candidates_of(model, calset)
+            candidates = {name: every[name] for name in every if name in task.candidates}
+        cut = len(night.names) - night.candidates
+        held = zip(night.names[cut:], night.reference[cut:].tolist(), strict=True)
+        # A gauge stays where its column was made.
+        values = dict(task.values) | {name: value for name, value in held if name not in candidates}
         (anew,) = night_equations(calset, model, values, candidates, number=night.number, sets=self.count)
         return Made([with_candidates_of(anew, night)])
 

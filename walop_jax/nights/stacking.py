@@ -124,9 +124,10 @@ def stack(
             new_breaks, chosen, _ = breaks_of(data, chosen, catalogue, carried)
             breaks += new_breaks
         data, solution, settled = _settled(data, chosen, at_hand, makers)
-        if at_hand and any(law is not None for law in chosen[len(chosen) - data.candidates :]):
-            # Candidates with a law are linearised at the solution as well.
-            data = _with_candidates_anew(data, solution, at_hand, makers)
+        candidates = zip(data.names, chosen, strict=True)
+        moving = {name for name, law in list(candidates)[len(chosen) - data.candidates :] if law is not None}
+        if at_hand and moving:
+            data = _with_candidates_anew(data, solution, at_hand, makers, frozenset(moving))
             data, solution, settled = _settled(data, chosen, at_hand, makers)
     except UndeterminedError as error:
         raise _undetermined(data, error) from None
@@ -285,14 +286,20 @@ def _settled(
 
 
 def _with_candidates_anew(
-    data: Together, solution: Solution, at_hand: Mapping[tuple[str, int], Data], makers: Makers
+    data: Together,
+    solution: Solution,
+    at_hand: Mapping[tuple[str, int], Data],
+    makers: Makers,
+    candidates: frozenset[str],
 ) -> Together:
-    """The nights linearised at the solution, with their candidates."""
+    """The nights linearised at the solution, with candidates that have a law."""
     values, _ = _in_units(data, solution)
     nights = list(data.nights)
     units = [u for u, night in enumerate(nights) if night.key in at_hand]
     points = [dict(zip(data.names, values[u].tolist(), strict=True)) for u in units]
-    tasks = [Task(at_hand[nights[u].key], nights[u], at, True) for u, at in zip(units, points, strict=True)]
+    tasks = [
+        Task(at_hand[nights[u].key], nights[u], at, candidates) for u, at in zip(units, points, strict=True)
+    ]
     for u, (night,) in zip(units, makers.make(tasks), strict=True):
         nights[u] = night
     return together(nights)
