@@ -42,11 +42,11 @@ from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_product import Classes, ClassOf, Likeness, Shape, Sum, distinct
-from walop_jax.diagnosis.dependences import FEWEST_POINTS, Dependences
 from walop_jax.diagnosis.exact import signature
 from walop_jax.diagnosis.examination import Examination
+from walop_jax.diagnosis.grammar import FEWEST_POINTS, Dependences
 from walop_jax.diagnosis.hidden_mistakes import usual_exposure
-from walop_jax.diagnosis.score import Projector, log_bayes
+from walop_jax.diagnosis.score import Matrix, Projector, Vector, log_bayes
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.inverses import whitening
@@ -58,8 +58,6 @@ from walop_jax.model.effects.deviations import CUBIC
 from walop_jax.model.effects.optics import GENERATORS, generators_of
 from walop_jax.model.light import mean_wavelengths
 
-Vector = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "_ _"]
 ALIKE = 0.5  # of the errors of the matrix: members that differ by less count as one
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
 LINEAR = 0.01  # relative error of the evidence of a linear step

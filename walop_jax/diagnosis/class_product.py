@@ -26,6 +26,7 @@ from jaxtyping import Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.thresholds import GOAL
 from walop_jax.diagnosis import thresholds
+from walop_jax.diagnosis.score import Matrix, Vector
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import some, two_digits
 from walop_jax.likelihood.inverses import pseudo_inverse
@@ -34,8 +35,6 @@ from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.optics import GENERATORS
 from walop_jax.model.specification import Model, effect_context, model_without, with_effects
 
-Vector = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "_ _"]
 Sum = tuple[tuple[float, Sentence], ...]
 """One amplitude: a sum of sentences with their coefficients."""
 

@@ -47,7 +47,7 @@ from numpy.polynomial.legendre import legvander
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.data.records import CalibrationSet, Exposures
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram
+from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, Vector, gram
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import cut, states
 from walop_jax.likelihood.columns import Columns
@@ -269,8 +269,6 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
 
 
 # ----------------------------------------------------------------------------------------------------- one fit laid out
-
-Vector = Float[np.ndarray, " _"]
 
 
 @dataclasses.dataclass(frozen=True)

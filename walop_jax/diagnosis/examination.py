@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 import scipy
-from jaxtyping import Float
 from scipy import special
 
 from walop_jax.data.records import CalibrationSet
@@ -28,9 +27,11 @@ from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Design, number_of_colum
 from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, all_candidates, sentences_of
 from walop_jax.diagnosis.score import (
     Candidate,
+    Matrix,
     Score,
     ScoreSpace,
     ScoreTable,
+    Vector,
     log_bayes,
     separations,
 )
@@ -40,8 +41,6 @@ from walop_jax.likelihood import limits
 from walop_jax.model.effects import Described, EffectKind
 from walop_jax.model.instrument import Instrument
 
-Vector = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "_ _"]
 Parts = Sequence[tuple[Probe, Collection[EffectKind]]]
 
 
@@ -100,9 +99,6 @@ def shortest(item: Ranked) -> Described:
     best = max(subsets, key=worth)
     amplitudes = np.linalg.lstsq(information[np.ix_(best, best)], scores[best], rcond=None)[0]
     return Described.combine([item.probe.group[i] for i in best], amplitudes)
-
-
-# --------------------------------------------------------------------------------------------------- evidence
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

@@ -143,8 +143,6 @@ def _trend(e: Exposures, settings: Int[np.ndarray, " e"], rms: Float[np.ndarray,
     return float(residuals[0] @ residuals[1]) / (size[0] * size[1])
 
 
-# ------------------------------------------------------------------------------------------------------------- findings
-
 Outcome = Literal["consistent", "effect_found", "unexplained"]
 Cube = Float[np.ndarray, "p e k"]
 
@@ -362,9 +360,6 @@ class Diagnosis(Drawn):
         )
 
 
-# --------------------------------------------------------------------------------- descriptions
-
-
 def descriptions_of(result: FitResult) -> tuple[tuple[Change, float, float], ...]:
     """The sentences of a fitted model, each with its amplitude and standard error."""
     if Described.name not in result.model.effect_names:
@@ -395,8 +390,6 @@ def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
         "tested_by": change.tested_by,
     }
 
-
-# ------------------------------------------------------------------------------------------ as plain data
 
 _AS_THEY_ARE = (
     "effect", "score", "p_value", "chi2_before", "chi2_after", "heldout_before", "heldout_after", "heldout_scheme",

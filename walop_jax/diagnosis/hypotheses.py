@@ -14,11 +14,10 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis.dependences import FEWEST_POINTS
-from walop_jax.diagnosis.score import Candidate, Score
+from walop_jax.diagnosis.score import Candidate, Score, Vector
 from walop_jax.likelihood.columns import Change, Columns, own_columns
 from walop_jax.model.dependence import conditions_of_effect
 from walop_jax.model.effects import Context, Described, Effect, EffectKind
@@ -28,8 +27,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import CONDITIONS
 
 DEFAULT_WIDTH = 1.0
-
-Vector = Float[np.ndarray, " _"]
+FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median
 
 
 @dataclasses.dataclass(frozen=True)

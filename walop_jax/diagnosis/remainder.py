@@ -12,8 +12,14 @@ from walop_jax.diagnosis.design import held_out, strata
 from walop_jax.diagnosis.exact import Trial, evidence_of_presence, try_effect
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.findings import Unexplained, describe
-from walop_jax.diagnosis.predictions import predicts_unseen
-from walop_jax.diagnosis.refits import Refits, contradicting, refitted_in_order, settled, without
+from walop_jax.diagnosis.refits import (
+    Refits,
+    contradicting,
+    predicts_unseen,
+    refitted_in_order,
+    settled,
+    without,
+)
 from walop_jax.diagnosis.search import State
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import limits
@@ -82,9 +88,6 @@ def _refitted(first: State, state: State, result: FitResult, steps: Sequence[Tri
     state = judge.adopt(state, result, steps, first.evidence)
     in_order = refitted_in_order(steps, first.evidence.design, state.evidence.design)
     return dataclasses.replace(state, steps=tuple(in_order))
-
-
-# ------------------------------------------------------------------------------------------- remainder
 
 
 def _leftover(first: State, state: State, judge: Refits) -> Remainder:

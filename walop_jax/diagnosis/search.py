@@ -153,9 +153,6 @@ def hopeless(evidence: Evidence, trial: Trial) -> str:
     return refused(evidence, dataclasses.replace(trial, evidence=factor * trial.evidence, left=remaining))
 
 
-# ------------------------------------------------------------------------------------------------------ one round
-
-
 def linear_trials(evidence: Evidence) -> list[Trial]:
     """The leading names, and sentences that are more probable than every name, by linear steps; best first."""
     trials = [linear_trial(evidence, item) for item in leaders(evidence.significant)]

@@ -15,7 +15,7 @@ Components  the variance of what field points, exposures, states, standards, nig
 Conditions  the efficient score of every number that the set states of itself: field, filters, colours, sky; of every
             prior, term of a camera and effect of the catalogue (`stated_conditions`).
 Candidates  the efficient score of every effect and description of a diagnosis.
-Repeats     the correlation of the residuals of two exposures (`repeated_noise`).
+Repeats     the correlation of the residuals of two exposures (`variance_components.repeated_noise`).
 Errors      χ²/dof far below 1: N_ERR is overestimated. A few per cent are attributed to the stated errors,
             not to the model.
 
@@ -41,13 +41,13 @@ from walop_jax.diagnosis.design import Design, pattern_scores
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates
 from walop_jax.diagnosis.readings import refuse_dead_cameras, refuse_mixups
-from walop_jax.diagnosis.repeated_noise import repeated_noise
 from walop_jax.diagnosis.score import Projector, ScoreSpace, ScoreTable, effective_trials, local_p
 from walop_jax.diagnosis.stated_conditions import Singles, stated_conditions
 from walop_jax.diagnosis.variance_components import (
     VarianceComponent,
     found_components,
     in_words,
+    repeated_noise,
     structure_of,
     variance_components,
     with_structure,

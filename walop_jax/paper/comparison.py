@@ -129,9 +129,6 @@ def offsets(
     return Offsets(found, along(1), along(3), noiseless, with_one, paper.condition)
 
 
-# ------------------------------------------------------------------------------------- both methods, one set
-
-
 @dataclasses.dataclass(frozen=True, repr=False)
 class Comparison(Drawn):
     """Paper II's method and the joint model on one calibration set.
