@@ -134,7 +134,7 @@ def test_no_room_calls_upward_through_a_string():
 MOST_REACHED = {
     "model.light": 4050,
     "likelihood.flux": 100,
-    "diagnosis.score": 850,
+    "diagnosis.score": 780,
     "commands.matrix": 23050,
     "commands.refit": 28400,
     "commands.diagnose": 31800,
@@ -193,10 +193,10 @@ MOST_LINES = {
     "calibration": 2845,
     "posterior": 2380,
     "science": 6420,
-    "diagnosis": 8110,
+    "diagnosis": 7650,
     "nights": 2810,
-    "plans": 2380,
-    "paper": 870,
+    "plans": 2315,
+    "paper": 815,
     "reports": 3125,
     "commands": 4885,
 }
