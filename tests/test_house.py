@@ -141,7 +141,7 @@ def test_no_room_calls_upward_through_a_string():
 MOST_REACHED = {
     "model.light": 3950,
     "likelihood.flux": 100,
-    "diagnosis.score": 810,
+    "diagnosis.score": 780,
     "commands.matrix": 16400,
     "commands.refit": 26700,
     "commands.diagnose": 30450,
@@ -200,10 +200,10 @@ MOST_LINES = {
     "calibration": 2655,
     "posterior": 2205,
     "science": 6300,
-    "diagnosis": 8110,
+    "diagnosis": 7650,
     "nights": 2810,
-    "plans": 2380,
-    "paper": 870,
+    "plans": 2315,
+    "paper": 815,
     "reports": 3035,
     "commands": 4685,
 }
