@@ -67,7 +67,7 @@ AMPLITUDES = {
 class Combinations(NamedTuple):
     """Factors of changes in a diagnosis: each pattern over the field with each form of dependence.
 
-    Patterns and forms are those of `diagnosis.dependences`; `among` is the group of changes tried together,
+    Patterns and forms are those of `diagnosis.grammar`; `among` is the group of changes tried together,
     each with its amplitude: single ones, those of the cameras of an arm, of all cameras or arms, or all optics there.
     """
 

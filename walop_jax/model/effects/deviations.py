@@ -1,7 +1,7 @@
 """Deviations of missing physics from its description, at the same places.
 
 Never a candidate: products of a diagnosis include them, with a covariance, where an addition has no name
-(`diagnosis.description_shape`). A fit of other data leaves them out.
+(`diagnosis.class_members`). A fit of other data leaves them out.
 
 Equation    M → M_Δ M_R M_D M of `optics`, each of the nine components of r, d, k being g Σ_p c_p f_p(x, y); other
             changes as in `change`
