@@ -189,23 +189,23 @@ def test_the_core_is_reached_without_the_rest(entry):
 
 
 MOST_LINES = {
-    "io": 1635,
-    "instruments": 250,
+    "io": 1621,
+    "instruments": 220,
     "data": 5970,
-    "sky": 455,
-    "model": 9790,
+    "sky": 435,
+    "model": 9626,
     "likelihood": 3380,
-    "simulation": 1130,
+    "simulation": 1128,
     "fit": 2190,
     "calibration": 2845,
     "posterior": 2380,
-    "science": 6420,
+    "science": 6300,
     "diagnosis": 8110,
     "nights": 2810,
     "plans": 2380,
     "paper": 870,
-    "reports": 3125,
-    "commands": 4885,
+    "reports": 3035,
+    "commands": 4685,
 }
 """Lines of each room: raising one is a decision of its own."""
 

@@ -231,24 +231,32 @@ def test_candidates_follow_a_night_that_is_linearised_anew(nights):
     moved = rng.normal(size=cut)
 
     def at(theta, J, candidates):
-        left, some = r + J[:, :cut] @ theta, J[:, : cut + candidates]
+        """The night with some candidates, by their positions."""
+        keep = [*range(cut), *candidates]
+        left, some = r + J[:, :cut] @ theta, J[:, keep]
         return dataclasses.replace(
             nights[0],
-            parameters=nights[0].parameters[: cut + candidates],
-            candidates=candidates,
-            reference=np.append(theta, np.zeros(candidates)),
+            parameters=tuple(nights[0].parameters[i] for i in keep),
+            candidates=len(candidates),
+            reference=np.append(theta, np.zeros(len(candidates))),
             gradient=some.T @ left,
             matrix=some.T @ some,
         )
 
-    before, there = at(np.zeros(cut), columns, k), at(moved, columns, k)
-    found = with_candidates_of(at(moved, columns, 0), before)
-    np.testing.assert_allclose(found.matrix, there.matrix, rtol=1e-9, atol=1e-9 * there.matrix.max())
-    np.testing.assert_allclose(
-        found.gradient, there.gradient, rtol=1e-8, atol=1e-8 * np.abs(there.gradient).max()
-    )
+    every, few = range(cut, n), (cut + 3, cut + 7)
+    before, there = at(np.zeros(cut), columns, every), at(moved, columns, every)
+    largest = np.abs(there.gradient).max()
+    for some in ((), few):
+        found = with_candidates_of(at(moved, columns, some), before)
+        assert found.names == there.names
+        np.testing.assert_allclose(found.matrix, there.matrix, rtol=1e-9, atol=1e-9 * there.matrix.max())
+        np.testing.assert_allclose(found.gradient, there.gradient, rtol=1e-8, atol=1e-8 * largest)
     bent = columns * (1.0 + 0.01 * rng.normal(size=columns.shape))
     size = np.sqrt(np.diag(before.matrix))
-    found = with_candidates_of(at(moved, bent, 0), before)
+    found = with_candidates_of(at(moved, bent, ()), before)
     assert np.linalg.eigvalsh(found.matrix / np.outer(size, size))[0] > -1e-12
     np.testing.assert_allclose(found.matrix[:cut, :cut], (bent.T @ bent)[:cut, :cut], rtol=1e-12)
+    found, keep = with_candidates_of(at(moved, bent, few), before), [*range(cut), *few]
+    np.testing.assert_allclose(
+        found.matrix[np.ix_(keep, keep)], (bent.T @ bent)[np.ix_(keep, keep)], rtol=1e-12
+    )

@@ -333,25 +333,30 @@ def night_equations(
 
 
 def with_candidates_of(night: Night, before: Night) -> Night:
-    """A night that was linearised anew without candidates, with those it had `before`.
+    """A night that was linearised anew without candidates, or with some of them, with those it had `before`.
 
-    A candidate is C = A J + R with R beyond the parameters, Jᵀ R = 0. A, RᵀR and, to first order, Rᵀr are the same at
-    both places, so that only A J is to follow J: columns of candidates cost six times as much as all others.
+    Another candidate is C = A J + R with R beyond the parameters and candidates of J, Jᵀ R = 0. A, RᵀR and, to first
+    order, Rᵀr are the same at both places, so that only A J is to follow J: columns of candidates cost six times as
+    much as all others.
     """
-    cut = len(before.parameters) - before.candidates
-    if not before.candidates or night.candidates or night.names != before.names[:cut]:
+    names = before.names
+    at = np.array([names.index(name) for name in night.names if name in names], int)
+    rest = np.setdiff1d(np.arange(len(names)), at)
+    if len(rest) == 0 or len(at) < len(night.names):
         return night
-    free, cross, block = (before.matrix[:cut, :cut], before.matrix[cut:, :cut], before.matrix[cut:, cut:])
-    along = cross @ pseudo_inverse(free, 1e-13)
-    beyond, pull = block - along @ cross.T, before.gradient[cut:] - along @ before.gradient[:cut]
-    slope = along @ night.matrix
+    cross = before.matrix[np.ix_(rest, at)]
+    along = cross @ pseudo_inverse(before.matrix[np.ix_(at, at)], 1e-13)
+    beyond = before.matrix[np.ix_(rest, rest)] - along @ cross.T
+    pull = before.gradient[rest] - along @ before.gradient[at]
+    slope, place = along @ night.matrix, np.argsort(np.append(at, rest))
+    matrix = np.block([[night.matrix, slope.T], [slope, slope @ along.T + beyond]])
     return dataclasses.replace(
         night,
         parameters=before.parameters,
         candidates=before.candidates,
-        reference=np.append(night.reference, before.reference[cut:]),
-        gradient=np.append(night.gradient, along @ night.gradient + pull),
-        matrix=np.block([[night.matrix, slope.T], [slope, slope @ along.T + beyond]]),
+        reference=np.append(night.reference, before.reference[rest])[place],
+        gradient=np.append(night.gradient, along @ night.gradient + pull)[place],
+        matrix=matrix[np.ix_(place, place)],
     )
 
 
