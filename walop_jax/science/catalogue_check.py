@@ -99,11 +99,10 @@ class CatalogueCheck:
 
     `noise` is χ² per degree of freedom behind the changes (1 expected; without outliers) and `noise_p` its chance;
     `rows` the factor by which the common variance of the rows of a star exceeds N_ERR, None where every star has
-    one row, and `rows_p` its chance beside `noise`. `scale` are the factors on the photon covariance of stars of one
-    row and of several: 1 unless errors are off. `tests` are the `asked` questions in their first answer; `smallest` is
-    the gain change of the camera seen best that would be found in 99 % of cases (nan: none). `stars` and `rows_used`
-    count the sample; `growth` holds the units of X, Y and time; stars of `places` disagree together; `sky` is
-    the light of the sky left over (None: its level is not stated).
+    one row, and `rows_p` its chance beside `noise`. `tests` are the `asked` questions in their first answer;
+    `smallest` is the gain change of the camera seen best that would be found in 99 % of cases (nan: none). `stars` and
+    `rows_used` count the sample; `growth` holds the units of X, Y and time; stars of `places` disagree together; `sky`
+    is the light of the sky left over (None: its level is not stated).
     """
 
     stars: int
@@ -113,7 +112,6 @@ class CatalogueCheck:
     noise_p: float
     rows: float | None
     rows_p: float
-    scale: tuple[float, float]
     tests: tuple[PossibleChange, ...]
     changes: tuple[InstrumentChange, ...]
     smallest: float
@@ -138,6 +136,13 @@ class CatalogueCheck:
         if self.rows is None or self.rows < NO_NOISE:
             return False
         return self.rows_p < self.alarm and self.rows > NOISE_MATTERS * self.noise
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Factors on the photon covariance of stars of one row and of several: 1 unless errors are off."""
+        single = self.noise if self.noise_is_off else 1.0
+        # χ² of rows that repeat each other does not test N_ERR: their common part does.
+        return single, self.rows if self.rows is not None and self.rows_agree else single
 
     @property
     def holds(self) -> bool:
@@ -203,7 +208,7 @@ class CatalogueCheck:
         }
 
 
-NOTHING_TO_SPARE = CatalogueCheck(0, 0, 0, 1.0, 1.0, None, 1.0, (1.0, 1.0), (), (), np.nan)
+NOTHING_TO_SPARE = CatalogueCheck(0, 0, 0, 1.0, 1.0, None, 1.0, (), (), np.nan)
 """Of a catalogue in which no row has a camera to spare."""
 
 
@@ -364,16 +369,11 @@ class CatalogueSearch:
             noise_p=1.0 if self.crowded else chance_of_scale(noise),
             rows=None if rows is None else rows.value,
             rows_p=rows_p,
-            scale=(1.0, 1.0),
             tests=tuple(tests),
             changes=changes,
             smallest=smallest,
             growth=self.growth,
         )
-        # χ² of rows that repeat each other does not test N_ERR: their common part does.
-        single = noise.value if check.noise_is_off else 1.0
-        several = float(rows.value) if rows is not None and check.rows_agree else single
-        check = dataclasses.replace(check, scale=(single, several))
         return dataclasses.replace(check, places=self._places(check, look, sizes, chosen))
 
     def _places(

@@ -346,14 +346,23 @@ class Watching:
         return np.concatenate([part.parameters() @ self.root, part.colour], axis=-1)
 
     def suspects(self, found: Answers) -> list[PossibleChange]:
-        """Every reading with the histories compared, the most significant first; those too large for theirs last."""
+        """Every reading with the histories compared, the most significant first; those too large for theirs last.
+
+        These are the best history of each kind, whatever has changed, and its neighbours in time.
+        """
+        strength = np.max(np.abs(found.size / found.error), axis=1)
+        compared: list[int] = []
+        for kind in ("step", "drift", "once"):
+            if mine := [n for n, h in enumerate(self.histories) if h.kind == kind]:
+                top = max(mine, key=lambda n: strength[n])
+                compared += [n for n in (top - 1, top, top + 1) if n in mine]
         listed = [
             PossibleChange(
                 reading.name, reading.kind != "optics", self.histories[n], float(found.size[n, k]),
                 float(found.error[n, k]), reading.unit, reading.kind,
                 () if reading.across is None else (float(found.angle[n, k]),),
             )
-            for n in self.near(found.size / found.error)
+            for n in compared
             for k, reading in enumerate(self.readings.listed)
             if np.isfinite(found.error[n, k])
         ]  # fmt: skip
@@ -389,21 +398,19 @@ class Watching:
                 self.spoilt |= profile(x, y, change.best.place) > 0
             weights, scale = self.weights(residual)
             matrix, score = self.scan(residual, weights)
-        remarks = self.alone(residual, weights, scale)
-        return dataclasses.replace(self.told(changes, matrix, score, scale), remarks=remarks)
-
-    def alone(self, residual: Float[np.ndarray, "r k"], weights: Weights, whole: Scale) -> tuple[str, ...]:
-        """A remark on stars that were left out as they disagree by more than noise ever does."""
+        result = self.told(changes, matrix, score, scale)
+        # Stars that were left out as they disagree by more than noise ever does.
         dof = np.maximum(self.stars.dof.astype(float), 1e-12)
-        chi2 = self.stars.chi2(residual) / (self.variance * max(whole.value, 1.0))
+        chi2 = self.stars.chi2(residual) / (self.variance * max(scale.value, 1.0))
         odd = (weights.inverse == 0) & (self.stars.dof > 0) & (chi2 > special.chdtri(dof, ALARM / len(dof)))
         if not odd.any():
-            return ()
+            return result
         worst = self.stars.first[np.argmax(np.where(odd, chi2, 0.0))]
-        return (
+        remark = (
             f"{odd.sum()} of {len(dof)} stars disagree with the calibration each by itself and were left out, the "
-            f"worst at X {self.stars.x[worst]:+.3f}°, Y {self.stars.y[worst]:+.3f}°: blends, cosmic rays, bad pixels?",
+            f"worst at X {self.stars.x[worst]:+.3f}°, Y {self.stars.y[worst]:+.3f}°: blends, cosmic rays, bad pixels?"
         )
+        return dataclasses.replace(result, remarks=(remark,))
 
     def _likeliest(self, ways: list[Settled]) -> Settled | None:
         """The change behind which χ² is least, stars that are left out at their cut; others as good are alike."""
@@ -532,18 +539,6 @@ class Watching:
         ]
         return sorted(sizes, key=lambda entry: -abs(entry.sigma))
 
-    def near(self, z: Float[np.ndarray, "h c"]) -> list[int]:
-        """The best history of each kind, whatever has changed, and its neighbours in time."""
-        strength = np.max(np.abs(z), axis=1)
-        chosen: list[int] = []
-        for kind in ("step", "drift", "once"):
-            mine = [n for n, h in enumerate(self.histories) if h.kind == kind]
-            if not mine:
-                continue
-            top = max(mine, key=lambda n: strength[n])
-            chosen += [n for n in (top - 1, top, top + 1) if n in mine]
-        return chosen
-
     def told(
         self,
         changes: list[WatchedChange],
@@ -566,15 +561,12 @@ class Watching:
                 gain[:, k] += 0.0 if mine is None else mine.size * mine.history.over(self.time)
             error[:, k] = np.where(variances > 0, variances, np.nan) ** -0.5
             information = np.einsum("gh,gf,fh->h", steps, blocks[:, k, :, k], steps, optimize=True)
-            smallest[:, k] = (self.alarm + MOST_LIKELY) * np.where(
-                information > 0, information, np.nan
-            ) ** -0.5
-        chi2 = self.stars.chi2(self.stars.residual)
-        dof = self.stars.dof
-        pairs = np.unique(self.stars.star * groups + self.group)
-        ratio = np.full(groups, np.nan)
+            measured = np.where(information > 0, information, np.nan)
+            smallest[:, k] = (self.alarm + MOST_LIKELY) * measured**-0.5
+        chi2, dof = self.stars.chi2(self.stars.residual), self.stars.dof.astype(float)
+        pairs, ratio = np.unique(self.stars.star * groups + self.group), np.full(groups, np.nan)
         for g in np.unique(self.pool[self.pool < groups]):
-            ratio[g] = noise_scale(chi2[self.pool == g], dof[self.pool == g].astype(float)).value
+            ratio[g] = noise_scale(chi2[self.pool == g], dof[self.pool == g]).value
         return Watch(
             cameras=self.cameras,
             time=self.time,
