@@ -74,9 +74,8 @@ def affected(
             shifts_of_catalogue = list(nights_of(before, after, rows, name, limit))
         nights += shifts_of_catalogue
         if beyond := sum(night.beyond for night in shifts_of_catalogue):
-            warnings.append(
-                f"{name}: {beyond} stars have a filter or temperature that the new one does not cover"
-            )
+            what = "stars have a filter or temperature that the new one does not cover"
+            warnings.append(f"{name}: {beyond} {what}")
     first, second = (", ".join(dict.fromkeys(hashes)) for hashes in (replaced, replacing))
     shifts = Affected(first, second, limit, tuple(nights), tuple(warnings))
     return Outcome(shifts, saved_as=AFFECTED, warnings=shifts.warnings, trusted=not shifts.again)

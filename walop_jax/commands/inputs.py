@@ -164,9 +164,7 @@ def set_and_model(
         text = read_text(path_of(model, "a model", "base_model(calset), or the path of a model file"))
     if output is not None:
         if isinstance(model, Model) or isinstance(instrument, Instrument):
-            raise ValueError(
-                "with output, give model and instrument as files, so that the run can be made again"
-            )
+            raise ValueError("with output, give model and instrument as files: then it can be made again")
         paths_of(data)
     design = design_of(instrument)
     calset = set_of(data, design)

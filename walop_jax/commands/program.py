@@ -89,9 +89,8 @@ class _OneCommand(TyperCommand):
             return super().parse_args(ctx, args)
         except Exception as error:
             if str(getattr(error, "option_name", "")).startswith(("-o", "--out")):
-                raise typer.BadParameter(
-                    f"{ctx.info_name} {self.advice}", ctx, param_hint="--output"
-                ) from None
+                complaint = f"{ctx.info_name} {self.advice}"
+                raise typer.BadParameter(complaint, ctx, param_hint="--output") from None
             raise
 
 

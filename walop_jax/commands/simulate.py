@@ -102,9 +102,7 @@ def simulate(
         template, catalogue = None, catalogue_of(effects)
         if like is not None:
             if instrument is not None or catalogue_seed is not None:
-                raise ValueError(
-                    "like gives instrument and catalogue: leave out instrument and catalogue_seed"
-                )
+                raise ValueError("like gives instrument and catalogue: leave instrument, catalogue_seed out")
             template = _template(like, catalogue)
             plan = template.planned(plan)
         plan = plan or ObservingPlan.usual(design_of(instrument) or nominal_instrument())

@@ -62,9 +62,7 @@ def stack(
     from walop_jax.nights.stacking import stack as stacked
 
     if workers is not None and scheduler is not None:
-        raise UsageError(
-            "workers and scheduler exclude each other: a cluster has its own workers", "scheduler"
-        )
+        raise UsageError("workers and scheduler exclude each other: a cluster has workers", "scheduler")
     sources = [fit_of(night) for night in several(nights)]
     with job.reserved(output, FILES) as job, executor_of(workers, scheduler) as executor:
         job.begin("reading")

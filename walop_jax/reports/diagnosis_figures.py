@@ -60,9 +60,8 @@ def residual_maps(
     3 σ carry their sign, so that the maps can be read without colours.
     """
     far = max(largest_size(*maps.values()), SIGN_BEYOND)
-    return _maps(
-        points, maps, cameras, Normalize(-far, far), DIVERGING, "residual (σ)", len(points) <= MOST_MARKED, on
-    )
+    norm, signs = Normalize(-far, far), len(points) <= MOST_MARKED
+    return _maps(points, maps, cameras, norm, DIVERGING, "residual (σ)", signs, on)
 
 
 @styled
@@ -152,9 +151,8 @@ def signature_figure(
     for k, camera in enumerate(cameras):
         finite = np.isfinite(position) & np.isfinite(comparison.curves["BEFORE"][:, k])
         columns = (comparison.curves[name] for name in ("BEFORE", "ERROR", "EXPLAINED", "AFTER"))
-        x, before, error, explained, after = _binned(
-            position[finite], *(column[finite, k] for column in columns)
-        )
+        shown = (column[finite, k] for column in columns)
+        x, before, error, explained, after = _binned(position[finite], *shown)
         for axis, dots in ((upper[k], before), (lower[k], after)):
             axis.axhline(0.0, color=QUIET, lw=0.8, zorder=0)
             axis.errorbar(x, dots, error, fmt="o", ms=3, lw=0.8, color="0.15", label="data", zorder=3)
@@ -221,9 +219,8 @@ def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
     margin = (high / low) ** 0.12
     axis.set(xscale="log", xlim=(low / margin, high * margin**2), xlabel="χ² per degree of freedom")
     for y, value in zip(place, ratio, strict=True):
-        axis.annotate(
-            f"{value:.4g}", (value, y), (9, -8), textcoords="offset points", fontsize=8, va="center"
-        )
+        place_of_text = {"xytext": (9, -8), "textcoords": "offset points", "va": "center"}
+        axis.annotate(f"{value:.4g}", (value, y), fontsize=8, **place_of_text)
     axis.set_yticks(place, names)
     axis.set_ylim(len(ratio) - 0.5, -0.5)
     axis.tick_params(labelsize=SMALL)
@@ -291,9 +288,8 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     norm = LogNorm(np.nanmin(percent), max(np.nanmax(percent), 1.2 * np.nanmin(percent)))
     # Standards lie between the other points: in between the level is interpolated, where one of these is known.
     field = (found.x.min(), found.x.max(), found.y.min(), found.y.max())
-    places = np.stack(
-        np.meshgrid(np.linspace(*field[:2], _PIXELS), np.linspace(*field[2:], _PIXELS)), axis=-1
-    )
+    lines = np.linspace(*field[:2], _PIXELS), np.linspace(*field[2:], _PIXELS)
+    places = np.stack(np.meshgrid(*lines), axis=-1)
     points = np.stack([found.x, found.y], axis=1)
     level = (
         griddata(points[good], np.log(percent[good]), places)

@@ -329,9 +329,8 @@ def _candidates(run: RunContents) -> Section:
         ),
     )
     text = "Every effect of the catalogue at the first look at the starting model; p is corrected for their number."
-    return Section(
-        "candidates", "Candidates", table, folded=[display for display in folded if display.rows], text=text
-    )
+    folded = [display for display in folded if display.rows]
+    return Section("candidates", "Candidates", table, folded=folded, text=text)
 
 
 def _limits(run: RunContents) -> list[Display]:

@@ -62,9 +62,8 @@ def informed(
 
     `spread` holds standard deviations of the posterior, `prior` those of the prior (NaN: none).
     """
-    share = {
-        name: spread[name] / prior[name] if np.isfinite(prior.get(name, np.nan)) else 0.0 for name in names
-    }
+    known = {name for name in names if np.isfinite(prior.get(name, np.nan))}
+    share = {name: spread[name] / prior[name] if name in known else 0.0 for name in names}
     return tuple(sorted((n for n in names if share[n] < PRIOR_ONLY), key=lambda n: share[n]))
 
 

@@ -165,10 +165,8 @@ class FigureSource:
     @functools.cached_property
     def figure_data(self) -> DiagnosisFigureData:
         """Data of the figures of a diagnosis."""
-        advice = "it comes with walop-jax diagnose"
-        return self._wanted(
-            FIGURE_DATA, lambda run: read_figure_data(run.wanted(FIGURE_DATA, advice)), advice
-        )
+        hint = "it comes with walop-jax diagnose"
+        return self._wanted(FIGURE_DATA, lambda run: read_figure_data(run.wanted(FIGURE_DATA, hint)), hint)
 
     @functools.cached_property
     def accuracy(self) -> FieldAccuracy | None:
@@ -187,9 +185,8 @@ class FigureSource:
         count = len(self.figure_data.comparisons) - 1
         if self.step > count:
             result = f"the diagnosis added {count or 'no'} effect{'s' if count != 1 else ''}"
-            raise fail(
-                f"step {self.step}: {result}", advice="step 0 compares the starting with the final model"
-            )
+            advice = "step 0 compares the starting with the final model"
+            raise fail(f"step {self.step}: {result}", advice=advice)
         return self.step
 
 
@@ -246,14 +243,10 @@ def read_run(run: Run | Path) -> RunContents:
         names = [step["effect"] for step in diagnosis["steps"]]
         drawn = [] if pictures is None else [comparison.effect for comparison in pictures.comparisons[1:]]
         if pictures is not None and drawn not in (names, [*names, FreeForm.name]):
-            missing.append(
-                f"{FIGURE_DATA} is of another diagnosis than {DIAGNOSIS}: its pictures are left out."
-            )
+            missing.append(f"{FIGURE_DATA} is of another diagnosis than {DIAGNOSIS}: pictures are left out.")
             pictures = None
         if _another_fit(summary, diagnosis):
-            missing.append(
-                f"{DIAGNOSIS} is of another fit than {SUMMARY}: this folder was written to again since."
-            )
+            missing.append(f"{DIAGNOSIS} is of another fit than {SUMMARY}: the folder was written to again.")
     sampled = POSTERIOR in run
     extras = {
         "sample": optional(SAMPLE, lambda: run.document(SAMPLE), "no verdict on the sampling", sampled),
@@ -280,9 +273,8 @@ def read_limits(path: Path) -> DetectionLimits:
         content = RunFolder(path.parent).document(path.name, ("limits", "effects", "protection"))
         return DetectionLimits.from_document(content)
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise fail(
-            f"is not what walop-jax limits writes: {error}", file=path, advice="run it again"
-        ) from error
+        what = f"is not what walop-jax limits writes: {error}"
+        raise fail(what, file=path, advice="run it again") from error
 
 
 def _limits(run: Run, summary: dict[str, Any]) -> DetectionLimits:

@@ -125,9 +125,10 @@ class Canvas:
         """A figure, and panels in it with small numbers, as `subplots` makes them.
 
         `least` is the width (inches) of the narrowest panel that can be read, `labels` the height of the labels
-        around each at any size; where columns are narrower, rows become
-        columns (`turned`), or groups of columns go below each other.
+        around each at any size; where columns are narrower, rows become columns (`turned`: of maps, which share their
+        axes), or groups of columns go below each other.
         """
+        options |= {"sharex": True, "sharey": True} if turned else {}
         turned = turned and self._narrow(columns, least) and rows < columns
         group = columns
         if turned:
@@ -155,9 +156,8 @@ class Canvas:
             empty.remove()
         if groups * group > columns:  # the last panel takes the rest of its row
             place = axes[0, columns - 1].get_subplotspec()
-            axes[0, columns - 1].set_subplotspec(
-                place.get_gridspec()[place.rowspan.start, place.colspan.start :]
-            )
+            rest = place.get_gridspec()[place.rowspan.start, place.colspan.start :]
+            axes[0, columns - 1].set_subplotspec(rest)
         axes = axes[:, :columns]
         axes = axes.T if turned else axes
         for axis in np.ravel(axes):
@@ -313,9 +313,8 @@ def angle_ticks(axis: Axis, figure: Any, columns: int) -> None:
 def calendar(axis: Axes, mjd: Any) -> bool:
     """Write dates (UTC), a day at least, along X where times are MJD; False where they only count."""
     mjd = np.asarray(mjd, float)
-    low, high = (
-        axis.dataLim.intervalx
-    )  # of a single date matplotlib would draw a tenth of all days since 1970
+    # Of a single date matplotlib would draw a tenth of all days since 1970.
+    low, high = axis.dataLim.intervalx
     margin = max(0.05 * (high - low), 0.5 * (1.0 - (high - low)))
     axis.set_xlim(low - margin, high + margin)
     if not mjd.size or not np.nanmin(mjd) > FIRST_DATE:
@@ -419,9 +418,8 @@ def matrix_panels(
         low, high = (100.0 * float(edge(maps[i])) for edge in (np.min, np.max))
         span = f"{_short(low, high - low)} to {_short(high, high - low)} %"
         field_axes(axis, f"{PAPER_NAMES[kind]} {element_symbols(arms)[i]}\n{span}")
-        colour_bar(
-            figure, pixel_map(axis, 100.0 * maps[i], field, *element_scale(i, maps), smooth=smooth), axis
-        )
+        image = pixel_map(axis, 100.0 * maps[i], field, *element_scale(i, maps), smooth=smooth)
+        colour_bar(figure, image, axis)
         if weak is not None and i > 3 and weak.min() < SMALLEST_DETERMINANT < weak.max():
             axis.contour(weak, levels=[SMALLEST_DETERMINANT], extent=field, colors="0.15", linewidths=0.7)
     outer_labels(axes)

@@ -43,9 +43,8 @@ _KINDS = {"clp": "through the polariser", "moon": "of the moonlit sky", "standar
 def data_in_words(product: Calibration | Product) -> tuple[tuple[str, str], ...]:
     """Nights, exposures, polariser angles, plate settings, Moon patches, standards, temperatures, filters."""
     e = product.exposures
-    kinds = ", ".join(
-        f"{number} {_KINDS.get(kind, kind)}" for kind, number in Counter(e.kind.tolist()).items()
-    )
+    counts = Counter(e.kind.tolist()).items()
+    kinds = ", ".join(f"{number} {_KINDS.get(kind, kind)}" for kind, number in counts)
     low_x, high_x, low_y, high_y = product.field
     rows = [
         ("Nights", _nights(e.mjd, product.site.longitude)),

@@ -194,9 +194,8 @@ class _Application:
         on_sky = np.stack([mixed[..., 0], *axes], axis=-1)
         fitted = estimate(on_sky, used, sigma, star, vectors.instrument.cameras)
 
-        s = np.stack(
-            [np.ones(len(rows)), *sky_to_instrument(fitted.qu[star, 0], fitted.qu[star, 1], rotator)], axis=1
-        )
+        towards = sky_to_instrument(fitted.qu[star, 0], fitted.qu[star, 1], rotator)
+        s = np.stack([np.ones(len(rows)), *towards], axis=1)
         # Of the model per unit flux, to the plain parameters and to the throughputs.
         plain = np.empty((len(rows), vectors.cameras, vectors.plain))
         throughput = np.empty((len(rows), vectors.cameras, vectors.cameras))
@@ -211,9 +210,8 @@ class _Application:
             local = vectors.derivatives(self.settings[k], x[same], y[same], teff[same])
             plain[same], throughput[same] = (np.einsum("rs,rksf->rkf", s[same], slopes) for slopes in local)
             gain = fitted.gain[same]
-            derivative[same] = vectors.to_parameters(
-                gain @ plain[same], gain @ throughput[same], x[same], y[same]
-            )
+            of_plain, of_throughput = gain @ plain[same], gain @ throughput[same]
+            derivative[same] = vectors.to_parameters(of_plain, of_throughput, x[same], y[same])
         lit = np.where(fitted.flux > 0, fitted.flux, np.inf)
         for p, change in detector_slopes(vectors, counts):
             change = np.nan_to_num(change) / lit[:, None]
@@ -321,9 +319,8 @@ class _Application:
         root = np.where(used, 1.0 / np.where(used, sigma, 1.0), 0.0)
         a, qu = block.vectors[r], stars.qu[block.star[r]]
         unit = root * np.einsum("rks,rs->rk", a, np.concatenate([np.ones((len(qu), 1)), qu], axis=1))
-        flux, residual = eliminate_flux(
-            root * np.where(used, counts, 0.0), unit, np.zeros(len(r), bool), shared
-        )
+        weighed = root * np.where(used, counts, 0.0)
+        flux, residual = eliminate_flux(weighed, unit, np.zeros(len(r), bool), shared)
         model, scale = flux * unit, (flux * root)[..., None]
         tangent = project_flux(np.moveaxis(scale * a[..., 1:], -1, 0), model, False, shared)
         x, y = catalogue.points.x[rows], catalogue.points.y[rows]

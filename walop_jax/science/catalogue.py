@@ -161,9 +161,7 @@ def _with_colours(
     source.remarks.append(f"TEFF of {int(within.sum())} rows is made of BP_RP ({SOURCE})")
     if beyond := int(np.sum(from_colour & ~within)):
         limits = f"{LIMITS[0]:g} … {LIMITS[1]:g} mag"
-        source.remarks.append(
-            f"BP_RP of {beyond} rows lies beyond {limits}: their errors are those of unknown colours"
-        )
+        source.remarks.append(f"BP_RP of {beyond} rows lies beyond {limits}: errors as of unknown colours")
     settings = dataclasses.replace(points.settings, teff=np.where(within, temperature, teff))
     return dataclasses.replace(points, settings=settings), np.where(within, off, error)
 
@@ -244,9 +242,7 @@ def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndar
         unknown = ~missing & (negative | np.isin(np.char.lower(values), _NO_ID))
     if unknown.any():
         which = rows_text(np.flatnonzero(unknown))
-        source.remarks.append(
-            f"{named} is {values[unknown][0]} in {which}: unknown, a star of its own in each row"
-        )
+        source.remarks.append(f"{named} is {values[unknown][0]} in {which}: unknown, each row is a star")
     name = np.unique(values, return_inverse=True)[1].reshape(-1)
     return _numbered(name, missing | unknown, points)
 
@@ -270,12 +266,10 @@ def _by_position(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n
     name[located] = same_stars(ra[located], dec[located], SAME_PLACE)
     # Two stars of one exposure are two stars, however close: by time, or by the place in the field where it is unknown.
     cell = np.round(np.stack([points.x, points.y], axis=1) / ANOTHER_PLACE)
-    exposure = np.where(
-        np.isfinite(time)[:, None], np.stack([time, np.full(len(time), np.inf)], axis=1), cell
-    )
-    _, of, count = np.unique(
-        np.column_stack([name, exposure]), axis=0, return_inverse=True, return_counts=True
-    )
+    dated = np.stack([time, np.full(len(time), np.inf)], axis=1)
+    exposure = np.where(np.isfinite(time)[:, None], dated, cell)
+    key = np.column_stack([name, exposure])
+    _, of, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
     crowded = np.zeros(name.max() + 1, bool)
     crowded[name[count[of.reshape(-1)] > 1]] = True
     alone = ~located | crowded[name]
@@ -307,9 +301,8 @@ def _copies(
         cameras = np.flatnonzero(pattern)
         rows = np.flatnonzero(counted[:, cameras].all(axis=1)) if len(cameras) > 1 else cameras[:0]
         rows = rows[np.argsort(-counted[rows].sum(axis=1), kind="stable")]
-        group = equal_rows(
-            [*counts[rows][:, cameras].T, *sigma[rows][:, cameras].T, points.x[rows], points.y[rows]]
-        )
+        numbers = [*counts[rows][:, cameras].T, *sigma[rows][:, cameras].T]
+        group = equal_rows([*numbers, points.x[rows], points.y[rows]])
         _, best = np.unique(group, return_index=True)
         same[rows] = same[rows[best[group]]]
     copy = repeated = np.zeros(len(star), bool)

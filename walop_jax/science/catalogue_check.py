@@ -248,9 +248,8 @@ class CatalogueSearch:
             for name in cameras
         ]
         plain = stars.plain.shape[-1]
-        self.questions += [
-            PossibleChange(name, False, kind="optics", unit=unit) for name, unit in parameters[:plain]
-        ]
+        optics = (PossibleChange(name, False, kind="optics", unit=unit) for name, unit in parameters[:plain])
+        self.questions += optics
         # Columns: those of the cameras, all parameters, two of the colours; from them questions and nuisances are made.
         count, shown = len(kinds) * len(cameras), len(root)
         questions, nuisances = count + plain, self.root.shape[1]

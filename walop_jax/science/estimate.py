@@ -149,9 +149,8 @@ def _inverse(
     determinant = a * d - b * b
     good = determinant > SINGULAR * mean**2
     safe = np.where(good, determinant, 1.0)
-    inverse = (
-        np.stack([np.stack([d, -b], axis=-1), np.stack([-b, a], axis=-1)], axis=-2) / safe[:, None, None]
-    )
+    adjoint = np.stack([np.stack([d, -b], axis=-1), np.stack([-b, a], axis=-1)], axis=-2)
+    inverse = adjoint / safe[:, None, None]
     condition = np.where(good, (mean + half) / np.sqrt(safe), np.inf)
     return np.where(good[:, None, None], inverse, np.nan), condition
 

@@ -132,9 +132,8 @@ def doubt_radians(source: InputTable, name: str, angle: Float[np.ndarray, " n"],
         return
     degrees = np.rad2deg(turned)
     if np.all(np.abs(degrees - np.round(degrees)) < _WHOLE):
-        what = (
-            f"has no unit and is a whole number of degrees in radians ({turned[0]:.6g} = {degrees[0]:.0f}°)"
-        )
+        number = f"{turned[0]:.6g} = {degrees[0]:.0f}°"
+        what = f"has no unit and is a whole number of degrees in radians ({number})"
         raise place.fail(what, name, "give degrees, or state the unit of the column")
     source.remarks.append(f"{name} has no unit and lies within ±2π: taken to be degrees; are these radians?")
 
@@ -150,7 +149,6 @@ def true_matrices(
     points = field_points(source, instrument)
     names = [f"M{arm + 2}{column}" for arm in range(len(instrument.cameras.pairs)) for column in (1, 2, 3)]
     matrix = np.stack([numeric_column(source, name, Column("float")) for name in names], axis=1)
-    Place(path, "").refuse(
-        ~np.isfinite(matrix), "not finite", f"{names[0]} … {names[-1]}", "remove these rows"
-    )
+    names = f"{names[0]} … {names[-1]}"
+    Place(path, "").refuse(~np.isfinite(matrix), "not finite", names, "remove these rows")
     return points.x, points.y, matrix

@@ -107,9 +107,7 @@ def gather(
                 "detection threshold that of the others? Their q and u come from the others alone (FLAG 128)"
             )
     if doubtful := int(ambiguous.any(axis=1).sum()):
-        remarks.append(
-            f"{doubtful} stars have two candidates within {tolerance:g} arcsec: not used in that camera"
-        )
+        remarks.append(f"{doubtful} stars have two candidates within {tolerance:g} arcsec: not used there")
     columns, about = _columns(catalogues, pointing, index, ambiguous, place)
     return Gathered(columns, pointing, moves, detected.sum(axis=1), (*remarks, *about))
 
@@ -119,9 +117,8 @@ def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
 
     `table` is a path, an astropy table, or columns by name. Positions are registered first, as between cameras.
     """
-    source = (
-        read_input_table(table, ("RA", "DEC")) if isinstance(table, str | os.PathLike) else in_memory(table)
-    )
+    read = isinstance(table, str | os.PathLike)
+    source = read_input_table(table, ("RA", "DEC")) if read else in_memory(table)
     if not set(OF_STARS) & set(source.names):
         raise fail(f"has none of {', '.join(OF_STARS)}", file=source.path, advice="name its columns so")
     ra, dec = sky_positions(source)
@@ -178,9 +175,8 @@ def _registrations(
             apart = 60.0 * np.hypot(*(np.median(place, axis=0) - np.median(places[0], axis=0)))
             what = f"has no stars in common with {first.path} within {REACH / 60.0:g} arcmin"
             where = f" (their centres are {apart:.2g} arcmin apart)" if apart > 1.0 else ""
-            raise fail(
-                what + where, file=camera.path, advice="is it of the same field, and is its WCS right?"
-            )
+            advice = "is it of the same field, and is its WCS right?"
+            raise fail(what + where, file=camera.path, advice=advice)
         moves.append(move)
     shift = np.median([move.shift for move in moves], axis=0)
     rotation = float(np.median([move.rotation for move in moves]))
@@ -288,9 +284,8 @@ def _columns(
     }
     if levels := [camera.sky for camera in catalogues if camera.sky is not None]:
         if len(levels) < len(catalogues):
-            raise fail(
-                "only some cameras have a level of the sky", column="SKY", advice="give it for all, or none"
-            )
+            what = "only some cameras have a level of the sky"
+            raise fail(what, column="SKY", advice="give it for all, or none")
         columns["SKY"] = (of_cameras(levels, np.nan), "", "level of the sky that was subtracted, electrons")
     remarks = []
     for name, (unit, about) in OF_STARS.items():

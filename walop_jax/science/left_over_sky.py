@@ -104,9 +104,8 @@ def left_over_sky(
     columns[:, 1] -= columns[:, 1].mean()
     slopes = [_slope(columns, qu[chosen, k], photon[chosen, k, k]) for k in range(2)]
     share, errors = np.array(slopes).T
-    return (
-        LeftOverSky(share, errors, len(chosen)) if np.isfinite(slopes).all() and (errors > 0).all() else None
-    )
+    measured = np.isfinite(slopes).all() and (errors > 0).all()
+    return LeftOverSky(share, errors, len(chosen)) if measured else None
 
 
 def _slope(

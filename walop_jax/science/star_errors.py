@@ -100,9 +100,8 @@ def plate_errors(
     rows = np.stack([analysis.exact(s, x, y)[:, 0] for s in settings], axis=1)
     counts = _ELECTRONS * rows[..., 0]
     expected, star = counts.reshape(n * r, -1), np.repeat(np.arange(n), r)
-    stokes = estimate(
-        rows.reshape(n * r, -1, 3), expected, np.sqrt(expected), star, analysis.instrument.cameras
-    )
+    flat, cameras = rows.reshape(n * r, -1, 3), analysis.instrument.cameras
+    stokes = estimate(flat, expected, np.sqrt(expected), star, cameras)
     worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(stokes.photon, nan=np.inf))[:, 1])
     # q from a normalised difference with half of the electrons: σ² = 2 / all electrons.
     return worst / np.sqrt(2.0 / counts.sum(axis=(1, 2)))

@@ -125,9 +125,8 @@ class StarResiduals:
             for f in dataclasses.fields(self)
             if f.name not in ("star", "photon", "together", "structure")
         }
-        return StarResiduals(
-            star=self.star[rows] - start, photon=self.photon[stars], together=self.together, **cut
-        )
+        cut |= {"star": self.star[rows] - start, "photon": self.photon[stars]}
+        return StarResiduals(together=self.together, **cut)
 
     def blocks(self) -> Iterator[tuple[slice, slice, StarResiduals]]:
         """Slices of stars and of rows, some `CHECKED_ROWS` of these, each with its part."""
@@ -164,9 +163,8 @@ class StarResiduals:
         change: Callable[[StarResiduals, slice], Float[np.ndarray, "r k"]],
     ) -> Float[np.ndarray, "r k"]:
         """Residuals behind a change of the counts over σ, which `change` gives for some stars and their rows."""
-        return np.concatenate(
-            [residual[rows] - subset.left(change(subset, rows)) for _, rows, subset in self.blocks()]
-        )
+        remaining = (residual[rows] - part.left(change(part, rows)) for _, rows, part in self.blocks())
+        return np.concatenate(list(remaining))
 
 
 def own_variance(stars: StarResiduals) -> Float[np.ndarray, " s"]:

@@ -49,9 +49,7 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
         "EVPA_ERR": (light.angle_error, "standard error of EVPA"),
         **pair("_PHOTON", photon, "the share of the photons in {}_ERR"),
         **pair("_COLOUR", stars.colour, "error of {} if TEFF is ignored"),
-        **pair(
-            "_HIDDEN", stars.hidden, "largest shift of {} by a mistake that calibration data would not show"
-        ),
+        **pair("_HIDDEN", stars.hidden, "largest shift of {} by a mistake that no calibration data show"),
         "CHI2": (stars.chi2, "chi squared of the rows of the star"),
         "DOF": (stars.dof.astype(np.int32), "degrees of freedom of CHI2"),
         "NROWS": (stars.rows.astype(np.int32), "rows that were combined"),

@@ -135,9 +135,8 @@ def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[C
             name = names[number] if number < len(names) else f"catalogue {number + 1}"
             rows = f"{np.sum(~timed) if timed.any() else 'all'} of {len(timed)} rows have no time"
             remarks.append(f"{name}, MJD: {rows}, others do: left out, as their times are unknown")
-    return [c.of_rows(timed) for c, timed in zip(catalogues, has_time, strict=True) if timed.any()], tuple(
-        remarks
-    )
+    timed_rows = zip(catalogues, has_time, strict=True)
+    return [c.of_rows(timed) for c, timed in timed_rows if timed.any()], tuple(remarks)
 
 
 def with_rivals(calibration: Calibration) -> Calibration:

@@ -112,9 +112,8 @@ class Readings:
         return abs(change.size) <= (1.0 if change.kind == "spot" else self._of(change).widest)
 
     def _of(self, change: PossibleChange) -> Reading:
-        return next(
-            reading for reading in self.listed if (reading.kind, reading.name) == (change.kind, change.name)
-        )
+        thing = change.kind, change.name
+        return next(reading for reading in self.listed if (reading.kind, reading.name) == thing)
 
     def answers(
         self,
