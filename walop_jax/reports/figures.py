@@ -47,16 +47,14 @@ from walop_jax.reports.style import (
 )
 from walop_jax.science.field_accuracy import FieldAccuracy
 
+Parameters = Float[np.ndarray, " n"]  # full vectors
 FITTED = Normalize(0.7, 1.3)
 """Scale of rms residuals of a fit that explains its data, the same for every run."""
 
 
 @styled
 def residuals_figure(
-    likelihood: Likelihood,
-    values: Float[np.ndarray, " n"],
-    before: Float[np.ndarray, " n"],
-    on: Canvas = PAGE,
+    likelihood: Likelihood, values: Parameters, before: Parameters, on: Canvas = PAGE
 ) -> AnyFigure:
     """Residuals of every field point before and after a fit, full vectors of parameters; a histogram of the latter."""
     figure, (left, middle, right) = on.panels(9.6, 3.0, 1, 3, least=1.6)
@@ -68,11 +66,7 @@ def residuals_figure(
 
 @styled
 def calibration_figure(
-    maps: MatrixMaps,
-    likelihood: Likelihood,
-    values: Float[np.ndarray, " n"],
-    before: Float[np.ndarray, " n"],
-    on: Canvas = PAGE,
+    maps: MatrixMaps, likelihood: Likelihood, values: Parameters, before: Parameters, on: Canvas = PAGE
 ) -> AnyFigure:
     """A calibration on one page: maps of the matrix, residuals of every field point before and after the fit."""
     rows = max(2, maps.arms)
@@ -87,11 +81,7 @@ def calibration_figure(
 
 
 def _before_and_after(
-    figure: Figure,
-    axes: Sequence[Axes],
-    likelihood: Likelihood,
-    before: Float[np.ndarray, " n"],
-    after: Float[np.ndarray, " n"],
+    figure: Figure, axes: Sequence[Axes], likelihood: Likelihood, before: Parameters, after: Parameters
 ) -> None:
     """Rms residuals of the field points with two vectors of parameters, each on a scale of its own.
 
@@ -110,7 +100,7 @@ def _before_and_after(
         colour_bar(figure, image, axis, "rms residual (σ)", extend="neither" if far else "both")
 
 
-def point_residuals(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " p"]:
+def point_residuals(likelihood: Likelihood, values: Parameters) -> Float[np.ndarray, " p"]:
     """Rms normalised residual of each field point; 1 is what noise alone gives (the flux took one in four).
 
     NaN where a point has no data.
@@ -121,7 +111,7 @@ def point_residuals(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> 
     return np.sqrt(np.where(freedom > 0, square / np.maximum(freedom, 1.0), np.nan))
 
 
-def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> None:
+def _histogram(axis: Axes, likelihood: Likelihood, values: Parameters) -> None:
     """All residuals of a fit, and what noise alone would give."""
     _, residual = likelihood.residuals(values)
     # A flux takes the share y²/Σy² of the variance of every intensity y, in units of its error.

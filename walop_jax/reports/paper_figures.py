@@ -43,6 +43,7 @@ from walop_jax.reports.style import (
 )
 from walop_jax.science.star_errors import QUANTITIES, plate_errors, transmitted
 
+Places = Float[np.ndarray, " p"]
 _PIXELS, _LINES = 31, 41
 _STEPS = 21  # from the centre of the field to its edge
 _WAVELENGTH, _WAVELENGTHS = 0.62, (0.5, 0.75)  # µm
@@ -102,10 +103,7 @@ def retardance_wavelength_figure(calibration: Calibration, on: Canvas = PAGE) ->
 
 
 def _unwrapped_retardances(
-    instrument: Instrument,
-    line: Float[np.ndarray, " w"],
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
+    instrument: Instrument, line: Float[np.ndarray, " w"], x: Places, y: Places
 ) -> Float[np.ndarray, "n p w"]:
     """Retardances (deg) of plates at places and wavelengths (µm), without jumps of 360°.
 
@@ -144,7 +142,7 @@ def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = P
     return figure
 
 
-def _most(values: Float[np.ndarray, " p"]) -> tuple[float, float]:
+def _most(values: Places) -> tuple[float, float]:
     """The range of the values without those more than five (robust) standard deviations from their median."""
     median = float(np.median(values))
     spread = 5.0 * 1.4826 * float(np.median(np.abs(values - median))) or 1.0

@@ -54,6 +54,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 Map = Float[np.ndarray, "y x"]
 Maps = Float[np.ndarray, "m y x"]
+Places = Float[np.ndarray, " p"]  # at field points
 Field = tuple[float, float, float, float]
 AnyFigure = Any
 """A figure on a `Canvas`, or the subfigure that took the room of axes."""
@@ -246,9 +247,9 @@ def pixel_map(
 
 def point_map(
     axis: Axes,
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
-    values: Float[np.ndarray, " p"],
+    x: Places,
+    y: Places,
+    values: Places,
     norm: Normalize,
     colours: str,
     shown: Bool[np.ndarray, " p"] | None = None,
@@ -273,7 +274,7 @@ def point_map(
     return tiles
 
 
-def _spacing(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> float:
+def _spacing(x: Places, y: Places) -> float:
     """Side of the tiles: the typical distance to the nearest neighbour."""
     few = slice(0, MOST_VECTOR)
     distance = np.hypot(x[few, None] - x[None, few], y[few, None] - y[None, few])

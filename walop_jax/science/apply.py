@@ -33,6 +33,7 @@ from walop_jax.science.left_over_sky import with_sky
 from walop_jax.science.star_residuals import StarResiduals
 from walop_jax.sky.moon import sky_to_instrument
 
+OfRows = Float[np.ndarray, "r k"]  # by row and camera
 STAR_SAMPLE = 16384
 """Rows of a catalogue, spread over it, by which the whole of it is judged: they see a camera that has changed by a
 fiftieth of what single stars of 10⁶ electrons would show."""
@@ -147,7 +148,7 @@ class _Block(NamedTuple):
     stars: Stars
     found: Estimate
     vectors: Float[np.ndarray, "r k 3"]
-    sigma: Float[np.ndarray, "r k"]
+    sigma: OfRows
     plain: Float[np.ndarray, "r k o"]
     throughput: Float[np.ndarray, "r k k"]
     colour: Float[np.ndarray, "r k 2"]
@@ -221,10 +222,10 @@ class _Application:
             derivative += (fitted.gain @ turned[..., None]) * self.slope
         derivative = np.add.reduceat(-derivative, first)
 
-        def change_of(weights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r k"]:
+        def change_of(weights: Float[np.ndarray, "r c"]) -> OfRows:
             return np.einsum("rc,rcks,rs->rk", weights, spectra, s, optimize=True)
 
-        def shift(change: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "s 2"]:
+        def shift(change: OfRows) -> Float[np.ndarray, "s 2"]:
             return calibration_shift(fitted.gain, change[..., None], star)[..., 0]
 
         hidden = _hidden(vectors, derivative, {number: shift(change) for number, change in acting.items()})
@@ -270,11 +271,7 @@ class _Application:
         )
 
     def flags(
-        self,
-        rows: Int[np.ndarray, " r"],
-        counts: Float[np.ndarray, "r k"],
-        first: Int[np.ndarray, " s"],
-        found: Estimate,
+        self, rows: Int[np.ndarray, " r"], counts: OfRows, first: Int[np.ndarray, " s"], found: Estimate
     ) -> Int[np.ndarray, " s"]:
         """Quality bits of every star: those of its rows and of the calibration, and three that need all of its rows."""
         points, sigma = self.catalogue.points, self.catalogue.sigma[rows]

@@ -28,6 +28,7 @@ from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
 from walop_jax.science.field_points import FieldPoints, doubt_radians, field_points
 from walop_jax.sky.directions import same_stars
 
+Counts = Float[np.ndarray, "n k"]  # by row and camera
 _NEGATIVE = 5.0  # sigma: what noise about a subtracted background may do, and no more
 SAME_PLACE = 1.0  # arcsec
 ANOTHER_PLACE = 0.005  # deg in the field, of rows without a time
@@ -47,8 +48,8 @@ class Catalogue:
 
     points: FieldPoints
     teff_err: Float[np.ndarray, " n"]
-    counts: Float[np.ndarray, "n k"]
-    sigma: Float[np.ndarray, "n k"]
+    counts: Counts
+    sigma: Counts
     spoilt: Bool[np.ndarray, " n"]
     copy: Bool[np.ndarray, " n"]
     repeated: Bool[np.ndarray, " n"]
@@ -56,7 +57,7 @@ class Catalogue:
     rotator: Float[np.ndarray, " n"]
     time: Float[np.ndarray, " n"]
     remarks: tuple[str, ...] = ()
-    sky: Float[np.ndarray, "n k"] | None = None
+    sky: Counts | None = None
 
     def __len__(self) -> int:
         return len(self.star)
@@ -284,8 +285,8 @@ def _by_position(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n
 def _copies(
     source: InputTable,
     points: FieldPoints,
-    counts: Float[np.ndarray, "n k"],
-    sigma: Float[np.ndarray, "n k"],
+    counts: Counts,
+    sigma: Counts,
     rotator: Float[np.ndarray, " n"],
     star: Int[np.ndarray, " n"],
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:

@@ -43,6 +43,7 @@ from walop_jax.science.star_residuals import (
     FEW,
     NO_NOISE,
     SINGULAR,
+    Residuals,
     Scale,
     StarResiduals,
     Weights,
@@ -66,6 +67,7 @@ _FARTHEST = 5.0  # standard errors in every direction: no calibration is so far 
 _REFERENCE = 1e6  # electron
 
 Vector = Float[np.ndarray, " r"]  # a number for each row
+Sizes = Float[np.ndarray, " c"]  # of all columns
 CAMERA_KINDS = ("gain", "x", "y", "time", "flux", "light")
 
 
@@ -277,18 +279,18 @@ class CatalogueSearch:
         values[..., -2:] = part.colour
         return values
 
-    def _left(self, sizes: Float[np.ndarray, " c"]) -> Float[np.ndarray, "r k"]:
+    def _left(self, sizes: Sizes) -> Residuals:
         """Residuals behind changes of all columns."""
         if np.array_equal(sizes, self.start):
             return self.stars.residual
         amounts = self.mixing @ (sizes - self.start)
         return self.stars.behind(self.stars.residual, lambda part, _: self._columns(part) @ amounts)
 
-    def _looked(self, sizes: Float[np.ndarray, " c"], *, stated: bool = False) -> _Look:
+    def _looked(self, sizes: Sizes, *, stated: bool = False) -> _Look:
         """Scales, Q and g (priors included) with these changes taken away; with `stated` of N_ERR as it is."""
         stars, dof = self.stars, self.stars.dof.astype(float)
 
-        def scale_of(residual: Float[np.ndarray, "r k"]) -> Scale:
+        def scale_of(residual: Residuals) -> Scale:
             return noise_scale(stars.chi2(residual) / self.variance, dof)
 
         residual = self._left(sizes)
@@ -323,7 +325,7 @@ class CatalogueSearch:
             weighted = look(about, of_few(about, threshold(self._alarm)) if off else 1.0)
         return weighted
 
-    def _gains(self, look: _Look) -> tuple[Float[np.ndarray, " c"], int]:
+    def _gains(self, look: _Look) -> tuple[Sizes, int]:
         """The gains of the cameras that fit the stars best, among all sizes, and how many numbers these are."""
         cameras = len(self.cameras)
         order = [*range(cameras), *range(self.asked, len(look.score))]
@@ -376,7 +378,7 @@ class CatalogueSearch:
         return dataclasses.replace(check, places=self._places(check, look, sizes, chosen))
 
     def _places(
-        self, found: CatalogueCheck, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int]
+        self, found: CatalogueCheck, look: _Look, sizes: Sizes, chosen: list[int]
     ) -> tuple[DisagreeingPlace, ...]:
         """Places where stars disagree together, behind the changes and the errors of the calibration."""
         single, several = (max(scale, found.noise, 1.0) for scale in found.scale)
@@ -389,7 +391,7 @@ class CatalogueSearch:
                 break
         return places
 
-    def _explained(self) -> Float[np.ndarray, " c"] | None:
+    def _explained(self) -> Sizes | None:
         """Errors of the calibration that explain the stars best with N_ERR as stated; None if they cannot be."""
         _, sizes = self._settled(self._looked(self.start, stated=True), self.start, [], stated=True)
         errors = sizes[self.asked : -2]
@@ -404,7 +406,7 @@ class CatalogueSearch:
         errors[self.matters] = self.nearest[self.asked : -2]
         return errors if errors @ errors <= _FARTHEST**2 * self.matters.sum() else None
 
-    def bend(self, errors: Float[np.ndarray, " n"], residual: Float[np.ndarray, "r k"]) -> float:
+    def bend(self, errors: Float[np.ndarray, " n"], residual: Residuals) -> float:
         """Mean square, per degree of freedom, of the residuals with errors of the calibration less first order."""
         sizes = self.start.copy()
         sizes[self.asked : -2] = errors[self.matters]
@@ -423,8 +425,8 @@ class CatalogueSearch:
         return min(rows, chance_of_scale(look.noise), chance_of(strongest)) < near
 
     def _settled(
-        self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], *, stated: bool = False
-    ) -> tuple[_Look, Float[np.ndarray, " c"]]:
+        self, look: _Look, sizes: Sizes, chosen: list[int], *, stated: bool = False
+    ) -> tuple[_Look, Sizes]:
         """Changes `chosen` and errors of the calibration fitted together, with the stars that this keeps."""
         fitted = np.array([*chosen, *range(self.asked, len(sizes))])
         for _ in range(_ROUNDS):
@@ -439,7 +441,7 @@ class CatalogueSearch:
         return look, sizes
 
     def _beside(
-        self, matrix: Float[np.ndarray, "c c"], score: Float[np.ndarray, " c"], chosen: list[int]
+        self, matrix: Float[np.ndarray, "c c"], score: Sizes, chosen: list[int]
     ) -> list[PossibleChange]:
         """Every question, alone beside `chosen`, which have no answer here."""
         free = [n for n in range(self.asked) if n not in chosen]
@@ -452,9 +454,7 @@ class CatalogueSearch:
                 sizes[n] = sizes[n]._replace(size=float(slope * error**2), error=error)
         return sizes
 
-    def _change(
-        self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], asked: int
-    ) -> InstrumentChange:
+    def _change(self, look: _Look, sizes: Sizes, chosen: list[int], asked: int) -> InstrumentChange:
         """A detected change, and its rivals."""
         away = np.zeros_like(sizes)
         away[asked] = sizes[asked]
@@ -476,7 +476,7 @@ class _Look(NamedTuple):
     noise: Scale
     rows: Scale | None
     matrix: Float[np.ndarray, "c c"]
-    score: Float[np.ndarray, " c"]
+    score: Sizes
 
 
 def _chance_beside(rows: Scale, noise: Scale) -> float:

@@ -35,6 +35,9 @@ FAR = 5.0  # standard deviations
 _ROUNDS = 4
 
 
+Vector = Float[np.ndarray, " s"]  # a number for each star
+
+
 @dataclasses.dataclass(frozen=True)
 class LeftOverSky:
     """Polarised light of the sky left over, `share` (q, u) of its level, with `errors`, from so many `stars`."""
@@ -58,7 +61,7 @@ class LeftOverSky:
         """The share that is not exceeded with a probability of 99 %."""
         return float(np.hypot(*self.share) + MOST_LIKELY * self.errors.max())
 
-    def covariance(self, ratio: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2 2"]:
+    def covariance(self, ratio: Vector) -> Float[np.ndarray, "s 2 2"]:
         """Covariance of its shift of stars with a `ratio` of sky to light, 0 where none was found."""
         of_share = np.outer(self.share, self.share) + np.diag(self.errors**2)
         return np.where(self.found, ratio**2, 0.0)[:, None, None] * of_share
@@ -86,10 +89,7 @@ class LeftOverSky:
 
 
 def left_over_sky(
-    qu: Float[np.ndarray, "s 2"],
-    photon: Float[np.ndarray, "s 2 2"],
-    light: Float[np.ndarray, " s"],
-    ratio: Float[np.ndarray, " s"],
+    qu: Float[np.ndarray, "s 2"], photon: Float[np.ndarray, "s 2 2"], light: Vector, ratio: Vector
 ) -> LeftOverSky | None:
     """The sky left over in stars with these (q, u), covariances, light (electron) and ratios of sky to light.
 
@@ -108,9 +108,7 @@ def left_over_sky(
     return LeftOverSky(share, errors, len(chosen)) if measured else None
 
 
-def _slope(
-    columns: Float[np.ndarray, "s 3"], values: Float[np.ndarray, " s"], variance: Float[np.ndarray, " s"]
-) -> tuple[float, float]:
+def _slope(columns: Float[np.ndarray, "s 3"], values: Vector, variance: Vector) -> tuple[float, float]:
     """Coefficient of the last column, and its error."""
     scatter, used = 0.0, np.ones(len(values), bool)
     for _ in range(_ROUNDS):
@@ -124,11 +122,8 @@ def _slope(
 
 
 def _fitted(
-    columns: Float[np.ndarray, "s 3"],
-    values: Float[np.ndarray, " s"],
-    variance: Float[np.ndarray, " s"],
-    used: Bool[np.ndarray, " s"],
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"], Float[np.ndarray, " s"]]:
+    columns: Float[np.ndarray, "s 3"], values: Vector, variance: Vector, used: Bool[np.ndarray, " s"]
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"], Vector]:
     """Coefficients, their covariance and the residuals."""
     weight = np.where(used, 1.0 / variance, 0.0)
     inverse = np.linalg.pinv(columns.T @ (weight[:, None] * columns), hermitian=True)
@@ -136,7 +131,7 @@ def _fitted(
     return beta, inverse, values - columns @ beta
 
 
-def _scatter(left: Float[np.ndarray, " s"], variance: Float[np.ndarray, " s"]) -> float:
+def _scatter(left: Vector, variance: Vector) -> float:
     """Variance beyond the stated one for which χ² of residuals is their number less three."""
 
     def excess(scatter: float) -> float:

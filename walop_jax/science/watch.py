@@ -58,6 +58,7 @@ from walop_jax.science.star_residuals import (
     ROUNDING,
     SINGULAR,
     TRIMMED,
+    Residuals,
     Scale,
     StarResiduals,
     Weights,
@@ -172,7 +173,9 @@ def grouped(
     return times, group.reshape(-1)
 
 
-Settled = tuple[WatchedChange, Float[np.ndarray, "r k"]]
+Matrix = Float[np.ndarray, "c c"]
+Score = Float[np.ndarray, " c"]
+Settled = tuple[WatchedChange, Residuals]
 """A change, and the residuals behind it."""
 
 
@@ -204,7 +207,7 @@ class Watching:
 
     # --------------------------------------------------------------------------------------------- noise
 
-    def weights(self, residual: Float[np.ndarray, "r k"]) -> tuple[Weights, Scale]:
+    def weights(self, residual: Residuals) -> tuple[Weights, Scale]:
         """Weights of the stars, and the scale of all of them.
 
         A change that stars of a night have in common is no noise: where χ² is not what N_ERR says, weights come from
@@ -221,9 +224,7 @@ class Watching:
                 weights, _, off = rescaled
         return weights, scale
 
-    def _scaled(
-        self, residual: Float[np.ndarray, "r k"], fitted: Float[np.ndarray, " g"]
-    ) -> tuple[Weights, Scale, bool]:
+    def _scaled(self, residual: Residuals, fitted: Float[np.ndarray, " g"]) -> tuple[Weights, Scale, bool]:
         """Weights behind numbers fitted in every group, the scale; True if any scale is not that of N_ERR."""
         chi2 = self.stars.chi2(residual) / self.variance
         dof, alarm = self.stars.dof.astype(float), ALARM / (len(self.time) + 1)
@@ -247,8 +248,8 @@ class Watching:
         return Weights(weight / self.variance, share), overall, several
 
     def _behind_gains(
-        self, residual: Float[np.ndarray, "r k"], weights: Weights, count: int
-    ) -> tuple[Float[np.ndarray, "r k"], Float[np.ndarray, " g"]]:
+        self, residual: Residuals, weights: Weights, count: int
+    ) -> tuple[Residuals, Float[np.ndarray, " g"]]:
         """Residuals behind the first `count` columns as they fit each group best, and how many numbers these are."""
         groups = len(self.time)
         blocks, slopes = self._by_group(*self.scan(residual, weights))
@@ -258,16 +259,14 @@ class Watching:
             size[g] = root @ (root.T @ slopes[g, :count])
             fitted[g] = root.shape[1]
 
-        def change(part: StarResiduals, rows: slice) -> Float[np.ndarray, "r k"]:
+        def change(part: StarResiduals, rows: slice) -> Residuals:
             return np.einsum("rkc,rc->rk", self.readings.columns(part)[..., :count], size[self.group[rows]])
 
         return self.stars.behind(residual, change), fitted
 
     # -------------------------------------------------------------------------------------------- columns
 
-    def scan(
-        self, residual: Float[np.ndarray, "r k"], weights: Weights
-    ) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
+    def scan(self, residual: Residuals, weights: Weights) -> tuple[Matrix, Score]:
         """Q and g of `columns` in all groups (group, column), errors of the calibration eliminated."""
         stars, count, groups = self.stars, self.readings.columns_count, len(self.time)
         nuisances = self.root.shape[1] + 2
@@ -335,7 +334,7 @@ class Watching:
             blocks -= (flat.T @ flat).reshape(blocks.shape)
 
     def _by_group(
-        self, matrix: Float[np.ndarray, "c c"], score: Float[np.ndarray, " c"]
+        self, matrix: Matrix, score: Score
     ) -> tuple[Float[np.ndarray, "g k g k"], Float[np.ndarray, "g k"]]:
         """Q and g of `scan` by group and change."""
         slopes = score.reshape(len(self.time), -1)
@@ -367,9 +366,7 @@ class Watching:
         ]  # fmt: skip
         return sorted(listed, key=lambda entry: (not self.readings.possible(entry), -abs(entry.sigma)))
 
-    def without(
-        self, residual: Float[np.ndarray, "r k"], change: PossibleChange, size: float
-    ) -> Float[np.ndarray, "r k"]:
+    def without(self, residual: Residuals, change: PossibleChange, size: float) -> Residuals:
         """Residuals behind a change."""
         grown = change.history.over(self.time)[self.group, None] * size
         return self.stars.behind(
@@ -431,7 +428,7 @@ class Watching:
         """Every history of every reading, each alone."""
         return self.readings.answers(*self._by_group(matrix, score), self.shapes)
 
-    def settled(self, residual: Float[np.ndarray, "r k"], answers: Answers) -> Settled:
+    def settled(self, residual: Residuals, answers: Answers) -> Settled:
         """A change with its rivals, and the residuals behind it.
 
         Histories compared are the best of each kind and camera and their neighbours. The fit is repeated with the
@@ -469,7 +466,7 @@ class Watching:
         when = float(self.time[best.history.start]), (float(began.min()), float(began.max()))
         return WatchedChange(best, tuple(alike), *when)
 
-    def spotted(self, residual: Float[np.ndarray, "r k"], weights: Weights) -> Settled | None:
+    def spotted(self, residual: Residuals, weights: Weights) -> Settled | None:
         """A step in a spot of the field, and the residuals behind it; None where noise makes as much."""
         # Stars that lie off may be those of the spot.
         common = np.zeros(len(self.time) + 1)
@@ -515,7 +512,7 @@ class Watching:
         return self._dated(best, alike), self.without(residual, best, best.size)
 
     def _sized(
-        self, residual: Float[np.ndarray, "r k"], asked: list[PossibleChange], weights: Weights
+        self, residual: Residuals, asked: list[PossibleChange], weights: Weights
     ) -> list[PossibleChange]:
         """Changes with size and error, each alone, the most significant first; without those that no star sees."""
 
@@ -538,13 +535,7 @@ class Watching:
         ]
         return sorted(sizes, key=lambda entry: -abs(entry.sigma))
 
-    def told(
-        self,
-        changes: list[WatchedChange],
-        matrix: Float[np.ndarray, "c c"],
-        score: Float[np.ndarray, " c"],
-        whole: Scale,
-    ) -> Watch:
+    def told(self, changes: list[WatchedChange], matrix: Matrix, score: Score, whole: Scale) -> Watch:
         """The record: gains are those behind the changes, and the changes that each camera may be."""
         groups, cameras = len(self.time), len(self.cameras)
         blocks, slopes = self._by_group(matrix, score)
