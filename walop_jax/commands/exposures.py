@@ -10,7 +10,7 @@ from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike,
 from walop_jax.commands.inputs import TableFile
 
 FILES = Argument("FITS files, a JSON export of a log, a table of words, a schedule.", "FILE...", list[Path])
-WORDS = Option("Which word is which column, and filters by number.", "WORDS.toml", Path, required=True)
+WORDS = Option("Which word is which column, and filters of numbers.", "WORDS.toml", Path, required=True)
 
 
 @command(writes="file", jax=False)

@@ -200,7 +200,7 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
     image = None
     for axis, errors, name in zip(axes.ravel(), maps.errors, element_symbols(maps.arms), strict=True):
         least, highest = (plain(100.0 * float(value)) for value in (errors.min(), errors.max()))
-        field_axes(axis, f"error of {name}\n{least} to {highest} %")
+        field_axes(axis, f"error of {name}\n{least}–{highest} %")
         image = pixel_map(axis, 100.0 * errors, field_of(maps), LogNorm(low, max(high, 10 * low)), SEQUENTIAL)
     colour_bar(figure, image, axes, "standard error (%)", pad=0.02, extend="min", aspect=30)
     outer_labels(axes)

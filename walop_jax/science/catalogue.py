@@ -162,7 +162,8 @@ def _with_colours(
     source.remarks.append(f"TEFF of {int(within.sum())} rows is made of BP_RP ({SOURCE})")
     if beyond := int(np.sum(from_colour & ~within)):
         limits = f"{LIMITS[0]:g} … {LIMITS[1]:g} mag"
-        source.remarks.append(f"BP_RP of {beyond} rows lies beyond {limits}: errors as of unknown colours")
+        what = "their errors are those of unknown colours"
+        source.remarks.append(f"BP_RP of {beyond} rows lies beyond {limits}: {what}")
     settings = dataclasses.replace(points.settings, teff=np.where(within, temperature, teff))
     return dataclasses.replace(points, settings=settings), np.where(within, off, error)
 
@@ -243,7 +244,8 @@ def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndar
         unknown = ~missing & (negative | np.isin(np.char.lower(values), _NO_ID))
     if unknown.any():
         which = rows_text(np.flatnonzero(unknown))
-        source.remarks.append(f"{named} is {values[unknown][0]} in {which}: unknown, each row is a star")
+        what = "unknown, a star of its own in each row"
+        source.remarks.append(f"{named} is {values[unknown][0]} in {which}: {what}")
     name = np.unique(values, return_inverse=True)[1].reshape(-1)
     return _numbered(name, missing | unknown, points)
 

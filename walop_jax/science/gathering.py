@@ -107,7 +107,8 @@ def gather(
                 "detection threshold that of the others? Their q and u come from the others alone (FLAG 128)"
             )
     if doubtful := int(ambiguous.any(axis=1).sum()):
-        remarks.append(f"{doubtful} stars have two candidates within {tolerance:g} arcsec: not used there")
+        what = f"have two candidates within {tolerance:g} arcsec: not used in that camera"
+        remarks.append(f"{doubtful} stars {what}")
     columns, about = _columns(catalogues, pointing, index, ambiguous, place)
     return Gathered(columns, pointing, moves, detected.sum(axis=1), (*remarks, *about))
 

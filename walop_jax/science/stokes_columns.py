@@ -36,6 +36,7 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
     def pair(end: str, values: Float[np.ndarray, "s 2"], about: str) -> dict[str, tuple[np.ndarray, str]]:
         return {f"{name}{end}": (values[:, k], about.format(name)) for k, name in enumerate("QU")}
 
+    hidden = "largest shift of {} by a mistake that calibration data would not show"
     columns = {
         "Q": (stars.qu[:, 0], "q of the star: on the sky where ROTATOR is given"),
         "U": (stars.qu[:, 1], "u of the star: on the sky where ROTATOR is given"),
@@ -49,7 +50,7 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
         "EVPA_ERR": (light.angle_error, "standard error of EVPA"),
         **pair("_PHOTON", photon, "the share of the photons in {}_ERR"),
         **pair("_COLOUR", stars.colour, "error of {} if TEFF is ignored"),
-        **pair("_HIDDEN", stars.hidden, "largest shift of {} by a mistake that no calibration data show"),
+        **pair("_HIDDEN", stars.hidden, hidden),
         "CHI2": (stars.chi2, "chi squared of the rows of the star"),
         "DOF": (stars.dof.astype(np.int32), "degrees of freedom of CHI2"),
         "NROWS": (stars.rows.astype(np.int32), "rows that were combined"),
