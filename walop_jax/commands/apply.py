@@ -36,7 +36,9 @@ CATALOGUE = Argument(
     "CATALOGUE...",
     list[Path],
 )
-COMMON = Option("Write the common table of stellar polarisation (Panopoulou et al. 2025), also Galactic q, u.")
+COMMON = Option(
+    "Write the common table of stellar polarisation (Panopoulou et al. 2025), also Galactic q, u."
+)
 DEBIAS = Option("Estimator of P_DEBIASED: Plaszczynski et al. 2014, or Wardle and Kronberg 1974.", "MAS|WK")
 SATURATION = Option("Counts from here on are not used (FLAG 256).", "ELECTRONS", float)
 FORCE = Option("Also stars whose filter or temperature it does not cover (FLAG 2048).")

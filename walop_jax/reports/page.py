@@ -162,6 +162,8 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
         head = head if accuracy is None else _with_goal(head, accuracy)
     missing = [*run.missing]
     error_maps = _accuracy_pictures(run, missing) if trusted else ()
+    limits = [] if run.limits is None else [run.limits.display()]
+    limits = [dataclasses.replace(d, title=f"{d.title}: {len(d.rows)} amplitudes") for d in limits]
     origin = "" if run.product is None or not run.product.origin else f"; data from {run.product.origin}"
     sampled = run.product is not None and run.product.verdict.covariance_from == "posterior"
     when = "" if run.product is None else run.product.date.replace("T", " at ")
@@ -173,7 +175,7 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
         *([] if diagnosis is None else _diagnosed(run, head, missing)),
         Section("residuals", "Residuals before and after", pictures=_residual_pictures(run, missing)),
         *([] if diagnosis is None else [_candidates(run)]),
-        Section("limits", "What these data can show", folded=_limits(run)),
+        Section("limits", "What these data can show", folded=limits),
         Section("warnings", "Warnings", Display("", notes=_warnings(run) or ("None.",))),
         Section("matrix", "Instrument matrix", pictures=_matrix_pictures(run, missing)),
         Section("pulls", "Largest pulls from the priors", _pulls(run)),
@@ -226,11 +228,8 @@ def _with_goal(head: Display, known: FieldAccuracy) -> Display:
     """The head of a page with the answer for another goal in place of that of the fit."""
     answer = known.facts()
     replaced = {name for name, _ in answer}
-    remaining = [
-        fact
-        for fact in head.facts
-        if fact[0] not in replaced and not fact[0].startswith(("good for", "what to do"))
-    ]
+    others = [fact for fact in head.facts if not fact[0].startswith(("good for", "what to do"))]
+    remaining = [fact for fact in others if fact[0] not in replaced]
     return dataclasses.replace(head, facts=(*answer, *remaining))
 
 
@@ -255,13 +254,9 @@ def _residual_pictures(run: RunContents, missing: list[str]) -> list[Picture]:
     if several:
         names = ["ladder", "rms", "shares"] if len(data.comparisons) > 2 else ["ladder", "shares"]
         return drawn(run.source, names, missing)
-    whole = picture(
-        "whole",
-        lambda canvas: diagnosis_figures.residual_maps(
-            data.points, {"residuals": overall.field["BEFORE"]}, data.cameras, canvas
-        ),
-        combination=in_greek(overall.combination),
-    )
+    residuals = data.points, {"residuals": overall.field["BEFORE"]}, data.cameras
+    draw_whole = functools.partial(diagnosis_figures.residual_maps, *residuals)
+    whole = picture("whole", draw_whole, combination=in_greek(overall.combination))
     return [whole, *drawn(run.source, ["shares"], missing)]
 
 
@@ -299,46 +294,27 @@ def _candidates(run: RunContents) -> Section:
     """Every effect of the catalogue at the first look, limits on effects that were not found."""
     assert run.diagnosis is not None
     catalogue = EFFECTS if run.source.run is None else run.source.run.catalogue
-    rows = tuple(
-        (
-            row["effect"],
-            effect_in_words(row["effect"], catalogue),
-            rounded(row["score"], ".6g"),
-            probability(row["p_value"]).removeprefix("= "),
-        )
-        for row in run.diagnosis["candidates"]
-    )
+    rows = ()
+    for row in run.diagnosis["candidates"]:
+        effect, chance = row["effect"], probability(row["p_value"]).removeprefix("= ")
+        rows += ((effect, effect_in_words(effect, catalogue), rounded(row["score"], ".6g"), chance),)
     table = Display("", head=("effect", "meaning", ">score", ">p"), rows=rows[:SHOWN_CANDIDATES])
     hidden_rows = rows[SHOWN_CANDIDATES:]
-    limits = tuple(
-        (
-            row["effect"],
-            row["parameter"],
-            *value_and_error(row["value"], row["sigma"]),
-            rounded(row["below_95"], ".2g"),
-            row["unit"],
-        )
-        for row in run.diagnosis.get("limits", ())
+    limits = ()
+    for row in run.diagnosis.get("limits", ()):
+        texts = value_and_error(row["value"], row["sigma"])
+        limits += ((row["effect"], row["parameter"], *texts, rounded(row["below_95"], ".2g"), row["unit"]),)
+    title = (
+        f"{len(limits)} amplitudes that were not found, with the size they stay below with 95 % probability"
     )
+    head = ("effect", "parameter", ">value", ">σ", ">below (95 %)", "unit")
     folded = (
         Display(f"{len(hidden_rows)} more", head=table.head, rows=hidden_rows),
-        Display(
-            f"{len(limits)} amplitudes that were not found, with the size they stay below with 95 % probability",
-            head=("effect", "parameter", ">value", ">σ", ">below (95 %)", "unit"),
-            rows=limits,
-        ),
+        Display(title, head=head, rows=limits),
     )
     text = "Every effect of the catalogue at the first look at the starting model; p is corrected for their number."
     folded = [display for display in folded if display.rows]
     return Section("candidates", "Candidates", table, folded=folded, text=text)
-
-
-def _limits(run: RunContents) -> list[Display]:
-    """The detection limits of the data of the fit, behind a line."""
-    if run.limits is None:
-        return []
-    shown = run.limits.display()
-    return [dataclasses.replace(shown, title=f"{shown.title}: {len(shown.rows)} amplitudes")]
 
 
 def _doubts(summary: Mapping[str, Any]) -> list[str]:
