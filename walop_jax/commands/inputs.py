@@ -183,10 +183,7 @@ def set_and_model(
 def save(
     result: FitResult | Calibration | Run, folder: str | os.PathLike[str], *, overwrite: bool = False
 ) -> None:
-    """Write a fit as the folder of a run: calibration.fits and summary.json; of a calibration the first alone.
-
-    Raises `DataError` where they exist already and `overwrite` is False.
-    """
+    """Write a fit as the folder of a run, a calibration as its file alone. Raises `DataError` where they exist."""
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.summary import summary

@@ -187,10 +187,7 @@ def _function(command: Command[Any]) -> Callable[..., None]:
 
 
 def _guarded(command: Command[Any], given: dict[str, Any]) -> None:
-    """Run a command, with every error turned into one line on stderr and an exit code.
-
-    With the environment variable WALOP_JAX_DEBUG set, errors keep their traceback.
-    """
+    """Run a command; errors become a line on stderr and an exit code (with WALOP_JAX_DEBUG set: their traceback)."""
     try:
         with interrupts_answered(_interrupted):
             _run(command, given)

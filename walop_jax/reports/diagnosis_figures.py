@@ -199,10 +199,7 @@ def _binned(x: Float[np.ndarray, " e"], *columns: Float[np.ndarray, " e"]) -> li
 
 @styled
 def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
-    """χ² per degree of freedom of the starting model and of every model after it, on a logarithmic scale.
-
-    The band is where χ²/dof lies (5 standard deviations) when the model explains the data.
-    """
+    """χ²/dof of the starting model and all after it, logarithmic; in the band (5 σ) a model explains the data."""
     names = [*ladder["MODEL"]]
     names = [names[0], *(name if name == "final fit" else f"+ {name}" for name in names[1:])]
     ratio = ladder["CHI2"] / np.maximum(ladder["DOF"], 1)
@@ -270,10 +267,7 @@ _STEPS = (0.0, 1.0, 2.0, thresholds.SEPARATION, 4.0, 5.0, 6.0)
 
 @styled
 def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
-    """Largest error of q and u over the field that a single effect can make without being detected.
-
-    Crosses: q and u cannot both be measured with one exposure there.
-    """
+    """Largest error of q and u by a single effect that goes undetected; crosses: not both in one exposure."""
     from scipy.interpolate import griddata
     from scipy.spatial import KDTree  # takes a tenth of a second, and this figure alone needs it
 
@@ -308,10 +302,7 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
 
 @styled
 def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
-    """Separation (σ) of each effect (column) from each other one (row) that is present at its detection limit.
-
-    Effects that nothing comes near are left out, and counted.
-    """
+    """Separation (σ) of effects (columns) from each one at its detection limit (rows); far ones are counted."""
     alike = found.separation + np.where(np.eye(len(found.effects), dtype=bool), np.inf, 0.0) < _STEPS[-1]
     confusable = np.flatnonzero((alike | alike.T).any(axis=0))
     confusable = confusable if confusable.size else np.arange(len(found.effects))

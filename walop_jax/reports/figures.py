@@ -83,10 +83,7 @@ def calibration_figure(
 def _before_and_after(
     figure: Figure, axes: Sequence[Axes], likelihood: Likelihood, before: Parameters, after: Parameters
 ) -> None:
-    """Rms residuals of the field points with two vectors of parameters, each on a scale of its own.
-
-    The places of the standards, which lie between the others, are left out.
-    """
+    """Rms residuals of the field points, standards left out, with two vectors of parameters, each on its own scale."""
     points, extended = likelihood.calset.points, likelihood.calset.exposures.kind != "standard"
     shown = np.asarray(likelihood.used[:, extended].any(axis=1), bool)
     shown = shown if shown.any() else np.ones(len(points), bool)
@@ -101,10 +98,7 @@ def _before_and_after(
 
 
 def point_residuals(likelihood: Likelihood, values: Parameters) -> Float[np.ndarray, " p"]:
-    """Rms normalised residual of each field point; 1 is what noise alone gives (the flux took one in four).
-
-    NaN where a point has no data.
-    """
+    """Rms normalised residual of each field point, 1 by noise alone (the flux took one in four); NaN without data."""
     _, residual = likelihood.residuals(values)
     freedom = (likelihood.used * likelihood.data_per_row).sum(axis=1)
     square = (residual**2).sum(axis=(1, 2))
@@ -174,10 +168,7 @@ def modulation_figure(
 
 @styled
 def matrix_maps_figure(maps: MatrixMaps, kind: int | None = None, on: Canvas = PAGE) -> AnyFigure:
-    """The elements of the instrument matrix over the field as `matrix_panels` draws them.
-
-    `kind`: only those that Paper II calls by one name (`PAPER_NAMES`): zero offsets, efficiencies or cross-talk.
-    """
+    """The elements of the matrix over the field; `kind`: those of one name in Paper II (place in `PAPER_NAMES`)."""
     chosen = [i for i in range(len(maps.values)) if kind in (None, element_kind(i, maps.arms))]
     rows = maps.arms if kind is None else 1
     columns = max(len(chosen) // rows, 1)
@@ -189,10 +180,7 @@ def matrix_maps_figure(maps: MatrixMaps, kind: int | None = None, on: Canvas = P
 
 @styled
 def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
-    """The standard errors of the elements of the instrument matrix over the field, in per cent, one logarithmic scale.
-
-    It ends at whole decades, so that the errors of different runs can be compared.
-    """
+    """The standard errors of the elements of the matrix over the field (%), on a logarithmic scale of whole decades."""
     figure, axes = on.panels(8.6, 2.3 * maps.arms, maps.arms, 3, turned=True, squeeze=False)
     low, high = (100.0 * float(edge(maps.errors[maps.errors > 0], initial=1e-6)) for edge in (np.min, np.max))
     high = 10.0 ** np.ceil(np.log10(high))
@@ -209,10 +197,7 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
 
 @styled
 def matrix_change_figure(old: MatrixMaps, new: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
-    """By how much the elements of the instrument matrix have changed over the field, in per cent.
-
-    Those that Paper II calls by one name share a scale. Raises ValueError for maps of different places.
-    """
+    """Change of the matrix over the field (%), a scale for each name of Paper II; ValueError for other places."""
     if field_of(old) != field_of(new) or old.values.shape != new.values.shape:
         raise ValueError("the maps of the two calibrations are of different places")
     change = 100.0 * (new.values - old.values)

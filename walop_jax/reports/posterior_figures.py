@@ -58,10 +58,7 @@ def unit_in_words(unit: str) -> str:
 def informed(
     names: Sequence[str], spread: Mapping[str, float], prior: Mapping[str, float]
 ) -> tuple[str, ...]:
-    """The names constrained by the data, best first: posterior narrower than the prior, where there is one.
-
-    `spread` holds standard deviations of the posterior, `prior` those of the prior (NaN: none).
-    """
+    """Names that the data constrain, best first: `spread` (posterior) below that of the `prior` (NaN: none)."""
     known = {name for name in names if np.isfinite(prior.get(name, np.nan))}
     share = {name: spread[name] / prior[name] if name in known else 0.0 for name in names}
     return tuple(sorted((n for n in names if share[n] < PRIOR_ONLY), key=lambda n: share[n]))

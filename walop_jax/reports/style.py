@@ -66,10 +66,7 @@ def own_style() -> contextlib.AbstractContextManager[None]:
 
 
 class PaperFigure(Figure):
-    """A figure that is drawn in the style of the package, and written with TrueType fonts (PDF, PostScript).
-
-    Journals refuse Type 3, matplotlib's default.
-    """
+    """A figure in the style of the package, with TrueType fonts: journals refuse Type 3, matplotlib's default."""
 
     def savefig(self, *args: Any, **options: Any) -> None:
         """Write the figure, as any other."""
@@ -255,10 +252,7 @@ def point_map(
     colours: str,
     shown: Bool[np.ndarray, " p"] | None = None,
 ) -> Any:
-    """A square tile for each field point, as wide as the distance to its neighbours; none where there is no value.
-
-    `shown` are the points that set the distance and the edges of the map (default: all).
-    """
+    """A square tile for each point with a value, as wide as neighbours are apart; `shown` set distance and edges."""
     shown = np.ones(len(x), bool) if shown is None else shown
     size = _spacing(x[shown], y[shown])
     visible = shown & np.isfinite(values)

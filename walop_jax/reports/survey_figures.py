@@ -76,10 +76,7 @@ def nights_figure(document: Mapping[str, Any], on: Canvas = PAGE) -> Figure:
 
 @styled
 def watch_figure(found: Watch) -> Figure:
-    """Gain of every camera (per cent, since the calibration, that camera alone) by exposure group.
-
-    The band is the smallest step from there on that is found in 99 % of cases; lines are changes that were found.
-    """
+    """Gain of every camera since the calibration (%) by group; band: smallest step seen in 99 %, lines: changes."""
     count = len(found.cameras)
     figure, axes = PAGE.panels(6.0, 1.1 + 1.3 * count, count, 1, sharex=True, sharey=True, squeeze=False)
     named = {change.camera for change in found.changes}

@@ -104,10 +104,7 @@ class Affected(Displayed):
 def affected(
     old: Calibration, new: Calibration, catalogue: Catalogue, name: str, limit: float = LIMIT
 ) -> Iterator[NightShift]:
-    """The nights of a catalogue, called `name`, with the shift of its stars when `new` takes the place of `old`.
-
-    A star with rows of several nights, which are one result, is one of each of them.
-    """
+    """The nights of a catalogue, called `name`, with the shift of its stars; one of several nights is in each."""
     before, after = results_of(old, catalogue), results_of(new, catalogue)
     evening, star = night_of(catalogue.time, old.site.longitude), catalogue.star
     dated, everyone = np.isin(star, star[np.isfinite(evening)]), np.arange(len(before.qu))

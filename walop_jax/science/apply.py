@@ -127,10 +127,7 @@ def _joined(parts: list[Stars]) -> Stars:
 def residuals_of(
     vectors: AnalysisVectors, catalogue: Catalogue, rows: int = STAR_SAMPLE, *, force: bool = False
 ) -> list[StarResiduals]:
-    """Residuals of the stars of a catalogue, of about `rows` of its rows at most; none where no camera is to spare.
-
-    Raises `DataError` as `apply` does.
-    """
+    """Residuals of stars, of about `rows` rows at most; none without a camera to spare. `DataError` as in `apply`."""
     work = _Application(vectors, catalogue, force=force)
     chosen = work.sample(rows)
     return [
@@ -388,10 +385,7 @@ class _Application:
     def _changed(
         self, block: _Block, check: CatalogueCheck
     ) -> tuple[Float[np.ndarray, "s 2 2"], Bool[np.ndarray, " s"]]:
-        """Effect of the changes on stars, and which of them lie at one of the places.
-
-        The largest, in q and in u, of the changes that cannot be separated.
-        """
+        """Effect on stars of changes, of those alike the largest in q and in u; True for stars at a place."""
         points, fitted = self.catalogue.points, block.found
         cameras = self.vectors.instrument.cameras.names
         parameters = [name for name, _ in self.vectors.named]

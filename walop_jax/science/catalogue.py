@@ -218,10 +218,7 @@ _NO_ID = (*MISSING, "-1", "unknown")
 
 
 def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndarray, " n"]:
-    """Number of the star of every row: by FILTER, and ID, SOURCE_ID or position; a row without is a star of its own.
-
-    IDs that are missing, empty or negative are none.
-    """
+    """Number of the star of every row: by FILTER, and ID, SOURCE_ID or position; a row without is a star of its own."""
     rows = np.arange(source.rows)
     named = next((name for name in ("ID", "SOURCE_ID") if name in source.names), "ID")
     column = source.column(named)

@@ -283,10 +283,7 @@ def added_amplitudes(old: Model, new: Model) -> list[str]:
 
 
 class MeasuredChange(NamedTuple):
-    """A change in units of `sigma`, for the parameters that were known at all, and V⁻¹ over the measured directions.
-
-    `directions` is the number of those that were measured.
-    """
+    """A change in units of `sigma`, for parameters known at all, and V⁻¹ over the measured `directions`, a number."""
 
     names: tuple[str, ...]
     change: Float[np.ndarray, " k"]

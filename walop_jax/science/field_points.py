@@ -141,10 +141,7 @@ def doubt_radians(source: InputTable, name: str, angle: Float[np.ndarray, " n"],
 def true_matrices(
     path: str | os.PathLike[str], instrument: Instrument
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
-    """X, Y (deg) and M21, M22, … of a table of true matrices, three for each arm.
-
-    Raises `DataError` for values that are missing or not finite.
-    """
+    """X, Y (deg) and M21, M22, … of a table of true matrices, three for each arm; `DataError` if not finite."""
     source = read_input_table(path)
     points = field_points(source, instrument)
     names = [f"M{arm + 2}{column}" for arm in range(len(instrument.cameras.pairs)) for column in (1, 2, 3)]

@@ -91,10 +91,7 @@ class LeftOverSky:
 def left_over_sky(
     qu: Float[np.ndarray, "s 2"], photon: Float[np.ndarray, "s 2 2"], light: Vector, ratio: Vector
 ) -> LeftOverSky | None:
-    """The sky left over in stars with these (q, u), covariances, light (electron) and ratios of sky to light.
-
-    None where too few stars have all of them, or all have the same ratio.
-    """
+    """The sky left in stars of such light (electron) and sky over light; None of few stars, or of one ratio."""
     good = np.isfinite(qu).all(axis=1) & np.isfinite(photon).all(axis=(1, 2))
     chosen = np.flatnonzero(good & (light > 0) & np.isfinite(ratio) & (ratio >= 0))
     chosen = chosen[np.mod(np.arange(len(chosen)) * 0.6180339887498949, 1.0) < MOST / max(len(chosen), 1)]

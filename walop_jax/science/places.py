@@ -53,10 +53,7 @@ OfStars = Float[np.ndarray, " s"]
 
 @dataclasses.dataclass(frozen=True)
 class DisagreeingPlace:
-    """A place where stars disagree: centre and size (deg), significance, stars, and possible causes (best first).
-
-    That are spots of cameras, whose numbers are `cameras`.
-    """
+    """A place where stars disagree: centre, size (deg), σ, stars, causes (best first): spots of these `cameras`."""
 
     x: float
     y: float

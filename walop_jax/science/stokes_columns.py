@@ -24,10 +24,7 @@ Columns = dict[str, tuple[np.ndarray, str, str]]  # values, description, unit
 
 
 def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) -> Columns:
-    """The columns added to a catalogue (docs: files); all rows of a star hold the result of the star.
-
-    Raises ValueError for an unknown `estimator` of the degree of polarisation.
-    """
+    """Columns added to a catalogue (docs: files), of stars in all their rows; ValueError for an unknown `estimator`."""
     covariance = stars.covariance
     light = polarisation(stars.qu, covariance, estimator)
     error = np.sqrt(np.einsum("sii->si", covariance))
@@ -87,10 +84,7 @@ def header(product: str, estimator: str, on_sky: float, check: CatalogueCheck) -
 
 
 def sentences(rows: Catalogue, stars: Stars, names: Sequence[str]) -> Iterator[str]:
-    """Warnings about a catalogue: of its stars together, of counts and errors, of stars with another's rows.
-
-    `names` are those of the cameras.
-    """
+    """Warnings about a catalogue: all stars, counts and errors, rows of other stars; `names` are of the cameras."""
     at_places = {place.words() for place in stars.check.places}
     for text in stars.check.warnings():
         yield f"{text} (FLAG {Quality.PLACE if text in at_places else Quality.CATALOGUE:d})"

@@ -141,10 +141,7 @@ def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[C
 
 
 def with_rivals(calibration: Calibration) -> Calibration:
-    """The calibration with those of `RIVALS` that its instrument may have, at neutral and as good as certain.
-
-    They are columns that a change of the optics may have, beside the parameters that were fitted.
-    """
+    """The calibration with the `RIVALS` that its instrument may have, as columns: at neutral, as good as certain."""
     context = effect_context(calibration.model.template, calibration.exposures)
     model = calibration.model
     for name in RIVALS:
@@ -344,10 +341,7 @@ class Watching:
         return np.concatenate([part.parameters() @ self.root, part.colour], axis=-1)
 
     def suspects(self, found: Answers) -> list[PossibleChange]:
-        """Every reading with the histories compared, the most significant first; those too large for theirs last.
-
-        These are the best history of each kind, whatever has changed, and its neighbours in time.
-        """
+        """Readings with the best history of each kind and its neighbours, the strongest first, too large ones last."""
         strength = np.max(np.abs(found.size / found.error), axis=1)
         compared: list[int] = []
         for kind in ("step", "drift", "once"):

@@ -28,10 +28,7 @@ Sum = dict[int, float]
 
 
 class Reading(NamedTuple):
-    """A possible change, as a sum of `Readings.columns`; `across` is that along Y, of a gradient.
-
-    `widest` is the largest size that it may have.
-    """
+    """A possible change: a sum of `Readings.columns` (`across`: along Y, of a gradient), `widest` at most."""
 
     kind: str
     name: str
