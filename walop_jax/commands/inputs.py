@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 
 GIGABYTE = 1e9
-# --------------------------------------------------------------------------------------------------- options
-
 SETS = Argument("Calibration sets (FITS), fitted as one.", metavar="CALSET...", kind=list[Path])
 Sets = Annotated["CalibrationSet | PathLike | Sequence[PathLike]", SETS]
 ModelLike = Annotated[
@@ -55,9 +53,6 @@ SetFile = Annotated[
 TableFile = Annotated[
     "PathLike | None", Option("Table to write (.fits, .csv, .ecsv).", "OUT", Path, "-o", required=True)
 ]
-
-
-# ---------------------------------------------------------------------------------------------------- reading
 
 
 def read(

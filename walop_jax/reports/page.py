@@ -10,7 +10,6 @@ import dataclasses
 import functools
 import io
 import re
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,12 +31,11 @@ from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import draw
 from walop_jax.reports.posterior_figures import unit_in_words
 from walop_jax.reports.run import FigureSource, RunContents, read_limits
-from walop_jax.reports.style import PAGE, WIDTHS, Canvas
+from walop_jax.reports.style import PAGE, TEMPLATES, WIDTHS, Canvas, texts
 from walop_jax.reports.wording import data_in_words, effect_in_words, names_in_words, symbols_in_words
 from walop_jax.science.commissioning import is_go, requirement_advice, requirement_rows, requirements
 from walop_jax.science.field_accuracy import FieldAccuracy
 
-TEMPLATES = Path(__file__).parent / "templates"
 MOST_PULLS = 8
 SHOWN_CANDIDATES = 10
 MANY = 32  # rows of a table above which it is folded
@@ -107,12 +105,6 @@ def filled(head: Display, sections: Iterable[Section], *, good: bool, **content:
     return re.sub(r"(?<=\d) (?=[%σ±])|(?<=[=±≤]) (?=\d)", "\N{NO-BREAK SPACE}", text)
 
 
-@functools.cache
-def captions() -> Mapping[str, str]:
-    """Captions of figures by name, and of pictures by file."""
-    return tomllib.loads((TEMPLATES / "captions.toml").read_text(encoding="utf-8"))
-
-
 def embedded(content: bytes, kind: str = "png") -> str:
     """A picture as a data URI: for an image inside a page."""
     return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
@@ -125,7 +117,7 @@ def picture(name: str, drawn_on: Callable[[Canvas], Any], **words: str) -> Pictu
         stream = io.BytesIO()
         drawn_on(canvas).savefig(stream, format="svg", metadata={"Date": None})
         images.append(embedded(stream.getvalue(), "svg+xml"))
-    return Picture(images[0], captions()[name].format(**words), name in SMALL, images[1])
+    return Picture(images[0], texts("captions")[name].format(**words), name in SMALL, images[1])
 
 
 def drawn(source: FigureSource, names: Sequence[str], missing: list[str], **words: str) -> list[Picture]:
@@ -352,7 +344,7 @@ def _posterior(run: RunContents) -> Section:
     """The verdict on the chains, intervals, and the corner plot."""
     shown = None if run.sample is None else display_of(run.sample, run.source.folder / "sample.json")
     names = [] if shown is None else [row[0] for row in shown.rows]
-    words = captions()["corner"] + symbols_in_words(names)
+    words = texts("captions")["corner"] + symbols_in_words(names)
     pictures = [] if run.corner is None else [Picture(embedded(run.corner), words)]
     return Section("posterior", "Posterior", shown, pictures)
 
@@ -484,7 +476,9 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
         except DataError as error:
             missing.append(f"Parameters against time are not drawn: {error}.")
         return [*results, picture("nights", functools.partial(survey_figures.nights_figure, document))]
-    names = {name: words for name, words in captions().items() if re.fullmatch(rf"{kind}.*\.png", name)}
+    names = {
+        name: words for name, words in texts("captions").items() if re.fullmatch(rf"{kind}.*\.png", name)
+    }
     missing += [f"{name} is not there." for name in names if not (folder / name).exists()]
     return [  # panels of watch are below each other: whole on a narrow screen
         Picture(embedded((folder / name).read_bytes()), words, small=kind == "watch")

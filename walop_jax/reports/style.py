@@ -6,7 +6,9 @@ import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import matplotlib.style
@@ -27,6 +29,7 @@ from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.io.text import with_minus_sign
 from walop_jax.sky.nights import FIRST_DATE
 
+TEMPLATES = Path(__file__).parent / "templates"
 FONT = 9
 SMALL = 7
 NARROW = 4.5  # inches: a column of print, or half a page
@@ -58,6 +61,12 @@ Places = Float[np.ndarray, " p"]  # at field points
 Field = tuple[float, float, float, float]
 AnyFigure = Any
 """A figure on a `Canvas`, or the subfigure that took the room of axes."""
+
+
+@functools.cache
+def texts(name: str) -> Mapping[str, Any]:
+    """Texts beside the templates of pages: `captions` of figures, `symbols` of coefficients (mathematics and text)."""
+    return tomllib.loads((TEMPLATES / f"{name}.toml").read_text(encoding="utf-8"))
 
 
 def own_style() -> contextlib.AbstractContextManager[None]:

@@ -172,9 +172,6 @@ def quality_row(
     }
 
 
-# ---------------------------------------------------------------------------------------------- the table of nights
-
-
 def read_limits(path: str | os.PathLike[str] | None = None) -> Limits:
     """Limits by the name of a column (GAIN: of all cameras): those of a file, beside those of the package."""
     shipped = (resources.files("walop_jax.science") / "quality.toml").read_text(encoding="utf-8")

@@ -80,9 +80,6 @@ def header(product: str, estimator: str, on_sky: float, check: CatalogueCheck) -
     }
 
 
-# ------------------------------------------------------------------------------------------------------- warnings
-
-
 def sentences(rows: Catalogue, stars: Stars, names: Sequence[str]) -> Iterator[str]:
     """Warnings about a catalogue: all stars, counts and errors, rows of other stars; `names` are of the cameras."""
     at_places = {place.words() for place in stars.check.places}
