@@ -77,16 +77,9 @@ WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen t
 MOST_GROUPS = 150
 """Exposure groups that are separated; neighbours of more are joined."""
 RIVALS = (
-    "hwp1_axis",
-    "hwp2_axis",
-    "hwp1_crossing",
-    "hwp2_crossing",
-    "chwp_axis",
-    "wollaston_axis",
-    "upstream_retarder",
-    "telescope_polarisation",
-    "filter_shift",
-)
+    "hwp1_axis", "hwp2_axis", "hwp1_crossing", "hwp2_crossing", "chwp_axis", "wollaston_axis", "upstream_retarder",
+    "telescope_polarisation", "filter_shift",
+)  # fmt: skip
 """Effects of the optics that may have changed, beside the parameters of the model."""
 EDGES = (2.0, 8.0)
 """Sharpness of spots: a blurred one and one with an edge."""
