@@ -235,15 +235,13 @@ def read_run(run: Run | Path) -> RunContents:
         effects = [step["effect"] for step in diagnosis["steps"]]
         drawn = [] if pictures is None else [comparison.effect for comparison in pictures.comparisons[1:]]
         if pictures is not None and drawn not in (effects, [*effects, FreeForm.name]):
-            missing.append(
-                f"{names.FIGURE_DATA} is of another diagnosis than {names.DIAGNOSIS}: pictures are left out."
-            )
+            what = f"is of another diagnosis than {names.DIAGNOSIS}: its pictures are left out"
+            missing.append(f"{names.FIGURE_DATA} {what}.")
             pictures = None
         stated, ratio = diagnosis.get("chi2_per_dof_after"), summary["chi2"] / max(summary["dof"], 1)
         if stated is not None and abs(stated - ratio) > SAME_CHI2 * ratio:
-            missing.append(
-                f"{names.DIAGNOSIS} is of another fit than {names.SUMMARY}: the folder was written to again."
-            )
+            what = f"is of another fit than {names.SUMMARY}: this folder was written to again since"
+            missing.append(f"{names.DIAGNOSIS} {what}.")
     sampled = names.POSTERIOR in run
     extras = {
         "sample": optional(
