@@ -392,24 +392,11 @@ def in_greek(text: str) -> str:
 # -------------------------------------------------------------------------------------------------- other results
 
 
-OTHERS = {
-    "comparison": ("Paper II and the joint model", "trusted"),
-    "epoch": ("An old calibration and new data", "fits"),
-    "plan": ("Which calibration exposures to take", ""),
-    "limits": ("What these data can show", ""),
-    "survey": ("Many nights of one instrument", "trusted"),
-    "watch": ("Is the calibration still valid?", "holds"),
-    "affected": ("Catalogues that a new calibration changes", ""),
-    "commissioning": ("Go or no-go", "go"),
-}
-"""Pages about no fit by the name of their document (`io.names.DOCUMENTS`): title, key that says if it is good."""
-
-
 def kind_of_run(folder: Path) -> str:
-    """One of `OTHERS` for a folder that holds such a document and no fit to report; else `fit`."""
+    """One of the pages about no fit for a folder that holds such a document and no fit to report; else `fit`."""
     if (folder / SUMMARY).exists():
         return "fit"
-    return next((kind for kind in OTHERS if (folder / DOCUMENTS[kind]).exists()), "fit")
+    return next((kind for kind in texts("pages") if (folder / DOCUMENTS[kind]).exists()), "fit")
 
 
 def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
@@ -417,13 +404,13 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
 
     Raises `DataError` for a document that cannot be read or lacks contents of the page.
     """
-    (title, key), missing = OTHERS[kind], []
+    page, missing = texts("pages")[kind], []
     document = RunFolder(folder).document(DOCUMENTS[kind], ("shown",))
     head = display_of(document, folder / DOCUMENTS[kind])
     pictures = _pictures(folder, kind, document, missing)
     limited = kind == "plan" and (folder / LIMITS).exists()
     limits = read_limits(folder / LIMITS).display() if limited else None
-    good = bool(document.get(key, True)) and bool(document.get("new_trusted", True))
+    good = bool(document.get(page.get("trust"), True)) and bool(document.get("new_trusted", True))
     text = filled(
         head,
         (
@@ -433,24 +420,15 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
         ),
         good=good,
         untrusted=not document.get("trusted", document.get("new_trusted", True)),
-        title=title,
+        title=page["title"],
         about="",
         first="",
         doubts=[warning for warning in document.get("warnings", ()) if warning not in head.notes],
         name=folder.resolve().name,
-        next=_AFTER.get(kind, ()),
+        next=page.get("next", ()),
         missing=missing,
     )
     return text, tuple(missing)
-
-
-_AFTER: Mapping[str, Sequence[tuple[str, str]]] = {
-    "limits": [("plan exposures that show more", "walop-jax plan RUN --minutes 10")],
-    "plan": [("rehearse it", "walop-jax simulate PLAN/plan.toml -o SET.fits")],
-    "epoch": [("fit all nights together", "walop-jax stack RUN NEW.fits -o SURVEY")],
-    "survey": [("correct stars", "walop-jax apply SURVEY STARS.fits -o OUT.fits")],
-}
-"""Next steps after what other commands have made: words and a command line."""
 
 
 def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: list[str]) -> list[Picture]:

@@ -65,7 +65,7 @@ AnyFigure = Any
 
 @functools.cache
 def texts(name: str) -> Mapping[str, Any]:
-    """Texts beside the templates of pages: `captions` of figures, `symbols` of coefficients (mathematics and text)."""
+    """Texts beside the templates: `captions`, `symbols` of coefficients (mathematics, text), `pages` about no fit."""
     return tomllib.loads((TEMPLATES / f"{name}.toml").read_text(encoding="utf-8"))
 
 
