@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
 from matplotlib.ticker import MaxNLocator
 
@@ -116,8 +115,10 @@ def _maps(
                 axis.tick_params(axis="x", labelrotation=90)
             axis.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="both"))
             tiles = point_map(axis, points.x, points.y, values[:, k], norm, colours, shown)
-            if signs:
-                _signs(axis, points, values[:, k], norm)
+            for i in np.flatnonzero(signs & (np.abs(np.nan_to_num(values[:, k])) > SIGN_BEYOND)):
+                ink = "white" if abs(norm(values[i, k]) - 0.5) > 0.35 else "0.25"
+                look = {"color": ink, "fontsize": 5, "ha": "center", "va": "center"}
+                axis.text(points.x[i], points.y[i], "+" if values[i, k] > 0 else "−", **look)
     outer_labels(axes)
     for row, title in zip(axes, maps, strict=True):
         for axis in row:
@@ -125,13 +126,6 @@ def _maps(
                 axis.set_ylabel(f"{title}\n\nY (deg)")
     colour_bar(figure, tiles, axes, label, pad=0.015, aspect=18 * len(maps), fraction=0.03)
     return figure
-
-
-def _signs(axis: Axes, points: Points, values: Float[np.ndarray, " p"], norm: Normalize) -> None:
-    for i in np.flatnonzero(np.abs(np.nan_to_num(values)) > SIGN_BEYOND):
-        ink = "white" if abs(norm(values[i]) - 0.5) > 0.35 else "0.25"
-        sign = "+" if values[i] > 0 else "−"
-        axis.text(points.x[i], points.y[i], sign, color=ink, fontsize=5, ha="center", va="center")
 
 
 @styled
@@ -144,10 +138,9 @@ def signature_figure(
     polariser; against time otherwise. Exposures at one angle are averaged. The lower panels hold the remaining
     residuals.
     """
-    angular = _against_angle(comparison, exposures)
+    angular, position, label = _abscissa(comparison, exposures)
     grid = {"sharex": True, "sharey": "row", "height_ratios": (2.2, 1), "squeeze": False}
     figure, (upper, lower) = on.panels(0.6 + 2.0 * len(cameras), 3.5, 2, len(cameras), **grid)
-    position, label = _abscissa(exposures, angular)
     for k, camera in enumerate(cameras):
         finite = np.isfinite(position) & np.isfinite(comparison.curves["BEFORE"][:, k])
         columns = (comparison.curves[name] for name in ("BEFORE", "ERROR", "EXPLAINED", "AFTER"))
@@ -167,22 +160,16 @@ def signature_figure(
     return figure
 
 
-def _against_angle(comparison: ResidualComparison, exposures: Table) -> bool:
-    behind = np.isfinite(exposures["CLP_ANGLE"])
-    if comparison.harmonic >= 0 or not behind.any():
-        return comparison.harmonic >= 0
+def _abscissa(comparison: ResidualComparison, exposures: Table) -> tuple[bool, Float[np.ndarray, " e"], str]:
+    """True for polariser angles, positions along the axis, its label."""
+    behind, mjd = np.isfinite(exposures["CLP_ANGLE"]), exposures["MJD"]
     explained = comparison.curves["EXPLAINED"]
     power = np.nansum(np.where(explained != 0, explained, comparison.curves["BEFORE"]) ** 2, axis=1)
-    return bool(power[behind].sum() > 0.5 * power.sum())
-
-
-def _abscissa(exposures: Table, angular: bool) -> tuple[Float[np.ndarray, " e"], str]:
-    if angular:
-        return exposures["CLP_ANGLE"], "polariser angle (deg)"
-    mjd = exposures["MJD"]
+    if comparison.harmonic >= 0 or power[behind].sum() > 0.5 * power.sum():
+        return True, exposures["CLP_ANGLE"], "polariser angle (deg)"
     if np.isfinite(mjd).all() and np.ptp(mjd) > 0:
-        return 24.0 * (mjd - mjd.min()), "time since the first exposure (h)"
-    return exposures["EXPOSURE"].astype(float), "exposure"
+        return False, 24.0 * (mjd - mjd.min()), "time since the first exposure (h)"
+    return False, exposures["EXPOSURE"].astype(float), "exposure"
 
 
 def _binned(x: Float[np.ndarray, " e"], *columns: Float[np.ndarray, " e"]) -> list[Float[np.ndarray, " b"]]:

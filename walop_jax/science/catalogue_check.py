@@ -241,21 +241,19 @@ class CatalogueSearch:
             middle, half = 0.5 * float(times.min() + times.max()), 0.5 * float(np.ptp(times))
             self.growth = self.growth._replace(middle=middle, half=half)
         kinds = [kind for kind in CAMERA_KINDS if kind != "time" or self.growth.half > 0]
-        self.kinds = kinds
         units = {"flux": "per 1e6 electron", "light": "electron"}
         self.cameras = tuple(cameras)
-        self.questions = [
+        self.of_cameras = [
             PossibleChange(name, True, kind=kind, unit=units.get(kind, ""))
             for kind in kinds
             for name in cameras
         ]
         plain = stars.plain.shape[-1]
         optics = (PossibleChange(name, False, kind="optics", unit=unit) for name, unit in parameters[:plain])
-        self.questions += optics
+        self.questions = [*self.of_cameras, *optics]
         # Columns: those of the cameras, all parameters, two of the colours; from them questions and nuisances are made.
-        count, shown = len(kinds) * len(cameras), len(root)
-        questions, nuisances = count + plain, self.root.shape[1]
-        self.asked = questions
+        count, shown, nuisances = len(self.of_cameras), len(root), self.root.shape[1]
+        questions = self.asked = len(self.questions)
         self.mixing = np.zeros((count + shown + 2, questions + nuisances + 2))
         self.mixing[:questions, :questions] = np.eye(questions)
         self.mixing[count : count + shown, questions : questions + nuisances] = self.root
@@ -271,11 +269,11 @@ class CatalogueSearch:
         values = np.zeros((*part.model.shape, len(self.mixing)))
         place = (part.x, part.y, part.time)
         relative = np.where(part.root > 0, part.model / np.where(part.root > 0, part.root, 1.0), 0.0)
-        for column, change in enumerate(change for change in self.questions if change.camera):
+        for column, change in enumerate(self.of_cameras):
             k = column % cameras
             grown = self.growth.electrons(change, *place, relative[:, k])
             values[:, k, column] = grown * part.root[:, k]
-        values[..., len(self.kinds) * cameras : -2] = part.parameters()
+        values[..., len(self.of_cameras) : -2] = part.parameters()
         values[..., -2:] = part.colour
         return values
 

@@ -16,7 +16,7 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy import optimize
 
 from walop_jax.fit.verdict import Quality
@@ -108,24 +108,18 @@ def left_over_sky(
 def _slope(columns: Float[np.ndarray, "s 3"], values: Vector, variance: Vector) -> tuple[float, float]:
     """Coefficient of the last column, and its error."""
     scatter, used = 0.0, np.ones(len(values), bool)
-    for _ in range(_ROUNDS):
-        beta, _, residual = _fitted(columns, values, variance + scatter, used)
-        scatter = _scatter(residual[used], variance[used])
-        used = np.abs(residual) < FAR * np.sqrt(variance + scatter)
-    beta, inverse, residual = _fitted(columns, values, variance + scatter, used)
+    beta, inverse, residual = np.zeros(3), np.eye(3), values
+    for rounds_left in reversed(range(_ROUNDS + 1)):
+        weight = np.where(used, 1.0 / (variance + scatter), 0.0)
+        inverse = np.linalg.pinv(columns.T @ (weight[:, None] * columns), hermitian=True)
+        beta = inverse @ (columns.T @ (weight * values))
+        residual = values - columns @ beta
+        if rounds_left:
+            scatter = _scatter(residual[used], variance[used])
+            used = np.abs(residual) < FAR * np.sqrt(variance + scatter)
     pull = np.where(used, residual / (variance + scatter), 0.0)[:, None] * columns
     robust = inverse @ (pull.T @ pull) @ inverse
     return float(beta[2]), float(np.sqrt(max(inverse[2, 2], robust[2, 2])))
-
-
-def _fitted(
-    columns: Float[np.ndarray, "s 3"], values: Vector, variance: Vector, used: Bool[np.ndarray, " s"]
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"], Vector]:
-    """Coefficients, their covariance and the residuals."""
-    weight = np.where(used, 1.0 / variance, 0.0)
-    inverse = np.linalg.pinv(columns.T @ (weight[:, None] * columns), hermitian=True)
-    beta = inverse @ (columns.T @ (weight * values))
-    return beta, inverse, values - columns @ beta
 
 
 def _scatter(left: Vector, variance: Vector) -> float:
