@@ -214,7 +214,7 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
 def field_axes(axis: Axes, title: str = "") -> None:
     """Make axes a map of the field."""
     axis.set(title=title, xlabel="X (deg)", ylabel="Y (deg)", aspect="equal")
-    axis.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+    axis.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
     axis.tick_params(labelsize=SMALL)
 
 
