@@ -220,9 +220,9 @@ def _with_goal(head: Display, known: FieldAccuracy) -> Display:
     """The head of a page with the answer for another goal in place of that of the fit."""
     answer = known.facts()
     replaced = {name for name, _ in answer}
-    others = [fact for fact in head.facts if not fact[0].startswith(("good for", "what to do"))]
-    remaining = [fact for fact in others if fact[0] not in replaced]
-    return dataclasses.replace(head, facts=(*answer, *remaining))
+    unchanged = [fact for fact in head.facts if not fact[0].startswith(("good for", "what to do"))]
+    unchanged = [fact for fact in unchanged if fact[0] not in replaced]
+    return dataclasses.replace(head, facts=(*answer, *unchanged))
 
 
 def _accuracy_pictures(run: RunContents, missing: list[str]) -> list[Picture]:

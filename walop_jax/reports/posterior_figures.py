@@ -39,8 +39,8 @@ def informed(
     names: Sequence[str], spread: Mapping[str, float], prior: Mapping[str, float]
 ) -> tuple[str, ...]:
     """Names that the data constrain, best first: `spread` (posterior) below that of the `prior` (NaN: none)."""
-    known = {name for name in names if np.isfinite(prior.get(name, np.nan))}
-    share = {name: spread[name] / prior[name] if name in known else 0.0 for name in names}
+    with_prior = {name for name in names if np.isfinite(prior.get(name, np.nan))}
+    share = {name: spread[name] / prior[name] if name in with_prior else 0.0 for name in names}
     return tuple(sorted((n for n in names if share[n] < PRIOR_ONLY), key=lambda n: share[n]))
 
 

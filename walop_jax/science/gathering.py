@@ -322,5 +322,5 @@ def _agreed(values: np.ndarray, texts: bool) -> tuple[np.ndarray, Bool[np.ndarra
 def _whole(values: np.ndarray) -> np.ndarray:
     """Identifiers as integers where all are such, -1 for unknown ones."""
     texts = np.where(values == "", "-1", values.astype(str))
-    whole = all(text.lstrip("-").isdigit() for text in texts.tolist())
-    return texts.astype(np.int64) if whole else values.astype(str)
+    integers = all(text.lstrip("-").isdigit() for text in texts.tolist())
+    return texts.astype(np.int64) if integers else values.astype(str)
