@@ -123,10 +123,8 @@ def affected(
         change, z = (after.qu - before.qu)[twice], every_z[twice]
         mean = np.average(change, axis=0, weights=weight) if z.size else np.zeros(2)
         median, quantile, largest = map(float, np.quantile(z, [0.5, MOST, 1.0]) if z.size else np.zeros(3))
-        lost, gained = (
-            int((of_night & measured_before & ~measured_after).sum()),
-            int((of_night & measured_after & ~measured_before).sum()),
-        )
+        lost = int((of_night & measured_before & ~measured_after).sum())
+        gained = int((of_night & measured_after & ~measured_before).sum())
         yield NightShift(
             name, float(night), int(of_night.sum()), median, quantile, largest, float(mean[0]), float(mean[1]),
             above=int((z > limit).sum()), lost=lost, gained=gained, beyond=int((beyond & of_night).sum()),
