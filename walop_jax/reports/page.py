@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import jinja2
 
+from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.product import read_product
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.display import Display, signed

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
+from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings

@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.calibration import Calibration, Product
 from walop_jax.calibration.matrix import MatrixMaps
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.detection_limits import DetectionLimits
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, figure_data, read_figure_data

@@ -25,7 +25,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator, MultipleLocator, NullLocator, ScalarFormatter
 
-from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
+from walop_jax.calibration.accuracy import SMALLEST_DETERMINANT
 from walop_jax.io.text import with_minus_sign
 from walop_jax.sky.nights import FIRST_DATE
 

@@ -31,10 +31,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special
 
-from walop_jax.calibration.accuracy import sample_stars
+from walop_jax.calibration.accuracy import SMALLEST_DETERMINANT, sample_stars
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.base_model import SKY_AND_STARS, model_like

@@ -14,10 +14,9 @@ import functools
 import numpy as np
 from jaxtyping import Bool, Float
 
-from walop_jax.calibration.accuracy import measures_u, p_errors, p_forms, sample_stars
+from walop_jax.calibration.accuracy import GOAL, measures_u, p_errors, p_forms, sample_stars
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import CouldHide, could_hide, off_by, unmeasured
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import two_digits
 from walop_jax.likelihood.inverses import whitening

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.settings import Settings
 from walop_jax.science.estimate import estimate
 
