@@ -166,10 +166,7 @@ class FieldAccuracy:
 
 @dataclasses.dataclass(frozen=True)
 class Requirement:
-    """A requirement on a calibration: whether it is met, the result, and advice if not.
-
-    One that is not `needed` is no reason against a go.
-    """
+    """A requirement on a calibration: whether it is met, the result, advice if not; `needed`: a reason against a go."""
 
     what: str
     met: bool
