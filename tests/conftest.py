@@ -8,23 +8,20 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import shapes
+
+if TYPE_CHECKING:
+    from handmade_set import Handmade
+    from south_sets import SouthSet
+
+    from walop_jax.fit.refit import FitResult
 
 # Workers share the cores: threads of linear algebra that wait for each other make the run half as long again.
 if "--benchmark" not in sys.argv:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-
-import jax
-import jaxtyping
-import pytest
-from handmade_set import Handmade
-from south_sets import ABSENT, CUTS, SHARED, SouthSet
-
-jax.config.update("jax_enable_x64", True)  # the package itself never switches it on
-# Every annotated shape and type of the package is checked, under pytest only. Must precede its import.
-jaxtyping.install_import_hook("walop_jax", "shapes.checked")
-from walop_jax.data.calset import read_calibration_set  # noqa: E402
-from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 
 LEAST_COMPILED = 0.1  # seconds: what compiles faster is not worth a file
 # Half the time; results differ by 10⁻¹³ of the counts. The second is newer than the oldest JAX that will do.
@@ -43,10 +40,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile quickly and little unless something is timed, and keep compiled code in pytest's own cache.
+    """Compute in float64, check shapes, compile quickly and little unless something is timed, in pytest's own cache.
 
-    Workers and processes of tests share the cache, and so does the next run.
+    Workers and processes of tests share the cache, and so does the next run. The process that only hands out tests to
+    workers needs nothing of all this.
     """
+    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        return
+    import jax
+
+    jax.config.update("jax_enable_x64", True)  # the package itself never switches it on
+    shapes.check_package()
     if not config.getoption("--benchmark"):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_COMPILATION}".strip()
         if hasattr(jax.config, QUICK_OPTIMISATION):
@@ -101,6 +105,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Say how much was left out because data that cannot come with the project are not there."""
+    from south_sets import ABSENT
+
     skipped = sum(ABSENT in str(report.longrepr) for report in terminalreporter.getreports("skipped"))
     if skipped:
         terminalreporter.write_line(f"{skipped} tests skipped: their data are {ABSENT}")
@@ -109,6 +115,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of sets made outside the project that do not come with it."""
+    from south_sets import ABSENT, SHARED
+
     if not SHARED.is_dir():
         pytest.skip(f"outside sets are {ABSENT}")
     return SHARED
@@ -117,12 +125,16 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def south_set() -> Callable[[str], SouthSet]:
     """Cuts of 5 × 5 points of the sets a, b, c, d with known truth, by name."""
+    from south_sets import CUTS, SouthSet
+
     return functools.partial(SouthSet.of, CUTS)
 
 
 @pytest.fixture(scope="session")
 def whole_south_set(shared_data: Path) -> Callable[[str], SouthSet]:
     """The sets of 12 × 12 points with known truth, by name; skips where they are not."""
+    from south_sets import SouthSet
+
     return functools.partial(SouthSet.of, shared_data)
 
 
@@ -135,16 +147,23 @@ def either_south_set(request: pytest.FixtureRequest) -> Callable[[str], SouthSet
 @pytest.fixture(scope="session")
 def south_fit() -> Callable[[SouthSet], FitResult]:
     """Fits of the base model to sets with known truth, each made once."""
+    from walop_jax.data.calset import read_calibration_set
+    from walop_jax.fit.refit import refit
+
     return functools.cache(lambda south: refit(read_calibration_set(south.path)).judged())
 
 
 @pytest.fixture
 def handmade(tmp_path: Path) -> Handmade:
     """A calibration set made with astropy alone, to be spoilt."""
+    from handmade_set import Handmade
+
     return Handmade(tmp_path)
 
 
 @pytest.fixture
 def two_cameras(tmp_path: Path) -> Handmade:
     """A set of an instrument with two cameras and two moving elements of its own, made in the same way."""
+    from handmade_set import Handmade
+
     return Handmade(tmp_path, two_cameras=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +98,18 @@ def test_headers_of_a_night(words: Path, tmp_path: Path):
     check_columns(columns)
     assert [Path(name).name for name in columns["FILE"]] == ["0.fits", "1.fits"]
     assert remarks == ["no word for HA, TEFF: taken as not known"]
+
+
+def test_light_through_the_polariser_needs_no_word_for_it(words: Path, tmp_path: Path):
+    """KIND clp is light through the polariser, which a remark says; its angle has to be stated."""
+    text = WORDS.replace('[CLP_IN]\nword = "POLARIS"\nvalues = { IN = true, OUT = false }\n', "")
+    columns, remarks = exposures_table(headers(tmp_path), words_of(tomllib.loads(text)))
+    check_columns(columns)
+    assert remarks[1:] == ["CLP_IN is not stated in 1 exposures of KIND clp: taken as true"]
+    text = text.replace('[CLP_ANGLE]\nword = "POLANG"\nunit = "rad"\noptional = true\n', "")
+    columns, remarks = exposures_table(headers(tmp_path), words_of(tomllib.loads(text)))
+    assert columns["CLP_IN"].tolist() == [True, False]
+    assert remarks[2:] == ["CLP_ANGLE is not known in 1 exposures through the polariser: a fit needs it"]
 
 
 def test_a_log_of_the_telescope(words: Path, tmp_path: Path):

@@ -9,6 +9,7 @@ import pytest
 from astropy.io import fits
 
 from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.inspection import inspect
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.io.errors import DataError
 
@@ -151,6 +152,16 @@ def test_flagged_and_spoilt_rows_are_not_used(handmade):
     assert len(calset.remarks) == 2
     assert "rows 5, 6, 8 (counted from 0), not used" in calset.remarks[0]
     assert "FLAG: set in 1 of 24 rows" in calset.remarks[1]
+
+
+def test_truth_values_of_flags_are_bad_pixels(handmade):
+    """True says that a row is not to be used; it does not say that it is saturated, as bit 1 does."""
+    flags = np.arange(24) == 4
+    handmade["INTENSITIES"]["FLAG"] = ["L", None, flags]
+    calset = read_calibration_set(handmade.write())
+    assert calset.intensities.flag.tolist() == [2 * int(flag) for flag in flags]
+    assert "FLAG: holds truth values: true is taken as 2, bad pixel" in "; ".join(calset.remarks)
+    assert inspect(calset).flags == {"bad pixel": 1}
 
 
 def test_slightly_negative_counts_are_kept(handmade):

@@ -195,6 +195,20 @@ def test_an_executed_schedule_has_times(tmp_path: Path):
     assert table["CHWP_ANGLE"].unit == "deg"
 
 
+def test_a_file_of_json_is_parsed_once(tmp_path: Path, monkeypatch):
+    """To see whether it is a schedule, and for its exposures, as a schedule and as a log."""
+    written(tmp_path / "schedule.json", PLAN.exposures())
+    (tmp_path / "log.json").write_text('[{"TYPE": "clp", "ANGLE": 30.0}]')
+    (tmp_path / "words.toml").write_text(
+        'filters = { "SDSS-r" = 1, "NB-660" = 3 }\n[KIND]\nword = "TYPE"\n[CLP_ANGLE]\nword = "ANGLE"\n'
+    )
+    calls, loads = [], json.loads
+    monkeypatch.setattr(json, "loads", lambda text: calls.append(text) or loads(text))
+    assert len(walop.exposures(tmp_path / "schedule.json", words=tmp_path / "words.toml")) > 1
+    assert len(walop.exposures(tmp_path / "log.json", words=tmp_path / "words.toml")) == 1
+    assert len(calls) == 2
+
+
 def one_turning(turn: float, seconds: float = 30.0) -> Exposures:
     exposures = dataclasses.replace(PLAN.exposures()[:1], exptime=np.array([seconds]))
     return exposures.placed(**{CALIBRATION_PLATE: Position(np.ones(1, bool), np.zeros(1), np.array([turn]))})
@@ -212,6 +226,11 @@ def one_turning(turn: float, seconds: float = 30.0) -> Exposures:
             PLAN.exposures()[:1].placed(HWP=Position.at([22.5])),
             FILTERS,
             "HWP_ANGLE: a schedule cannot set HWP",
+        ),
+        (
+            dataclasses.replace(PLAN.exposures(), mjd=np.full(len(PLAN.exposures()), np.nan)),
+            FILTERS,
+            "MJD: no exposure has a time; a schedule needs the date of its night",
         ),
     ],
 )

@@ -37,12 +37,9 @@ def matrices(instrument: Instrument, x: float, y: float, plate: float | None) ->
     instrument = instrument.patched()
     spectrum = (light.node_wavelengths(instrument, layout), layout.conditions)
     ray = Ray.entering(jnp.asarray(x), jnp.asarray(y), spectrum)
-    train = light.divided(instrument)
-    common, ray = fold.stations((*train.leading, *train.banded), ray)
-    arms = [station for arm in instrument.arms for station in fold.stations(tuple(arm.train()), ray)[0]]
-    every = [*common, *arms]
-    found = fold.solved(every, layout.moving, [(plate,)])
-    return [(every[n][0].name, np.asarray(matrix)) for (n, _), matrix in found.items() if matrix is not None]
+    path = fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, layout.moving, [(plate,)])
+    found = path.solved().items()
+    return [(path.stations[n][0].name, np.asarray(matrix)) for (n, _), matrix in found if matrix is not None]
 
 
 def anywhere(rng: np.random.Generator) -> Instrument:

@@ -14,7 +14,7 @@ from astropy.table import MaskedColumn, Table
 from walop_jax.data.user_tables import in_memory
 from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import write_table
-from walop_jax.science.common_table import COLUMNS, check_common_table, common_table, to_galactic
+from walop_jax.science.common_table import check_common_table, columns, common_table, to_galactic
 
 
 def result(count=40) -> Table:
@@ -88,11 +88,11 @@ def test_others_read_it(end, tmp_path):
     assert (
         read.colnames
         == list(table.colnames)
-        == [name for name in COLUMNS if name not in ("Gmag", "Plx", "e_Plx")]
+        == [name for name in columns() if name not in ("Gmag", "Plx", "e_Plx")]
     )
     assert all(read[name].description for name in read.colnames)
     assert {name for name in read.colnames if read[name].unit is None} == {
-        n for n in table.colnames if not COLUMNS[n].unit
+        n for n in table.colnames if not columns()[n].unit
     }
     assert read["GaiaID"].tolist() == result()["SOURCE_ID"].tolist()
     np.testing.assert_array_equal(read["q"], table["q"])

@@ -132,6 +132,16 @@ def test_flags_are_those_of_the_package_and_others_are_refused(tmp_path):
     assert "MASK_FLAG: flags are read from" in said
 
 
+def test_truth_values_of_flags_name_no_cause(tmp_path):
+    """The bit 1 of SExtractor is a neighbour (8); a column that is true says only that a star is not to be used."""
+    columns = of_camera(STARS, 0, np.random.default_rng(0))
+    columns["FLAGS"] = np.arange(300) == 3
+    catalogue = read_camera_catalogue(ldac(tmp_path / "a.fits", columns))
+    assert np.flatnonzero(catalogue.flag).tolist() == [3]
+    assert catalogue.flag[3] == 2
+    assert "FLAGS holds truth values: true is taken as a bad pixel" in catalogue.remarks
+
+
 def test_right_ascensions_in_hours_are_converted_once(tmp_path):
     """1 h is 15°, a number that could itself be hours."""
     columns = {

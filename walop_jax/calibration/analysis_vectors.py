@@ -24,7 +24,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import acting_effects, acts_in, turn_of, with_effect
 from walop_jax.calibration.matrix import sky_vectors, vector_slopes
 from walop_jax.data.settings import Settings
-from walop_jax.likelihood.field_table import FieldTable, accurate_table, held_out
+from walop_jax.likelihood.field_table import FieldTable, Vector, accurate_table, held_out
 from walop_jax.likelihood.optics import plain_positions, through_series
 from walop_jax.model import chebyshev
 from walop_jax.model.chebyshev import Rectangle
@@ -52,7 +52,7 @@ def colour_nodes(count: int) -> Float[np.ndarray, " c"]:
     return COOLEST / (0.5 * (1.0 + chebyshev.nodes(count)))
 
 
-def colour_weights(teff: Float[np.ndarray, " p"], count: int) -> Float[np.ndarray, "p c"]:
+def colour_weights(teff: Vector, count: int) -> Float[np.ndarray, "p c"]:
     """Weights of the functions (flat spectrum, then `colour_nodes`) for sources of temperature `teff` (K).
 
     NaN is a flat photon spectrum; sources cooler than `COOLEST` are taken as that.
@@ -114,30 +114,18 @@ class AnalysisVectors:
             positions={prefix: np.mod(angle, 360.0) for prefix, angle in settings.positions.items()},
         )
 
-    def at(
-        self, setting: Settings, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
-    ) -> Float[np.ndarray, "p c k 3"]:
+    def at(self, setting: Settings, x: Vector, y: Vector) -> Float[np.ndarray, "p c k 3"]:
         """Vectors (point, colour, camera, Stokes) in one setting, for the spectra that `colour_weights` mixes."""
         return self._kept(self._vector_table, setting)(x, y).reshape(len(x), COLOURS + 1, self.cameras, 3)
 
     def coloured(
-        self,
-        setting: Settings,
-        x: Float[np.ndarray, " p"],
-        y: Float[np.ndarray, " p"],
-        teff: Float[np.ndarray, " p"] | None = None,
+        self, setting: Settings, x: Vector, y: Vector, teff: Vector | None = None
     ) -> Float[np.ndarray, "p k 3"]:
         """Vectors (point, camera, Stokes) for sources of colour temperature `teff` (K; NaN, None: flat)."""
         teff = np.full(len(x), np.nan) if teff is None else teff
         return np.einsum("pc,pcks->pks", colour_weights(teff, COLOURS), self.at(setting, x, y))
 
-    def derivatives(
-        self,
-        setting: Settings,
-        x: Float[np.ndarray, " p"],
-        y: Float[np.ndarray, " p"],
-        teff: Float[np.ndarray, " p"],
-    ) -> Local:
+    def derivatives(self, setting: Settings, x: Vector, y: Vector, teff: Vector) -> Local:
         """Derivatives of the vectors to the plain parameters that are not certain, and to the local throughputs."""
         weights = colour_weights(teff, DERIVATIVE_COLOURS)
         plain = self.plain
@@ -158,9 +146,7 @@ class AnalysisVectors:
         angles = {number: turn_of(self.instrument, effect) for number, effect in self.acting.items()}
         return {number: turn for number, turn in angles.items() if turn}
 
-    def added(
-        self, setting: Settings, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
-    ) -> dict[int, Float[np.ndarray, "p k 3"]]:
+    def added(self, setting: Settings, x: Vector, y: Vector) -> dict[int, Float[np.ndarray, "p k 3"]]:
         """Change of the vectors by each effect of `acting` that is in the beam, for a flat spectrum."""
         if setting.key not in self._acting_in:
             self._acting_in[setting.key] = {
@@ -174,28 +160,20 @@ class AnalysisVectors:
         return dict(zip(acting, np.moveaxis(values, 1, 0), strict=True))
 
     def to_parameters(
-        self,
-        plain: Float[np.ndarray, "p 2 o"],
-        throughput: Float[np.ndarray, "p 2 k"],
-        x: Float[np.ndarray, " p"],
-        y: Float[np.ndarray, " p"],
+        self, plain: Float[np.ndarray, "p 2 o"], throughput: Float[np.ndarray, "p 2 k"], x: Vector, y: Vector
     ) -> Float[np.ndarray, "p 2 n"]:
         """Derivatives to `parameters`: those to the local throughputs are spread over the series."""
         spread = through_series(throughput[:, :, None], self.basis(x, y)[:, None, None])
         return np.concatenate([plain, spread], axis=-1)
 
-    def basis(self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p t"]:
+    def basis(self, x: Vector, y: Vector) -> Float[np.ndarray, "p t"]:
         """Terms of the throughput series at field positions (deg)."""
         return self.instrument.throughput.basis(x, y)
 
     # ------------------------------------------------------------------------------------ making the tables
 
     def exact(
-        self,
-        setting: Settings,
-        x: Float[np.ndarray, " p"],
-        y: Float[np.ndarray, " p"],
-        teff: Sequence[float] = (np.nan,),
+        self, setting: Settings, x: Vector, y: Vector, teff: Sequence[float] = (np.nan,)
     ) -> Float[np.ndarray, "p c k 3"]:
         """Vectors (point, colour, camera, Stokes) without any table; `teff` NaN is a flat spectrum."""
         plan, bands = self._plan(setting, teff)
@@ -223,7 +201,7 @@ class AnalysisVectors:
         teff = [np.nan, *nodes]
         weights = colour_weights(np.array(BETWEEN), COLOURS)
 
-        def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
+        def exact(x: Vector, y: Vector) -> Float[np.ndarray, "p f"]:
             return self.exact(setting, x, y, teff).reshape(len(x), -1)
 
         def error(interpolated: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p t k 3"]) -> float:
@@ -241,7 +219,7 @@ class AnalysisVectors:
         plain = plain_positions(self.instrument).size
         columns = np.concatenate([self._uncertain, plain + np.arange(self.cameras)])
 
-        def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
+        def exact(x: Vector, y: Vector) -> Float[np.ndarray, "p f"]:
             """Derivatives in the order point, (colour, camera, Stokes, parameter)."""
             values = vector_slopes(self.instrument, plan, x, y)
             return np.moveaxis(values[:, columns][:, :, bands], 1, -1).reshape(len(x), -1)
@@ -259,12 +237,10 @@ class AnalysisVectors:
         filters = self.calibration.curves(setting)
         flat = dataclasses.replace(setting, teff=np.full(1, np.nan))
 
-        def vectors(
-            instrument: Instrument, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
-        ) -> Float[np.ndarray, "p k 3"]:
+        def vectors(instrument: Instrument, x: Vector, y: Vector) -> Float[np.ndarray, "p k 3"]:
             return sky_vectors(instrument, plan_for_settings(instrument, flat, filters), x, y)[:, 0, :, :3]
 
-        def exact(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p f"]:
+        def exact(x: Vector, y: Vector) -> Float[np.ndarray, "p f"]:
             """Change of the vectors in the order point, (effect, camera, Stokes)."""
             bare = vectors(self.instrument, x, y)
             changes = [vectors(with_effect(self.instrument, one), x, y) - bare for one in acting.values()]

@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult
 
 Matrix = Float[np.ndarray, "n n"]
+Positions = Float[np.ndarray, " p"]  # deg
 Columns = dict[str, tuple[np.ndarray, str]]  # values, description
 
 MAP_SIZE = 31  # pixels along each axis of the maps: 0.02° over ±0.3°
@@ -328,7 +329,7 @@ class Calibration(Contents, Fitted):
         return m.reshape(*shape, size), covariance.reshape(*shape, size, size)
 
     def _elements(
-        self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], settings: Settings
+        self, x: Positions, y: Positions, settings: Settings
     ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
         filters = self.curves(settings)
         if self.draws is not None:
@@ -340,12 +341,7 @@ class Calibration(Contents, Fitted):
         return values, covariance + of_structure(self.verdict.structure, values)
 
     def over_field(
-        self,
-        x: Float[np.ndarray, " p"],
-        y: Float[np.ndarray, " p"],
-        settings: Settings,
-        counts: Sequence[int],
-        tolerance: float,
+        self, x: Positions, y: Positions, settings: Settings, counts: Sequence[int], tolerance: float
     ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"], Float[np.ndarray, "p m n"]]:
         """Matrix, covariance and derivatives at many field positions (deg), interpolated (`slopes_over_field`).
 
@@ -413,11 +409,7 @@ class Calibration(Contents, Fitted):
         raise DataError(f"FILTER: the calibration has no filter {name!r}; {nearest(name, names)}")
 
     def flags(
-        self,
-        x: Float[np.ndarray, " p"],
-        y: Float[np.ndarray, " p"],
-        settings: Settings,
-        values: Float[np.ndarray, "p m"] | None = None,
+        self, x: Positions, y: Positions, settings: Settings, values: Float[np.ndarray, "p m"] | None = None
     ) -> Int[np.ndarray, " p"]:
         """Bits of `Quality` at field positions: beyond the field or the settings; for matrices, high cross-talk.
 
@@ -508,11 +500,7 @@ class Calibration(Contents, Fitted):
         }
 
     def matrix_columns(
-        self,
-        x: Float[np.ndarray, " p"],
-        y: Float[np.ndarray, " p"],
-        settings: Settings,
-        outside: Bool[np.ndarray, " p"],
+        self, x: Positions, y: Positions, settings: Settings, outside: Bool[np.ndarray, " p"]
     ) -> Columns:
         """The matrix elements, their standard errors and FLAG, each with its description; NaN and 32 where `outside`.
 

@@ -21,13 +21,7 @@ from walop_jax.commands.command import (
 from walop_jax.commands.each import EACH, SCHEDULER, WORKERS, for_each
 from walop_jax.commands.gather import gather
 from walop_jax.commands.inputs import TableFile
-from walop_jax.commands.products import (
-    Effects,
-    Posterior,
-    Product,
-    calibration_of,
-    catalogue_of,
-)
+from walop_jax.commands.products import Effects, Posterior, Product, calibration_of, catalogue_of
 from walop_jax.commands.tables import table_of, table_outcome
 from walop_jax.io.errors import errors_naming
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,10 +11,7 @@ from walop_jax.commands.products import IN_MEMORY, Effects, Product, catalogue_o
 from walop_jax.io.errors import DataError, errors_naming
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Run
-    from walop_jax.model.effects import EffectKind
     from walop_jax.science.commissioning import Certificate
-    from walop_jax.science.field_accuracy import Requirement
 
 DOCUMENT = "commissioning.json"
 FOLDER = Option(f"Folder for {DOCUMENT}; it may be that of the fit.", "RUN", Path, "-o")
@@ -45,51 +41,40 @@ def certify(
 
     >>> [check.name for check in walop.certify("RUN").failed]  # doctest: +SKIP
     """
-    from walop_jax import Calibration, FitResult
+    from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.certify import certify as checks_of
     from walop_jax.calibration.certify import validity
-    from walop_jax.calibration.product import product_path, read_product
-    from walop_jax.science.commissioning import Certificate
+    from walop_jax.calibration.product import product_path, read_calibration, read_product
+    from walop_jax.science.commissioning import Certificate, requirements
+    from walop_jax.science.field_accuracy import field_accuracy
 
     job.tell("checking")
     source: Any = fit_of(calibration)
-    if isinstance(source, Calibration | FitResult):
-        held = Calibration.from_fit(source) if isinstance(source, FitResult) else source
-        path, product, catalogue = (Path(IN_MEMORY), held.product, held.model.catalogue)
+    held: Any = Calibration.from_fit(source) if isinstance(source, FitResult) else source
+    if in_memory := isinstance(held, Calibration):
+        path, product, catalogue = Path(IN_MEMORY), held.product, held.model.catalogue
     else:
-        path = product_path(folder_of(source))
+        path = product_path(folder_of(held))
         product, catalogue = read_product(path), catalogue_of(effects)
     with errors_naming(path):
         checks = tuple(checks_of(product, catalogue))
-    rebuilt = any(check.name == "model" and check.passed for check in checks)
-    needs = _requirements(job, source, path, catalogue) if rebuilt else ()
+    needs, calset = (), None
+    if any(check.name == "model" and check.passed for check in checks):
+        job.tell("working out the accuracy of p")
+        if isinstance(source, FitResult):
+            accuracy = field_accuracy(held) if source.answer is None else source.answer()
+            needs = requirements(source.checked_verdict(), source.minimum.message, accuracy, source.calset)
+        else:
+            held = held if in_memory else read_calibration(path, catalogue)
+            with contextlib.suppress(DataError):  # its exposures are looked at where they can be found
+                calset = None if in_memory else Run(path.parent).calset
+            needs = requirements(held.verdict, "", field_accuracy(held), calset)
     parents = tuple(entry.sha256 for entry in product.inputs)
     certificate = Certificate(path, checks, needs, validity(product), product.content_hash(), parents)
-    why = "; ".join(f"{check.name} ({check.found})" for check in certificate.failed)
+    failed = ", ".join(check.name for check in certificate.failed)
     return Outcome(
         certificate,
         saved_as=DOCUMENT,
-        failure=f"{path}: not valid: {why}" if certificate.failed else "",
+        failure=failed and f"{path}: not valid: {failed}",
         trusted=certificate.go,
     )
-
-
-def _requirements(
-    job: Job, given: Calibration | FitResult | Run | PathLike, path: Path, catalogue: Sequence[EffectKind]
-) -> tuple[Requirement, ...]:
-    """Requirements on a valid product; its exposures are looked at where the data of the run can be found."""
-    from walop_jax import Calibration, FitResult, Run
-    from walop_jax.calibration.product import read_calibration
-    from walop_jax.science.commissioning import requirements
-    from walop_jax.science.field_accuracy import field_accuracy
-
-    job.tell("working out the accuracy of p")
-    if isinstance(given, FitResult):
-        accuracy = field_accuracy(Calibration.from_fit(given)) if given.answer is None else given.answer()
-        return requirements(given.checked_verdict(), given.minimum.message, accuracy, given.calset)
-    if isinstance(given, Calibration):
-        return requirements(given.verdict, "", field_accuracy(given), None)
-    calibration, calset = read_calibration(path, catalogue), None
-    with contextlib.suppress(DataError):
-        calset = Run(path.parent).calset
-    return requirements(calibration.verdict, "", field_accuracy(calibration), calset)

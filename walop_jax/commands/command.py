@@ -182,11 +182,6 @@ class Outcome(Generic[T]):
             return self.text
         return "\n".join(filter(None, (self.shown.text(), self.below)))
 
-    def saved_document(self) -> dict[str, Any]:
-        """The document with the display, if there is one."""
-        displayed = self.display is not None or hasattr(self.value, "display")
-        return {**self.content, **({"shown": self.shown.document()} if displayed else {})}
-
     def save(self, folder: OutputFolder, drop: Sequence[str] = ()) -> Outcome[T]:
         """Put all files into the output folder, together; gives the outcome, a failure where one was not written."""
         from walop_jax.io.folder import NotWrittenError
@@ -200,7 +195,9 @@ class Outcome(Generic[T]):
                     if write is not None:
                         write(temporary / name)
                 if self.saved_as:
-                    text_file(json_text(self.saved_document()))(temporary / self.saved_as)
+                    displayed = self.display is not None or hasattr(self.value, "display")
+                    content = {**self.content, **({"shown": self.shown.document()} if displayed else {})}
+                    text_file(json_text(content))(temporary / self.saved_as)
         except NotWrittenError as error:
             return dataclasses.replace(self, failure=self.failure or str(error))
         return self

@@ -14,8 +14,6 @@ from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
     from walop_jax.diagnosis.findings import Diagnosis
-    from walop_jax.fit.refit import FitResult
-    from walop_jax.io.display import Display
 
 OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA, MODEL)
 MINUTES = Option(
@@ -84,7 +82,10 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
     from walop_jax.science.field_accuracy import answered
 
     product, after = found.calibration(), answered(found.after)
-    usable = after.trusted and found.verdict != "unexplained"
+    complete = found.verdict != "unexplained"
+    usable, shown = after.trusted and complete, found.display()
+    if after.answer is not None and after.converged and (accuracy := after.answer()) is not None:
+        shown = dataclasses.replace(shown, facts=(*shown.facts, *accuracy.facts(complete=complete)))
 
     def write_summary(path: Path) -> None:
         job.tell("mapping the field", "mapping")
@@ -95,7 +96,7 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
     return Outcome(
         found,
         document(found),
-        display=_with_answer(found, after),
+        display=shown,
         below=f"The calibration can{'' if usable else 'not'} be trusted; written to {output}.",
         files={
             SUMMARY: write_summary,
@@ -130,13 +131,3 @@ def write(found: Diagnosis, folder: PathLike, *, overwrite: bool = False) -> Non
 
     with output_folder(folder, OUTPUTS, overwrite=overwrite) as out:
         outcome_of(Job(), found, folder).save(out)
-
-
-def _with_answer(found: Diagnosis, after: FitResult) -> Display:
-    """The findings, and how well stars are known with the extended model."""
-    shown, accuracy = (
-        found.display(),
-        after.answer() if after.answer is not None and after.converged else None,
-    )
-    answer = () if accuracy is None else accuracy.facts(complete=found.verdict != "unexplained")
-    return dataclasses.replace(shown, facts=(*shown.facts, *answer))

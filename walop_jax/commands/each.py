@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command_of
 from walop_jax.io.errors import DataError
@@ -18,15 +18,6 @@ from walop_jax.io.errors import DataError
 EACH = Option("Each CATALOGUE by itself: OUT is a folder of tables with their names.")
 WORKERS = Option("With --each: in so many processes of this machine, by Dask.", "N", int, least=1)
 SCHEDULER = Option("With --each: on the workers of a Dask cluster that share the files.", "ADDRESS", str)
-
-
-class Ended(NamedTuple):
-    """The end of one of the commands: its document, warnings, text, and why there is no output."""
-
-    document: Any = None
-    text: str = ""
-    warnings: Sequence[str] = ()
-    error: str = ""
 
 
 def for_each(
@@ -59,17 +50,17 @@ def for_each(
         for file, place in zip(files, places, strict=True)
         if job.overwrite or not place.exists()
     ]
-    ended = []
+    ended, warnings = [], []
     with executor_of(workers, scheduler) as executor:
-        tasks = [(command.__name__, job.overwrite, end) for end in calls]
-        for number, end in enumerate(mapped(_run, tasks, executor), start=1):
+        tasks = [(command.__name__, job.overwrite, call) for call in calls]
+        for number, outcome in enumerate(mapped(_run, tasks, executor), start=1):
             job.tell(f"{number} of {len(calls)} catalogues")
-            ended.append(end)
-    failed = [end.error for end in ended if end.error]
-    existing = len(files) - len(calls)
-    remark = (
-        f"{existing} of {len(files)} tables were there already, and are left; --overwrite makes them again"
-    )
+            ended.append(outcome)
+            warnings += outcome.warnings
+    failed = [outcome.failure for outcome in ended if outcome.failure]
+    if existing := len(files) - len(calls):
+        there = f"{existing} of {len(files)} tables were there already"
+        warnings.append(f"{there}, and are left; --overwrite makes them again")
     return Outcome(
         places,
         {
@@ -77,18 +68,16 @@ def for_each(
             "made": len(ended) - len(failed),
             "left": existing,
             "failed": failed,
-            "catalogues": [end.document for end in ended if not end.error],
+            "catalogues": [outcome.content for outcome in ended if not outcome.failure],
         },
-        "\n".join(end.text for end in ended if end.text) or f"{output}: nothing was left to do",
-        warnings=list(
-            dict.fromkeys([*(w for end in ended for w in end.warnings), *([remark] if existing else [])])
-        ),
+        "\n".join(outcome.text for outcome in ended if outcome.text) or f"{output}: nothing was left to do",
+        warnings=list(dict.fromkeys(warnings)),
         failure="; ".join(failed),
     )
 
 
-def _run(task: tuple[str, bool, dict[str, Any]]) -> Ended:
-    """A command of this package by its name, in any process."""
+def _run(task: tuple[str, bool, dict[str, Any]]) -> Outcome[None]:
+    """The outcome of a command of this package by its name, in any process; without the value."""
     import walop_jax
     from walop_jax.model.compiled import float64
 
@@ -98,5 +87,7 @@ def _run(task: tuple[str, bool, dict[str, Any]]) -> Ended:
         with float64():
             outcome = command.run(Job(overwrite=overwrite), dict(arguments))
     except (DataError, UsageError) as error:
-        return Ended(error=str(error))
-    return Ended(outcome.content, outcome.printed(), tuple(outcome.warnings), outcome.failure)
+        return Outcome(None, {}, "", failure=str(error))
+    return Outcome(
+        None, outcome.content, outcome.printed(), warnings=outcome.warnings, failure=outcome.failure
+    )

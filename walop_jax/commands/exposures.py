@@ -44,10 +44,12 @@ def exposures(
         raise UsageError("give the file that assigns words to columns", "words")
     paths = several(files)
     rules = read_words(words)
-    if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json" and is_schedule(json_content(paths[0])):
-        columns, remarks = read_schedule(paths[0], rules.filters)
+    single = len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json"
+    content = json_content(paths[0]) if single else None
+    if is_schedule(content):
+        columns, remarks = read_schedule(paths[0], rules.filters, content)
     else:
-        columns, remarks = exposures_table(paths, rules)
+        columns, remarks = exposures_table(paths, rules, content)
     units = {name: "deg" for name in columns if name.endswith(("_ANGLE", "_TURN"))}
     units |= {name: rule.unit for name, rule in EXPOSURES.items()}
     table = astropy_table({name: (values, units.get(name, ""), "") for name, values in columns.items()})

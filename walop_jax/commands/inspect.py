@@ -42,12 +42,8 @@ class InspectedSets(Displayed):
         }
 
     def display(self) -> Display:
-        """The first of the inspections; `displays` are all."""
-        return self.displays()[0] if self.inspections else Display("nothing that can be read")
-
-    def displays(self) -> list[Display]:
-        """Every inspection."""
-        return [inspection.display() for inspection in self.inspections]
+        """The first of the inspections."""
+        return self.inspections[0].display() if self.inspections else Display("nothing that can be read")
 
 
 @command(jax=False)
@@ -87,16 +83,12 @@ def inspect(
             continue
         faults += [f"{path}: {entry}" for entry in inspection.findings if entry.severity == "fault"]
         sets.append((str(path), inspection))
-    strange = [
-        inspection
-        for _, inspection in sets
-        if not isinstance(inspection, DataError) and inspection.instrument not in shipped()
-    ]
     joint = inspection_of(read_calibration_set(*paths)) if len(paths) > 1 and not faults else None
     inspected = InspectedSets(tuple(sets), joint, tuple(faults))
+    strange = any(inspection.instrument not in shipped() for inspection in inspected.inspections)
     return Outcome(
         inspected,
-        text="\n".join(inspection.text() for inspection in inspected.displays()),
+        text="\n".join(inspection.display().text() for inspection in inspected.inspections),
         failure="; ".join(faults),
         next=("walop-jax refit CALSET --instrument FILE.toml -o RUN",) if strange else (),
     )

@@ -77,9 +77,8 @@ def limits(
         raise ValueError(f"the fit did not converge ({result.minimum.message})")
     effect_kinds = None if effects is None else catalogue_of(effects)
     limits_of_data = detection_limits(result, catalogue=effect_kinds, seed=job.seed, progress=job.progress)
-    suggested = output is not None and (
-        f"walop-jax report {output}",
-        *_plan(data, output, instrument, result),
+    suggested = (
+        () if output is None else (f"walop-jax report {output}", *_plan(data, output, instrument, result))
     )
     return Outcome(
         limits_of_data,
@@ -96,7 +95,7 @@ def limits(
             OUTPUTS[2]: figure_file(separation_figure, limits_of_data),
         },
         saved_as=OUTPUTS[0],
-        next=suggested or (),
+        next=suggested,
         warnings=tuple(f"the fit: {text}" for text in result.warnings),
     )
 

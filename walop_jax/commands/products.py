@@ -98,16 +98,11 @@ def calibration_of(given: Product, effects: Effects = None) -> Calibration:
     from walop_jax.calibration.product import read_calibration
 
     source: Any = fit_of(given)
-    if not _is_in_memory(source):
+    if hasattr(source, "folder") or not isinstance(fit_of(given), Fitted):  # also the product of a Run
         return read_calibration(folder_of(source), catalogue_of(effects))
     calibration = source if isinstance(source, Calibration) else Calibration.from_fit(source)
     in_memory = calibration.path is None
     return dataclasses.replace(calibration, path=Path(IN_MEMORY)) if in_memory else calibration
-
-
-def _is_in_memory(source: Any) -> bool:
-    """True for a fit or a calibration; the product of a `Run` is read from its folder."""
-    return isinstance(source, Fitted) and not hasattr(source, "folder")
 
 
 def folder_of(run: Run | PathLike) -> Path:

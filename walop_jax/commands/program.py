@@ -261,7 +261,7 @@ def _show(found: Outcome[Any], quiet: bool, json: bool) -> None:
     elif text:
         _print(text, found.markdown)
     for sentence in found.warnings:
-        warn(sentence)
+        complain(sentence, "warning")
     if text and found.next and not found.failure:
         # On stderr: stdout may be redirected into a file.
         typer.echo(f"Done in {seconds_since_start():.0f} s. Next: {' or '.join(found.next)}", err=True)
@@ -299,14 +299,9 @@ def _print(text: str, markdown: bool) -> None:
 # ----------------------------------------------------------------------------------------------------- the terminal
 
 
-def complain(message: str) -> None:
-    """Print an error as one line on stderr."""
-    typer.echo(f"walop-jax: error: {' '.join(message.split())}", err=True)
-
-
-def warn(message: str) -> None:
-    """Print a warning as one line on stderr."""
-    typer.echo(f"walop-jax: warning: {' '.join(message.split())}", err=True)
+def complain(message: str, kind: str = "error") -> None:
+    """Print an error, or a warning, as one line on stderr."""
+    typer.echo(f"walop-jax: {kind}: {' '.join(message.split())}", err=True)
 
 
 @contextlib.contextmanager

@@ -45,21 +45,12 @@ def quality(
 
     >>> walop.quality("RUN")["CHI2DOF", "OUTSIDE"]  # doctest: +SKIP
     """
-    from walop_jax import Run
     from walop_jax.io.atomic import check_output
     from walop_jax.io.plain_tables import table_format
     from walop_jax.io.run_folder import RunFolder
     from walop_jax.reports.posterior_figures import save_figure
     from walop_jax.reports.survey_figures import quality_figure
-    from walop_jax.science.quality import (
-        OUTSIDE,
-        append,
-        joined,
-        judge,
-        quality_row,
-        read_limits,
-        table_of_nights,
-    )
+    from walop_jax.science.quality import OUTSIDE, append, quality_row, read_limits, table_of_nights
 
     allowed = read_limits(limits)
     if output is not None:
@@ -71,25 +62,18 @@ def quality(
     rows, remarks = [], []
     for number, run in enumerate(sources, start=1):
         job.tell(f"run {number} of {len(sources)}", "reading")
-        held = calibration_of(run, effects)
-        folder = (
-            run.folder if isinstance(run, Run) else Path(run) if isinstance(run, str | os.PathLike) else None
-        )
+        held, folder = calibration_of(run, effects), getattr(run, "folder", run)
+        folder = Path(folder) if isinstance(folder, str | os.PathLike) else None
         documents = RunFolder(folder).documents if folder is not None and folder.is_dir() else {}
-        rows.append(
-            quality_row(held, str(folder or held.path), documents.get("summary", {}).get("accuracy_of_p"))
-        )
+        accuracy = documents.get("summary", {}).get("accuracy_of_p")
+        rows.append(quality_row(held, str(folder or held.path), accuracy))
         if rows[-1]["NIGHTS"] > 1:
             remarks.append(
                 f"{rows[-1]['RUN']}: holds {rows[-1]['NIGHTS']} nights, its row is that of the last"
             )
     job.begin("writing")
     new = table_of_nights(rows)
-    if output is None:
-        table, table_remarks = joined(new[:0], new)
-        table = judge(table, allowed)
-    else:
-        table, table_remarks = append(output, new, allowed)
+    table, table_remarks = append(output, new, allowed)
     if figure is not None:
         save_figure(figure, quality_figure(table, allowed), overwrite=True)
     hashes = {row["CALHASH"] for row in rows}

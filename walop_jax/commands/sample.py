@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command, text_file
+from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command
 from walop_jax.commands.inputs import DataOf, ModelLike
 from walop_jax.commands.products import Diagnosed, Effects, catalogue_of, fit_of, folder_of
 from walop_jax.io.errors import fail
-from walop_jax.io.text import read_text
+from walop_jax.io.text import json_text, read_text
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Options, Run
+    from walop_jax import FitResult, Options, Run
     from walop_jax.posterior.result import PosteriorSample, Progress
 
 RUN = Argument("Folder of a `walop-jax refit`.", "RUN", Path)
@@ -106,12 +106,16 @@ def _sampled_run(
 ) -> PosteriorSample:
     """The posterior around the fit in a folder, written there, with the covariance in its product if it can be."""
     from walop_jax import Model
-    from walop_jax.calibration.product import read_calibration
+    from walop_jax.calibration.product import read_calibration, write_calibration
     from walop_jax.io.folder import output_folder
     from walop_jax.io.names import PRODUCT
+    from walop_jax.io.plain_tables import write_table
     from walop_jax.posterior.draws import digest_of_fit
-    from walop_jax.posterior.files import Chain
+    from walop_jax.posterior.files import Chain, write_posterior
     from walop_jax.posterior.sampling import sample as sample_fit
+    from walop_jax.reports.named import draw
+    from walop_jax.reports.posterior_figures import save_figure
+    from walop_jax.reports.run import FigureSource
 
     folder = run.folder
     if not folder.is_dir():
@@ -132,34 +136,16 @@ def _sampled_run(
         posterior = sample_fit(result, options, folder=folder / CHAINS, resume=resume, report=tell)
         fitted = digest_of_fit(product.inputs, product.model.names, product.values)
         posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)
+        document = posterior.document() | {"shown": posterior.display().document()}
+        intervals, figures = posterior.to_table(), FigureSource.of(posterior)
         with out.filled(((PRODUCT,) if posterior.trusted else ()) + OUTPUTS) as temporary:
-            for name, write in _writers(product, posterior).items():
-                write(temporary / name)
+            write_posterior(temporary / "posterior.nc", posterior)
+            for end in (".fits", ".ecsv"):
+                write_table(temporary / f"posterior{end}", intervals)
+            for name in ("corner", "trace"):
+                save_figure(temporary / f"posterior_{name}.png", draw(name, figures))
+            (temporary / "sample.json").write_text(json_text(document), encoding="utf-8")
+            if posterior.trusted:
+                better = product.with_covariance(posterior.covariance, posterior.errors_from)
+                write_calibration(temporary / PRODUCT, better)
     return posterior
-
-
-def _writers(product: Calibration, posterior: PosteriorSample) -> dict[str, Callable[[Path], object]]:
-    """The files of a sampled run."""
-    from walop_jax.calibration.product import write_calibration
-    from walop_jax.io.names import PRODUCT
-    from walop_jax.io.plain_tables import write_table
-    from walop_jax.io.text import json_text
-    from walop_jax.posterior.files import write_posterior
-    from walop_jax.reports.named import draw
-    from walop_jax.reports.posterior_figures import save_figure
-    from walop_jax.reports.run import FigureSource
-
-    intervals = posterior.to_table()
-    figures = FigureSource.of(posterior)
-    writers: dict[str, Callable[[Path], object]] = {
-        "posterior.nc": lambda path: write_posterior(path, posterior),
-        "posterior.fits": lambda path: write_table(path, intervals),
-        "posterior.ecsv": lambda path: write_table(path, intervals),
-        "posterior_corner.png": lambda path: save_figure(path, draw("corner", figures)),
-        "posterior_trace.png": lambda path: save_figure(path, draw("trace", figures)),
-        "sample.json": text_file(json_text(posterior.document() | {"shown": posterior.display().document()})),
-    }
-    if posterior.trusted:
-        better = product.with_covariance(posterior.covariance, posterior.errors_from)
-        writers[PRODUCT] = lambda path: write_calibration(path, better)
-    return writers

@@ -136,10 +136,11 @@ def simulate(
         which = f"seed {job.seed}" if like is None or isinstance(like, tuple) else str(like)
         text = f"{output}: {plan.name}, {stars} stars of the instrument of {which}"
         suggested, times = (f"walop-jax apply RUN {output} -o OUT.fits",), data["MJD"]
+        beside = Path(str(output))
+        end = ".fits.gz" if beside.name.lower().endswith(".fits.gz") else beside.suffix
         for number, name in enumerate(plan.design.cameras.names if cameras else ()):
-            of_cameras[_of_camera(Path(str(output)), name)] = astropy_table(
-                *field.of_camera(number, job.seed)
-            )
+            file_of_camera = beside.with_name(f"{beside.name[: len(beside.name) - len(end)]}_{name}{end}")
+            of_cameras[file_of_camera] = astropy_table(*field.of_camera(number, job.seed))
         if of_cameras:
             files = [str(path) for path in of_cameras]
             about["cameras"], text = files, f"{text}; of the cameras: {', '.join(files)}"
@@ -178,12 +179,6 @@ def simulate(
         warnings=left_out_sentences(lost, like if isinstance(like, str | os.PathLike) else None),
         next=suggested,
     )
-
-
-def _of_camera(path: Path, camera: str) -> Path:
-    """The file of a camera beside a table."""
-    end = ".fits.gz" if path.name.lower().endswith(".fits.gz") else path.suffix
-    return path.with_name(f"{path.name[: -len(end)]}_{camera}{end}")
 
 
 def _template(like: Any, catalogue: Sequence[EffectKind]) -> Template:

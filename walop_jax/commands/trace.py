@@ -85,13 +85,13 @@ def trace(
         {
             "stages": [
                 {
-                    "stage": stage.name,
-                    "about": stage.about,
-                    "rows": stage.rows,
-                    "columns": stage.columns,
-                    "value": stage.value.tolist(),
+                    "stage": s.name,
+                    "about": s.about,
+                    "rows": s.rows,
+                    "columns": s.columns,
+                    "value": s.value.tolist(),
                 }
-                for stage in stages
+                for s in stages
             ],
             NOT_CARRIED_OVER: list(lost),
         },

@@ -23,6 +23,7 @@ from astropy.wcs import WCS
 from jaxtyping import Float, Int
 
 from walop_jax.data.header_words import Words, of_header
+from walop_jax.data.records import DataFlag
 from walop_jax.data.schema import Column
 from walop_jax.data.table_files import read_table_file
 from walop_jax.data.units import Place, convert_unit, degrees_of, unit_of
@@ -41,9 +42,7 @@ from walop_jax.io.text import parse_toml, read_text, some
 from walop_jax.io.toml import Reader
 
 SHIPPED = ("sextractor", "photutils")
-BITS = (1, 2, 4, 8, 16)
-"""Bits of FLAG that a catalogue may set."""
-BAD_PIXEL = 2
+BAD_PIXEL = int(DataFlag.BAD_PIXEL)
 POINTING = ("RA", "DEC", "ROTATOR")
 OF_EXPOSURES = ("FILTER", "MJD", "TEMP", "HA", "CHWP_ANGLE", "CHWP_IN", "CHWP_TURN")
 """Columns, or words of a header, about the exposure: they go with its stars."""
@@ -122,8 +121,8 @@ def read_map(source: str | os.PathLike[str]) -> ColumnMap:
         for bit, meaning in values.get("bits", {}).items():
             if not bit.isdigit() or int(bit).bit_count() != 1:
                 raise reader.fault("bits", f"{bit!r} is no single bit: 1, 2, 4, 8, …")
-            if meaning not in (0, *BITS):
-                listed = ", ".join(map(str, BITS))
+            if meaning not in (0, *DataFlag):
+                listed = ", ".join(str(int(flag)) for flag in DataFlag)
                 raise reader.fault("bits", f"{bit} = {meaning}: give a bit of FLAG ({listed}), or 0")
         for pair in values.get("sky", ()):
             if len(pair) > 2:
@@ -334,11 +333,14 @@ def _positions(
 def _flags(source: InputTable, column_map: ColumnMap, place: Place) -> Int[np.ndarray, " n"]:
     """Bits of FLAG."""
     name = next((name.upper() for name in column_map.flag if name.upper() in source.names), None)
-    flag, rule = np.zeros(source.rows, np.int64), Column("int", missing=0)
+    flag, rule = np.zeros(source.rows, np.int64), Column("int", missing=0, true=BAD_PIXEL)
     if name is None:
         source.remarks.append("no flags of the stars: blends and saturated ones are not known")
         return flag
-    values = undefined = numeric_column(source, name, rule).astype(np.int64)
+    values = undefined = numeric_column(source, name, rule)
+    if source.column(name).dtype.kind == "b":
+        source.remarks.append(f"{name} holds truth values: true is taken as a bad pixel")
+        return values
     for bit, meaning in column_map.bits.items():
         flag |= np.where(values & int(bit) > 0, meaning, 0)
         undefined = undefined & ~int(bit)

@@ -107,21 +107,29 @@ def words_of(content: Mapping[str, Any]) -> Words:
 
 
 def exposures_table(
-    paths: Sequence[str | os.PathLike[str]], words: Words
+    paths: Sequence[str | os.PathLike[str]], words: Words, content: Any = None
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Columns of EXPOSURES, one row for each exposure in the files, their names in FILE; and remarks.
 
-    Raises `DataError`, with file, word and column, for words that are missing, have another unit, or a value that
-    cannot be meant.
+    `content` is that of the only file, JSON, where it has been read. KIND `clp` is taken through the polariser where no
+    word states CLP_IN. Raises `DataError`, with file, word and column, for words that are missing, have another unit,
+    or a value that cannot be meant.
     """
-    records = [(str(path), record) for path in map(Path, paths) for record in _records(path, words)]
+    records = [(str(path), record) for path in map(Path, paths) for record in _records(path, words, content)]
     if not records:
         raise fail("no exposures in these files", advice="name FITS files, a JSON file or a table")
     rows = [_row(record, words.columns, file) for file, record in records]
-    table = columns_of(rows, ", ".join(dict.fromkeys(file for file, _ in records)))
     there = set().union(*rows, ("EXPOSURE",))
+    through = [row for row in rows if "CLP_IN" not in row and str(row.get("KIND")).lower() == "clp"]
+    for row in through:
+        row["CLP_IN"] = True
+    table = columns_of(rows, ", ".join(dict.fromkeys(file for file, _ in records)))
     absent = [name for name in EXPOSURES if name not in there and not _MOVES.fullmatch(name)]
     remarks = [f"no word for {', '.join(absent)}: taken as not known"] if absent else []
+    if through:
+        remarks.append(f"CLP_IN is not stated in {len(through)} exposures of KIND clp: taken as true")
+    if unknown := int(np.sum(table["CLP_IN"] & np.isnan(table.get("CLP_ANGLE", np.array(np.nan))))):
+        remarks.append(f"CLP_ANGLE is not known in {unknown} exposures through the polariser: a fit needs it")
     if early := overlapping(table["MJD"], table["EXPTIME"]):
         what = "begin before the one ahead of them has ended: is a record there twice, or a file for each camera?"
         remarks.append(f"{early} exposures {what} MJD is the middle, in UTC")
@@ -173,11 +181,11 @@ def _plain(header: Mapping[str, Any]) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------------ files and records
 
 
-def _records(path: Path, words: Words) -> Iterator[Mapping[str, Any]]:
+def _records(path: Path, words: Words, content: Any) -> Iterator[Mapping[str, Any]]:
     """The words of every exposure in a file: one of a FITS file, one for each record or row of others."""
     suffix = path.suffix.lower()
     if suffix in (".json", ".jsonl"):
-        yield from _of_json(path, words.rows)
+        yield from _of_json(path, words.rows, json_content(path) if content is None else content)
     elif suffix in (".fits", ".fit", ".fts", ".gz", ".fz"):
         from astropy.io import fits
 
@@ -205,8 +213,7 @@ def json_content(path: str | os.PathLike[str]) -> Any:
             raise fail(f"is no JSON: {error}", file=path, advice="export or write it again") from None
 
 
-def _of_json(path: Path, rows: str) -> Iterator[Mapping[str, Any]]:
-    content = json_content(path)
+def _of_json(path: Path, rows: str, content: Any) -> Iterator[Mapping[str, Any]]:
     for key in filter(None, rows.split(".")):
         if not isinstance(content, Mapping) or key not in content:
             advice = nearest(key, content) if content and isinstance(content, Mapping) else ""

@@ -90,8 +90,7 @@ def schedule_of(
                 place = {"ra": sexagesimal(ra, "hourangle"), "dec": sexagesimal(dec, "deg")}
                 objects.setdefault(target, {"name": target, **place})
         targets.append({"target": target, "type": kind, "acquisition": acquisitions})
-    mjd = exposures.mjd[np.isfinite(exposures.mjd)]
-    evening = _local(float(mjd.min()) if mjd.size else 51544.0, site) - datetime.timedelta(hours=12)
+    evening = _local(float(np.nanmin(exposures.mjd)), site) - datetime.timedelta(hours=12)
     schedule = {
         "name": facts.get("name", "calibration"),
         "date": evening.date().isoformat(),
@@ -105,15 +104,15 @@ def schedule_of(
 
 
 def read_schedule(
-    path: str | os.PathLike[str], filters: Mapping[str, int]
+    path: str | os.PathLike[str], filters: Mapping[str, int], content: Any = None
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Columns of EXPOSURES of a schedule, the names of their targets in TARGET, and remarks.
 
-    An acquisition that was executed may hold `executed`, the UTC at which each exposure began. Without it times are not
-    known. Raises `DataError`, with target and acquisition, for missing entries and for states that an exposure cannot
-    have.
+    `content` is that of the file, where it has been read. An acquisition that was executed may hold `executed`, the UTC
+    at which each exposure began. Without it times are not known. Raises `DataError`, with target and acquisition, for
+    missing entries and for states that an exposure cannot have.
     """
-    content = json_content(path)
+    content = json_content(path) if content is None else content
     if not is_schedule(content):
         raise fail("is no schedule: it has no objects and targets", file=path, advice="give one of format v4")
     where = {str(entry.get("name")): entry for entry in _tables(content["objects"], path, "objects")}
@@ -155,6 +154,8 @@ def _check(exposures: Exposures, filters: Mapping[str, int]) -> None:
         raise fail(what, column=column, advice="take these by hand")
     if not np.isfinite(exposures.exptime).all():
         raise fail("is not known", column="EXPTIME", advice="a schedule needs the time of every exposure")
+    if not np.isfinite(exposures.mjd).any():
+        raise fail("no exposure has a time", column="MJD", advice="a schedule needs the date of its night")
 
 
 def _acquired(one: Exposures, filters: Mapping[str, int]) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from astropy import units
 from jaxtyping import Bool, Float
 
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER, PREFIX
+from walop_jax.data.records import DataFlag
 from walop_jax.data.units import Place, check_partners, convert_unit, unit_of
 from walop_jax.io.errors import nearest, rows_text
 
@@ -58,7 +59,8 @@ class Column:
 
     `missing` None means that the column is required; `width` is the number of values in a row, or None for
     as many as the file has. `shape_advice` describes the row that is expected, `remarked` whether it is worth a remark
-    that the column is not there, `rules` what holds for its values in any table.
+    that the column is not there, `rules` what holds for its values in any table. `true` is the whole number that a
+    truth value stands for.
     """
 
     kind: Kind
@@ -68,6 +70,7 @@ class Column:
     shape_advice: str = "one value in a row: split it"
     remarked: bool = True
     rules: tuple[Rule, ...] = ()
+    true: int = 1
 
 
 _NAN = float("nan")
@@ -127,7 +130,7 @@ INTENSITIES: Mapping[str, Column] = {
     "SOURCE": Column("int", missing=-1),
     "N": _COUNTS,
     "N_ERR": _COUNTS,
-    "FLAG": Column("int", missing=0),
+    "FLAG": Column("int", missing=0, true=int(DataFlag.BAD_PIXEL)),
 }
 SKY = dataclasses.replace(_COUNTS, missing=np.nan)
 _SHARE = within(1.0, "fractions are wanted: are these per cent?", "exceeds 1")
@@ -258,7 +261,11 @@ def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[d
         if name in names:
             index = names.index(name)
             unit = units_of[name] = (hdu.columns[index].unit or "").strip()
-            table[name] = values_of(_stored(hdu, index, name, place), name, column, place, unit=unit)
+            stored = _stored(hdu, index, name, place)
+            table[name] = values_of(stored, name, column, place, unit=unit)
+            if column.true != 1 and stored.dtype.kind == "b":
+                what = f"holds truth values: true is taken as {column.true}, {DataFlag(column.true).meaning}"
+                remarks.append(place.remark(what, name))
             if unit and column.kind == "float" and units.Unit(unit) != units.Unit(column.unit):
                 remarks.append(
                     place.remark(f"is in {unit}, converted to {column.unit or 'a fraction'}", name)
@@ -367,6 +374,8 @@ def values_of(
     if values.dtype.kind not in ("fiu" if rule.kind == "float" else "fiub"):
         advice = "write it as a numeric column" if rule.kind == "float" else "write integers"
         raise place.fail(f"holds {values.dtype.name} values", name, advice)
+    if rule.kind == "int" and values.dtype.kind == "b":
+        values = values * np.int64(rule.true)
     if rule.kind == "float":
         numbers = values.astype(np.float64)
         numbers[empty] = np.nan

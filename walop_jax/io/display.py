@@ -6,6 +6,7 @@ import abc
 import dataclasses
 import html
 import importlib
+import itertools
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -81,26 +82,12 @@ class Display:
     def _elements(self) -> Iterator[str]:
         yield f"<div><p><strong>{html.escape(self.title)}</strong></p>"
         if self.facts:
-            rows = (
-                f"<tr><th {_LEFT}>{html.escape(name)}</th><td {_LEFT}>{html.escape(signed(value))}</td></tr>"
-                for name, value in self.facts
-            )
+            rows = (f"<tr>{_cell('th', name)}{_cell('td', signed(value))}</tr>" for name, value in self.facts)
             yield f"<table>{''.join(rows)}</table>"
         if self.rows:
-            sides = [_RIGHT if name.startswith(">") else _LEFT for name in self.head]
-            head = "".join(
-                f"<th {side}>{html.escape(name.removeprefix('>'))}</th>"
-                for name, side in zip(self.head, sides, strict=True)
-            )
-            body = "".join(
-                "<tr>"
-                + "".join(
-                    f"<td {side}>{html.escape(signed(cell))}</td>"
-                    for cell, side in zip(row, sides, strict=True)
-                )
-                + "</tr>"
-                for row in self.rows
-            )
+            head = "".join(_cell("th", name.removeprefix(">"), name) for name in self.head)
+            cells = (map(_cell, itertools.repeat("td"), map(signed, row), self.head) for row in self.rows)
+            body = "".join(f"<tr>{''.join(row)}</tr>" for row in cells)
             yield f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
         yield from (f"<p>{html.escape(note)}</p>" for note in self.notes)
         yield "</div>"
@@ -111,7 +98,9 @@ def signed(text: str) -> str:
     return re.sub(r"(?<![^\s(])-(?=\.?\d)", "−", text)
 
 
-_LEFT, _RIGHT = 'style="text-align: left"', 'style="text-align: right; font-variant-numeric: tabular-nums"'
+def _cell(tag: str, text: str, column: str = "") -> str:
+    side = "right; font-variant-numeric: tabular-nums" if column.startswith(">") else "left"
+    return f'<{tag} style="text-align: {side}">{html.escape(text)}</{tag}>'
 
 
 class Displayed(abc.ABC):

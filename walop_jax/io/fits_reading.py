@@ -79,28 +79,25 @@ def open_fits(path: str | os.PathLike[str], advice: str | None = None) -> Iterat
         try:
             raw = stack.enter_context(path.open("rb"))
             packed = unpacking(path)
-            content = raw if packed is None else unpacked(stack.enter_context(packed[0]), path, fits=True)
-            check_structure(io.BytesIO(content) if isinstance(content, bytes) else raw, path)
+            content = None if packed is None else unpacked(stack.enter_context(packed[0]), path, fits=True)
+            checked = raw if content is None else io.BytesIO(content)
+            check_structure(checked, path)
             caught = stack.enter_context(warnings.catch_warnings(record=True))
             warnings.simplefilter("always")
             # Opened here because astropy does not close a file that it fails to read.
-            stream = (
-                io.BytesIO(content) if isinstance(content, bytes) else stack.enter_context(path.open("rb"))
-            )
-            hdus = stack.enter_context(
-                fits.open(stream, lazy_load_hdus=False, disable_image_compression=True)
-            )
+            stream = stack.enter_context(path.open("rb")) if content is None else io.BytesIO(content)
+            opened = fits.open(stream, lazy_load_hdus=False, disable_image_compression=True)
+            hdus = stack.enter_context(opened)
             units = list(hdus)
             for hdu in units:
                 if isinstance(hdu, fits.BinTableHDU):
                     _check_columns(hdu, path)
-            raw.seek(0)
-            sha256 = _verify(path, units, io.BytesIO(content) if isinstance(content, bytes) else raw)
+            sha256 = _verify(path, units, checked)
         except DataError:
             raise
         except UNREADABLE as error:
             raise fail(f"cannot be read as FITS: {one_line(error)}", file=path, advice=BROKEN) from error
-        if isinstance(content, bytes):
+        if content is not None:
             raw.seek(0)
             sha256 = hashlib.file_digest(raw, "sha256").hexdigest()
         remarks = tuple(f"{path}: {one_line(entry.message)}" for entry in caught)

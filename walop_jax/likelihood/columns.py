@@ -195,9 +195,11 @@ def _pushed(
     return jax.vmap(jax.vmap(at), (None, 0))(counts, change)
 
 
-_at_points = compiled(
-    jax.vmap(_at_point, (None, None, 0)), optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="responses"
-)
+def _at_each(instrument: Instrument, plan: Plan, points: PointData) -> _AtPoint:
+    return jax.lax.map(lambda p: _at_point(instrument, plan, p), points, batch_size=limits.RESPONSES_AT_ONCE)
+
+
+_at_points = compiled(_at_each, optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="responses")
 _fringes_at = compiled(_fringes, optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="fringes")
 _visible = compiled(_visibilities, optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="visibilities")
 _detectors = compiled(_pushed, kept_as="detector_slopes")

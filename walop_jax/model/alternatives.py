@@ -109,12 +109,14 @@ def _turned_plates(instrument: Instrument) -> Iterator[Named]:
 def _turned_wedges(instrument: Instrument) -> Iterator[Named]:
     for turn in TURNS:
 
-        def turned(instrument: Instrument, place: str, turn: float = turn) -> Instrument:
-            return instrument.changed(
-                place, azimuth=lambda azimuth: jnp.asarray(turn) if azimuth is None else azimuth + turn
-            )
+        def azimuth(old: Any, turn: float = turn) -> Any:
+            return jnp.asarray(turn) if old is None else old + turn
 
-        yield from _each_and_all([*_used(instrument, Wedge)], f"turned by {turn:.0f} deg", turned)
+        yield from _each_and_all(
+            [*_used(instrument, Wedge)],
+            f"turned by {turn:.0f} deg",
+            lambda i, place, azimuth=azimuth: i.changed(place, azimuth=azimuth),
+        )
 
 
 def _beams(instrument: Instrument) -> Iterator[Named]:
@@ -145,14 +147,15 @@ def _order(instrument: Instrument) -> Iterator[Named]:
     front = next((n for n, e in enumerate(instrument.train(), start=1) if isinstance(e, Polariser)), 0)
     for holder, prefix, path in _paths(instrument):
         for first, second in itertools.pairwise(path if holder else path[front:]):
+            swapped = {first: second, second: first}
+            yield (
+                f"{prefix}{first} behind {prefix}{second}",
+                _with_path(holder, lambda way, swapped=swapped: tuple(swapped.get(n, n) for n in way)),
+            )
 
-            def exchanged(
-                instrument: Instrument, holder: str = holder, first: str = first, second: str = second
-            ) -> Instrument:
-                swapped = {first: second, second: first}
-                return instrument.changed(holder, path=lambda way: tuple(swapped.get(n, n) for n in way))
 
-            yield f"{prefix}{first} behind {prefix}{second}", exchanged
+def _with_path(holder: str, path: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Rearrangement:
+    return lambda instrument: instrument.changed(holder, path=path)
 
 
 def _in_or_out(instrument: Instrument) -> Iterator[Named]:
@@ -173,10 +176,7 @@ def _in_or_out(instrument: Instrument) -> Iterator[Named]:
             bends = type(element).ray is not Element.ray  # without it all elements behind would be displaced
             if isinstance(element, Polariser | Analyser) or element.moves or bends:
                 continue
-
-            def without(instrument: Instrument, holder: str = holder, out: str = name) -> Instrument:
-                return instrument.changed(holder, path=lambda way: tuple(n for n in way if n != out))
-
+            without = _with_path(holder, lambda way, out=name: tuple(n for n in way if n != out))
             yield f"{prefix}{name} left out", without
 
 

@@ -351,13 +351,13 @@ def in_float64(function: Callable[..., Any], name: str) -> Callable[..., Any]:
     return run
 
 
+_REMEDY = 'call jax.config.update("jax_enable_x64", True) before anything else, or set JAX_ENABLE_X64=1'
+
+
 def need_float64(what: str) -> None:
     """Raise RuntimeError, with the remedy, where the session compiles in float32."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise RuntimeError(
-            f"{what} is computed in float64, which is switched off: call "
-            'jax.config.update("jax_enable_x64", True) before anything else, or set JAX_ENABLE_X64=1'
-        )
+        raise RuntimeError(f"{what} is computed in float64, which is switched off: {_REMEDY}")
 
 
 def _refuse_float32(args: tuple[Any, ...]) -> None:
@@ -365,7 +365,5 @@ def _refuse_float32(args: tuple[Any, ...]) -> None:
     if jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         return
     if any(getattr(leaf, "dtype", None) == np.float32 for leaf in jax.tree.leaves(args)):
-        raise RuntimeError(
-            "walop_jax computes in float64, which is switched off, and was given numbers in float32: call "
-            'jax.config.update("jax_enable_x64", True) before anything else, or set JAX_ENABLE_X64=1.'
-        )
+        what = "walop_jax computes in float64, which is switched off, and was given numbers in float32"
+        raise RuntimeError(f"{what}: {_REMEDY}")

@@ -27,9 +27,9 @@ from walop_jax.model.cameras import DetectorPart
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import Shapes, of_shapes, parameter_places, shapes_of
+from walop_jax.model.parameters import by_shapes, parameter_places
 from walop_jax.model.plan import Plan, blank_plan
-from walop_jax.model.ray import Conditions, NotPlannedError, Ray
+from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays, Sight
 
 AT = 0.11, 0.07
@@ -44,13 +44,10 @@ class Needs(NamedTuple):
     path_difference: float  # µm
 
 
+@by_shapes
 def needs(instrument: Instrument) -> Needs:
     """Requirements of the light path of an instrument, effects included, from a run on shapes alone."""
-    return _needs(*shapes_of(instrument))
 
-
-@functools.lru_cache(maxsize=256)
-def _needs(structure: Any, shapes: Shapes) -> Needs:
     def run(quantities: Set[str], instrument: Instrument) -> tuple[Instrument, Array]:
         patched, plan = (
             instrument.patched(),
@@ -63,9 +60,8 @@ def _needs(structure: Any, shapes: Shapes) -> Needs:
         counts = light.counts(patched, rows, patched.throughput.at(x, y), sight, zeros)
         return patched, light.detected(patched, plan.exposures, counts)
 
-    (patched, _), quantities = _asking(run, of_shapes(structure, shapes))
-    elements = [*patched.elements, *(element for arm in patched.arms for element in arm.elements)]
-    longest = max((item.path_difference for item in elements), default=0.0)
+    (patched, _), quantities = _asking(run, instrument)
+    longest = max((element.path_difference for element in patched.by_place().values()), default=0.0)
     return Needs(quantities - {"median"}, "median" in quantities, longest)
 
 
@@ -89,14 +85,15 @@ def optical_indices(instrument: Instrument) -> Int[np.ndarray, " o"]:
 
 def optical_reach(instrument: Instrument, plan: Plan) -> Bool[np.ndarray, "a n"]:
     """True where a parameter (columns) reaches the band rows of an arm (rows) in the settings of a plan."""
-    reached = np.array(_reach(*shapes_of((instrument, plan))), bool)
+    reached = np.array(_reach(instrument, plan), bool)
     places = [place for place, count in parameter_places(instrument) for _ in range(count)]
     return reached[:, places]
 
 
-@functools.lru_cache(maxsize=256)
-def _reach(structure: Any, shapes: Shapes) -> tuple[tuple[bool, ...], ...]:
+@by_shapes
+def _reach(instrument: Instrument, plan: Plan) -> tuple[tuple[bool, ...], ...]:
     """For every arm the arrays of instrument and plan that reach its rows; inner programs use all their arguments."""
+    shapes, structure = jax.tree.flatten((instrument, plan))
 
     def reaching(number: int) -> tuple[bool, ...]:
         def run(*arrays: Array) -> Array:
@@ -105,30 +102,25 @@ def _reach(structure: Any, shapes: Shapes) -> tuple[tuple[bool, ...], ...]:
             one_arm = dataclasses.replace(patched, arms=patched.arms[number : number + 1])
             return light.band_rows(one_arm, plan, *map(jnp.asarray, AT))
 
-        program = jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(s, d) for s, d in shapes)).jaxpr
+        program = jax.make_jaxpr(run)(*shapes).jaxpr
         needed = {id(program.outvars[0])}
         for equation in reversed(program.eqns):
             if any(id(v) in needed for v in equation.outvars):
                 needed |= {id(v) for v in equation.invars}
         return tuple(id(v) in needed for v in program.invars)
 
-    return tuple(map(reaching, range(len(of_shapes(structure, shapes)[0].arms))))
+    return tuple(map(reaching, range(len(instrument.arms))))
 
 
+@by_shapes
 def conditions_of_effect(bare: Instrument, effect: Effect) -> frozenset[str]:
     """Conditions of the elements that an effect inserts or changes, by names in `ray.CONDITIONS`."""
-    return _conditions_of_effect(*shapes_of((bare, effect)))
 
-
-@functools.lru_cache(maxsize=1024)
-def _conditions_of_effect(structure: Any, shapes: Shapes) -> frozenset[str]:
-    def changed(both: tuple[Instrument, Effect]) -> list[Element]:
-        bare, effect = both
+    def changed(bare: Instrument, effect: Effect) -> list[Element]:
         before = {id(element) for element in _behind_polariser(bare)}
         return [element for element in _behind_polariser(effect.patch(bare)) if id(element) not in before]
 
-    changed_elements = jax.eval_shape(changed, of_shapes(structure, shapes))
-    return frozenset(name for element in changed_elements for name in _conditions_asked(*shapes_of(element)))
+    return frozenset().union(*map(_conditions_asked, jax.eval_shape(changed, bare, effect)))
 
 
 def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
@@ -137,15 +129,13 @@ def _behind_polariser(instrument: Instrument) -> Iterator[Element]:
         yield from (*arm.train(), arm.analyser)
 
 
-@functools.lru_cache(maxsize=1024)
-def _conditions_asked(structure: Any, shapes: Shapes) -> frozenset[str]:
+@by_shapes
+def _conditions_asked(element: Element) -> frozenset[str]:
     def run(quantities: Set[str], element: Element) -> tuple[Any, Any]:
-        ones, zero = jnp.ones(1), jnp.zeros(())
-        conditions = Conditions(band_width=0.1 * ones, planned=dict.fromkeys(quantities, ones))
-        ray = Ray.entering(zero, zero, (0.62 * ones, conditions))
+        ray = Ray.on_trial(quantities)
         return element.ray(ray), element.mueller(ray)
 
-    return _asking(run, of_shapes(structure, shapes))[1]
+    return _asking(run, element)[1]
 
 
 # --------------------------------------------------------------------------------------- validity for other exposures

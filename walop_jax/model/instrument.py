@@ -110,10 +110,9 @@ class Instrument(LightPath):
         ray = Ray.entering(
             jnp.asarray(x, float), jnp.asarray(y, float), (nodes, Conditions(jnp.zeros_like(nodes), planned))
         )
-        common, ray = fold.stations(instrument.behind_polariser(), ray)
-        arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
         state = tuple(angles.get(prefix) for prefix in moving)
-        ahead, *inside = fold.in_state(common, arms, moving, state)
+        path = fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, moving, [state])
+        ahead, *inside = path.in_first_state()
         of_arm = []
         for behind in inside:
             matrix = fold.product((*ahead, *behind))

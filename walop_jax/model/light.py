@@ -15,8 +15,9 @@ Units       counts per unit of unpolarised light at unit throughput; angles rad;
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -27,10 +28,9 @@ from jaxtyping import Array, Bool, Float, Int
 from walop_jax.model import fold, mueller
 from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.simple import Analyser
-from walop_jax.model.light_path import LightPath, Scalar
-from walop_jax.model.parameters import Shapes, of_shapes, shapes_of
+from walop_jax.model.light_path import LightPath, Scalar, is_achromatic
 from walop_jax.model.plan import Plan
-from walop_jax.model.ray import NotPlannedError, Ray
+from walop_jax.model.ray import Ray
 from walop_jax.model.sources import ExposureArrays, Sight, Source, turned
 
 FEW_BANDS = 3
@@ -41,45 +41,15 @@ BROAD = 0.05  # µm: equivalent width from which a filter is displaced by `Light
 # ------------------------------------------------------------------------------------------- the train
 
 
-class Train(NamedTuple):
-    """The common train in its three parts: ahead of the polariser, leading elements, those in the band integral."""
+def divided(instrument: LightPath) -> tuple[tuple[Element, ...], tuple[Element, ...]]:
+    """The common train behind the polariser: leading elements, then those in the band integral.
 
-    telescope: tuple[Element, ...]
-    leading: tuple[Element, ...]
-    banded: tuple[Element, ...]
-
-
-def divided(instrument: LightPath) -> Train:
-    """The parts of the common train.
-
-    Leading are the elements behind the polariser up to the first that moves, or that depends on the wavelength or on
-    another quantity of the exposures, as a run on shapes shows.
+    Leading are the elements up to the first that moves, or that depends on the wavelength or on another quantity of
+    the exposures, as a run on shapes shows.
     """
     behind = instrument.behind_polariser()
-    count = _leading(*shapes_of(behind))
-    return Train(instrument.telescope(), behind[:count], behind[count:])
-
-
-@functools.lru_cache(maxsize=256)
-def _leading(structure: Any, shapes: Shapes) -> int:
-    """Number of leading elements; one run for all values of their numbers."""
-    count = 0
-
-    def follow(elements: tuple[Element, ...]) -> None:
-        nonlocal count
-        ray = Ray.entering(jnp.zeros(()), jnp.zeros(()))
-        for element in elements:
-            if element.moves:
-                return
-            try:
-                element.mueller(ray)
-                ray = element.ray(ray)
-            except NotPlannedError:
-                return
-            count += 1
-
-    jax.eval_shape(follow, of_shapes(structure, shapes))
-    return count
+    leading = tuple(itertools.takewhile(lambda e: not e.moves and is_achromatic(e), behind))
+    return leading, behind[len(leading) :]
 
 
 def _achromatic(elements: tuple[Element, ...], x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
@@ -96,7 +66,7 @@ def telescope(instrument: LightPath, x: Scalar, y: Scalar) -> Float[Array, "4 4"
 
 def upstream(instrument: LightPath, x: Scalar, y: Scalar) -> Float[Array, "4 4"]:
     """Mueller matrix of the leading elements at a field point (see `divided`)."""
-    return _achromatic(divided(instrument.patched()).leading, x, y)
+    return _achromatic(divided(instrument.patched())[0], x, y)
 
 
 # ------------------------------------------------------------------------------------ bands and cameras
@@ -200,15 +170,11 @@ def is_dispersed(instrument: LightPath) -> bool:
 
 def _node_rows(instrument: LightPath, plan: Plan, ray: Ray) -> Float[Array, "c n r 4"]:
     """Rows of the analysers at every node, in every state."""
-    train = divided(instrument)
-    for element in train.leading:
+    leading, banded = divided(instrument)
+    for element in leading:
         ray = element.ray(ray)
-    common, ray = fold.stations(train.banded, ray)
-    arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
-    states = [state for state, _, _ in plan.settings]
-    matrices = fold.solved([*common, *(station for arm in arms for station in arm)], plan.moving, states)
-    analysers = [arm.analyser for arm in instrument.arms]
-    return fold.backward(common, arms, analysers, matrices, plan.moving, states, len(plan.wavelength))
+    path = fold.Fold.of(banded, instrument.arms, ray, plan.moving, plan.states)
+    return path.backward(path.solved(), len(plan.wavelength))
 
 
 def camera_vectors(

@@ -22,7 +22,7 @@ from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.simple import Analyser, Polariser
 from walop_jax.model.elements.wave_plate import WavePlate
-from walop_jax.model.parameters import Component, check_names, number, unknown_name
+from walop_jax.model.parameters import Component, by_shapes, check_names, number, unknown_name
 from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import Source, Standards
 
@@ -71,7 +71,9 @@ class LightPath(Component):
     effects: tuple[Any, ...] = ()  # patches: `effects.base.Effect`
     rotator_zero: Scalar | None = number(unit="deg", about="true ROTATOR minus the header's", default=None)
     filter_shift: Scalar | None = number(unit="um", about="displacement of broad bands", default=None)
-    sky_films: tuple[Any, ...] = ()  # changes of light from the sky in single exposures (`optics.SkyFilm`)
+    sky_films: tuple[
+        Any, ...
+    ] = ()  # changes of light from the sky in single exposures (`effects.optics.Film`)
 
     # ------------------------------------------------------------------------------- parts
 
@@ -94,7 +96,7 @@ class LightPath(Component):
             return ()
         elements = tuple(itertools.takewhile(lambda e: not isinstance(e, Polariser), self.train()))
         for element in elements:
-            if element.moves or type(element).ray is not Element.ray or not _is_achromatic(element):
+            if element.moves or type(element).ray is not Element.ray or not is_achromatic(element):
                 raise ValueError(
                     f"element {element.name!r} is ahead of the polariser, where nothing may move, bend the ray "
                     "or depend on wavelength or exposure; put it behind the polariser"
@@ -125,27 +127,26 @@ class LightPath(Component):
 
     def places(self, kind: type[Element]) -> tuple[str, ...]:
         """Places, as for `changed`, of all elements of a class; arms first, then the common train."""
-        arms = [
-            f"{arm.name}.{element.name}"
-            for arm in self.arms
-            for element in arm.elements
-            if isinstance(element, kind)
-        ]
-        return (*arms, *(element.name for element in self.elements if isinstance(element, kind)))
+        return tuple(place for place, element in self.by_place().items() if isinstance(element, kind))
+
+    def by_place(self) -> dict[str, Element]:
+        """All elements by their places, as for `changed`; arms first, then the common train."""
+        in_arms = {f"{arm.name}.{element.name}": element for arm in self.arms for element in arm.elements}
+        return in_arms | {element.name: element for element in self.elements}
+
+    def ahead_of_analysers(self) -> list[Element]:
+        """The elements of the common train, then of every arm, in the order light meets them."""
+        return [*self.train(), *(element for arm in self.arms for element in arm.train())]
 
     def moving(self) -> tuple[str, ...]:
         """Prefixes of the columns of the moving elements behind the polariser, common train first."""
-        elements = [*self.train(), *(element for arm in self.arms for element in arm.train())]
-        prefixes = [
-            element.moves for element in elements if element.moves and not isinstance(element, Polariser)
-        ]
-        return tuple(dict.fromkeys(prefixes))
+        elements = (e for e in self.ahead_of_analysers() if not isinstance(e, Polariser))
+        return tuple(dict.fromkeys(element.moves for element in elements if element.moves))
 
     @property
     def plates(self) -> str | None:
         """Model of its wave plates (`wave_plate.MODELS`); None where it has none."""
-        elements = (*self.elements, *(element for arm in self.arms for element in arm.elements))
-        return next((element.model for element in elements if isinstance(element, WavePlate)), None)
+        return next((e.model for e in self.by_place().values() if isinstance(e, WavePlate)), None)
 
     def effect(self, name: str) -> Any:
         """The active effect of a name; ValueError when there is none."""
@@ -176,14 +177,16 @@ class LightPath(Component):
         A duplicate name gets a number. Raises `NoSuchPlaceError` where there is no such element.
         """
         where, _, neighbour = (before or after).rpartition(".")
-        if where:
-            arm = next((arm for arm in self.arms if arm.name == where), None)
-            if arm is None:
-                raise NoSuchPlaceError(f"the instrument has no arm {where!r}")
-            holder = _inserted(arm, element, neighbour, bool(after))
-            arms = tuple(holder if candidate.name == where else candidate for candidate in self.arms)
-            return dataclasses.replace(self, arms=arms)
-        return _inserted(self, element, neighbour, bool(after))
+        holder = _member(self.arms, where, "arm") if where else self
+        if neighbour not in holder.path:
+            raise NoSuchPlaceError(str(unknown_name("element", neighbour, holder.path)))
+        name, count = element.name or element.kind, 1
+        while name in holder.path:
+            count += 1
+            name = f"{element.name or element.kind}_{count}"
+        at = holder.path.index(neighbour) + bool(after)
+        elements = (*holder.elements, dataclasses.replace(element, name=name))
+        return self.changed(where, elements=elements, path=(*holder.path[:at], name, *holder.path[at:]))
 
     def with_part(self, slot: str, part: Component) -> Self:
         """The instrument with one more part of its cameras.
@@ -195,13 +198,8 @@ class LightPath(Component):
 
     def with_source(self, source: Source) -> Self:
         """The instrument with a source of one more KIND, or with one of its sources replaced."""
-        remaining = tuple(present for present in self.sources if present.name != source.name)
-        if len(remaining) == len(self.sources):
-            return dataclasses.replace(self, sources=(*self.sources, source))
-        return dataclasses.replace(
-            self,
-            sources=tuple(source if present.name == source.name else present for present in self.sources),
-        )
+        sources = {present.name: present for present in self.sources} | {source.name: source}
+        return dataclasses.replace(self, sources=tuple(sources.values()))
 
 
 def _member(members: tuple[AnyPart, ...], name: str, what: str) -> AnyPart:
@@ -211,10 +209,16 @@ def _member(members: tuple[AnyPart, ...], name: str, what: str) -> AnyPart:
     raise NoSuchPlaceError(str(unknown_name(what, name, [_name(member) for member in members])))
 
 
-def _is_achromatic(element: Element) -> bool:
-    zero = jnp.zeros(())
+@by_shapes
+def is_achromatic(element: Element) -> bool:
+    """True if an element depends neither on wavelength nor on another quantity of the exposures."""
+
+    def run(element: Element) -> Any:
+        ray = Ray.entering(jnp.zeros(()), jnp.zeros(()))
+        return element.mueller(ray), element.ray(ray)
+
     try:
-        jax.eval_shape(lambda e: e.mueller(Ray.entering(zero, zero)), element)
+        jax.eval_shape(run, element)
     except NotPlannedError:
         return False
     return True
@@ -243,17 +247,3 @@ def _changed(part: AnyPart, path: list[str], fields: dict[str, Any], place: str)
                 new = (*members[:i], _changed(member, path[1:], fields, place), *members[i + 1 :])
                 return dataclasses.replace(part, **{field.name: new})
     raise NoSuchPlaceError(f"the instrument has no part {place!r}; {nearest(path[0], names)}")
-
-
-def _inserted(holder: Any, element: Element, neighbour: str, after: bool) -> Any:
-    if neighbour not in holder.path:
-        raise NoSuchPlaceError(str(unknown_name("element", neighbour, holder.path)))
-    name, number_ = element.name or element.kind, 1
-    while name in holder.path:
-        number_ += 1
-        name = f"{element.name or element.kind}_{number_}"
-    at = holder.path.index(neighbour) + (1 if after else 0)
-    path = (*holder.path[:at], name, *holder.path[at:])
-    return dataclasses.replace(
-        holder, elements=(*holder.elements, dataclasses.replace(element, name=name)), path=path
-    )

@@ -96,10 +96,6 @@ CRYSTALS = {
         QUARTZ_O, QUARTZ_E, QUARTZ_THERMAL, (0.198, 2.05), f"Ghosh 1999, Opt. Commun. 163, 95; {_ETZEL}"
     ),
     "mgf2": Crystal(MGF2_O, MGF2_E, MGF2_THERMAL, (0.2, 7.0), f"Dodge 1984, Appl. Opt. 23, 1980; {_ETZEL}"),
-}
-OTHER_CURVES = {"quartz": {"quartz_1951": "Radhakrishnan 1951"}, "mgf2": {"mgf2_1980": "Li 1980"}}
-"""Crystals under the same everyday name with another published dispersion: possible meanings of a description."""
-CRYSTALS |= {
     "quartz_1951": Crystal(
         QUARTZ_O_1951,
         QUARTZ_E_1951,
@@ -115,6 +111,8 @@ CRYSTALS |= {
         f"Li 1980, J. Phys. Chem. Ref. Data 9, 161; {_ETZEL}",
     ),
 }
+OTHER_CURVES = {"quartz": {"quartz_1951": "Radhakrishnan 1951"}, "mgf2": {"mgf2_1980": "Li 1980"}}
+"""Crystals under the same everyday name with another published dispersion: possible meanings of a description."""
 GLASSES = {"BK7": Glass(BK7, (0.3, 2.5), "Schott 2017, data sheet of N-BK7")}
 MATERIALS: Mapping[str, Crystal | Glass] = CRYSTALS | GLASSES
 """Materials of description files."""

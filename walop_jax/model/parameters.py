@@ -29,11 +29,11 @@ NUMBER = "walop_jax.number"
 SEVERAL = "walop_jax.several"
 
 Vector = Float[Array, " n"]
-Shapes = tuple[tuple[tuple[int, ...], str], ...]
 NAME = re.compile(r"[A-Za-z0-9_.+*-]+")
 """Valid names of parameters, in models and in files."""
 
 AnyComponent = TypeVar("AnyComponent", bound="Component")
+Result = TypeVar("Result")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -228,14 +228,24 @@ def is_row(kind: type[Component], number: str) -> bool:
 # -------------------------------------------------------------------------------- the tree and the vector
 
 
+def by_shapes(function: Callable[..., Result]) -> Callable[..., Result]:
+    """The function of trees, called with shapes for their arrays, once for all trees of equal structure and shapes."""
+
+    @functools.lru_cache(maxsize=1024)
+    def of_shapes(structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...]) -> Result:
+        return function(*jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes]))
+
+    @functools.wraps(function)
+    def call(*trees: Any) -> Result:
+        arrays, structure = jax.tree.flatten(trees)
+        return of_shapes(structure, tuple((np.shape(a), jnp.result_type(a).name) for a in arrays))
+
+    return call
+
+
+@by_shapes
 def parameter_places(component: Component) -> tuple[tuple[int, int], ...]:
     """For every parameter array its position among the leaves of the flattened tree, and its size."""
-    return _places(*shapes_of(component))
-
-
-@functools.lru_cache(maxsize=256)
-def _places(structure: Any, shapes: Shapes) -> tuple[tuple[int, int], ...]:
-    component = of_shapes(structure, shapes)
     flat, _ = jax.tree_util.tree_flatten_with_path(component)
     position = {tuple(_key(entry) for entry in path): i for i, (path, _) in enumerate(flat)}
     return tuple((position[holder], len(array)) for holder, array in _arrays(component) if array)
@@ -254,17 +264,6 @@ def values_of(component: Component) -> Vector:
         # By numpy: operations of JAX outside of a program are each compiled as one of their own.
         return array(np.concatenate([np.zeros(0), *map(np.ravel, chosen)]))
     return jnp.concatenate([jnp.ravel(array) for array in chosen])
-
-
-def shapes_of(tree: Any) -> tuple[Any, Shapes]:
-    """Structure of a tree and the shapes and types of its arrays: common to all calls of a program."""
-    arrays, structure = jax.tree_util.tree_flatten(tree)
-    return structure, tuple((tuple(np.shape(a)), jnp.result_type(a).name) for a in arrays)
-
-
-def of_shapes(structure: Any, shapes: Shapes) -> Any:
-    """The tree with shapes in the place of arrays, for `jax.eval_shape`."""
-    return jax.tree_util.tree_unflatten(structure, [jax.ShapeDtypeStruct(s, d) for s, d in shapes])
 
 
 def with_values(component: AnyComponent) -> Callable[[Vector | np.ndarray], AnyComponent]:

@@ -44,6 +44,11 @@ class Plan(eqx.Module):
     work: int = 0
     slope: Float[Array, " b"] | None = None
 
+    @property
+    def states(self) -> list[State]:
+        """Positions of the moving elements, setting by setting."""
+        return [state for state, _, _ in self.settings]
+
 
 def blank_exposures(instrument: LightPath, count: int) -> ExposureArrays:
     """Exposures without any information but their number."""

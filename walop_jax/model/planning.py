@@ -194,8 +194,7 @@ def extrapolations(instrument: Instrument, curves: Iterable[FilterCurve]) -> tup
 
     Raises `DataError` beyond the validity of the formulae.
     """
-    behind = (element for arm in instrument.arms for element in arm.train())
-    names = dict.fromkeys(name for element in (*instrument.train(), *behind) for name in element.materials)
+    names = dict.fromkeys(name for e in instrument.ahead_of_analysers() for name in e.materials)
     sentences = []
     for curve in curves:
         wavelengths = curve.wavelength[curve.throughput > 0]

@@ -114,18 +114,11 @@ def gauss_rules(node: Vector, weight: Vector, counts: range) -> Iterator[Rule]:
         yield centre + half * value, columns[0] ** 2
 
 
-def _fringe_error(
-    node: Vector,
-    weight: Vector,
-    fine: Float[np.ndarray, " f"],
-    fine_weight: Float[np.ndarray, " f"],
-    waves: float,
-) -> float:
+def _fringe_error(rule: Rule, measure: tuple[Vector, Vector], waves: float) -> float:
     # Phase of a plate of fixed birefringence, 2π waves · 0.62/λ, at a range of thicknesses.
     thickness = 2j * np.pi * 0.62 * waves * np.linspace(0.3, 1.0, 8)[:, None]
-    rule = np.exp(thickness / node) @ weight
-    exact = np.exp(thickness / fine) @ fine_weight
-    return float(np.abs(rule - exact).max())
+    mean, exact = (np.exp(thickness / node) @ weight for node, weight in (rule, measure))
+    return float(np.abs(mean - exact).max())
 
 
 def band_rule(
@@ -147,11 +140,11 @@ def band_rule(
     followed = [(WAVES, tolerance), (weak, 100 * tolerance)]
     followed += [(waves, tolerance)] if waves > WAVES else []
     followed += [(faint, FAINTER * tolerance)] if faint > FAINT else []
-    fine, fine_weight = tabulated_measure(wavelength, throughput, waves)
+    measure = fine, fine_weight = tabulated_measure(wavelength, throughput, waves)
     # No rule resolves a fringe with fewer than two nodes a cycle: those are not tried.
     cycles = 0.62 * max(fringes, waves if waves > WAVES else 0.0) * (1.0 / fine[0] - 1.0 / fine[-1])
     counts = range(max(1, int(2.0 * cycles)), min(MAXIMUM_NODES, len(fine)))
-    for node, weight in gauss_rules(fine, fine_weight, counts) if counts else ():
-        if all(_fringe_error(node, weight, fine, fine_weight, n) < limit for n, limit in followed):
-            return node, weight
-    return fine, fine_weight
+    for rule in gauss_rules(fine, fine_weight, counts) if counts else ():
+        if all(_fringe_error(rule, measure, n) < limit for n, limit in followed):
+            return rule
+    return measure

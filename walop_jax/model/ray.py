@@ -6,7 +6,7 @@ Units       field coordinates deg; direction cosines of the unit vector along th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -61,6 +61,14 @@ class Ray(eqx.Module):
         """The ray from a field point (deg) ahead of the mapping from field to pupil: along the axis."""
         zero = jnp.zeros(())
         return cls(x, y, zero, zero, spectrum)
+
+    @classmethod
+    def on_trial(cls, quantities: Iterable[str]) -> Ray:
+        """A ray along the axis at one wavelength, with some of `CONDITIONS`: for dependences."""
+        ones, zero = jnp.ones(1), jnp.zeros(())
+        return cls.entering(
+            zero, zero, (0.62 * ones, Conditions(0.1 * ones, dict.fromkeys(quantities, ones)))
+        )
 
     @property
     def kz(self) -> Real:

@@ -41,7 +41,7 @@ from walop_jax.model.elements.wave_plate import WavePlate, fringe
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light_path import Scalar
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
-from walop_jax.model.parameters import shapes_of
+from walop_jax.model.parameters import by_shapes
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import CONDITIONS, Conditions, Ray
 from walop_jax.model.sources import MoonPatches, MoonSky, Sight, Standards
@@ -62,21 +62,10 @@ def trains(instrument: Instrument) -> dict[str, tuple[Element, ...]]:
     }
 
 
+@by_shapes
 def acts(element: Element) -> bool:
     """True if an element has a Mueller matrix."""
-    return _acts(*shapes_of(element))
-
-
-@functools.lru_cache(maxsize=1024)
-def _acts(structure: Any, shapes: Any) -> bool:
-    ones, zero = array(np.ones(1)), array(np.zeros(()))
-
-    def run(*arrays: Array) -> Any:
-        element = jax.tree_util.tree_unflatten(structure, arrays)
-        conditions = Conditions(band_width=0.1 * ones, planned=dict.fromkeys(CONDITIONS, ones))
-        return element.mueller(Ray.entering(zero, zero, (0.62 * ones, conditions)))
-
-    return jax.eval_shape(run, *(jax.ShapeDtypeStruct(s, d) for s, d in shapes)) is not None
+    return jax.eval_shape(lambda e: e.mueller(Ray.on_trial(CONDITIONS)), element) is not None
 
 
 def _places(instrument: Instrument) -> list[list[int]]:
@@ -162,7 +151,7 @@ class _Banded(NamedTuple):
 def vector_slopes(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> VectorSlopes:
     """Slopes of the analysis vectors at a field point (deg)."""
     instrument = instrument.patched()
-    numbers, overall, cameras = _numbers(instrument), _whole(instrument), len(instrument.cameras)
+    numbers, overall = _numbers(instrument), _whole(instrument)
     longest = max(map(len, numbers), default=0)
 
     def moved(sizes: Float[Array, " t"]) -> Instrument:
@@ -176,18 +165,13 @@ def vector_slopes(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> V
     rows = jnp.concatenate([block.reshape(-1, *banded.rows.shape) for block in banded[1:]])
     shifted = jax.jacfwd(mean)(jnp.zeros(()))
     means = jnp.zeros((len(rows), len(shifted))).at[-1].set(shifted)
-    neutral = (
-        banded.rows,
-        light.mean_wavelengths(instrument, plan),
-        instrument.throughput.at(x, y),
-        jnp.zeros(cameras**2),
-    )
-    value, push = jax.linearize(functools.partial(_vectors, instrument, (x, y)), *neutral)
-    zeros = [jnp.zeros_like(tangent) for tangent in neutral]
+    neutral = _neutral(instrument, plan, x, y)
+    value, push = jax.linearize(functools.partial(_vectors, instrument, (x, y)), banded.rows, *neutral)
+    zeros = [jnp.zeros_like(tangent) for tangent in (banded.rows, *neutral)]
     slopes = (
         jax.vmap(lambda tangent, mean: push(tangent, mean, *zeros[2:]))(rows, means),
-        jax.vmap(lambda tangent: push(*zeros[:2], tangent, zeros[3]))(jnp.diag(neutral[2])),
-        jax.vmap(lambda tangent: push(*zeros[:3], tangent))(jnp.eye(cameras**2)),
+        jax.vmap(lambda tangent: push(*zeros[:2], tangent, zeros[3]))(jnp.diag(neutral[1])),
+        jax.vmap(lambda tangent: push(*zeros[:3], tangent))(jnp.eye(len(neutral[2]))),
     )
     return VectorSlopes(value, jnp.concatenate(slopes))
 
@@ -206,18 +190,16 @@ def fringe_slopes(
         return changed
 
     def vectors(rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
-        none = jnp.zeros(len(instrument.cameras) ** 2)
-        return _vectors(
-            instrument,
-            (x, y),
-            rows,
-            light.mean_wavelengths(instrument, plan),
-            instrument.throughput.at(x, y),
-            none,
-        )
+        return _vectors(instrument, (x, y), rows, *_neutral(instrument, plan, x, y))
 
     banded = _banded(plan, (x, y), moved, (1, 0), gaps)
     return jax.vmap(jax.vmap(jax.linearize(vectors, banded.rows)[1]))(banded.plates[:, :, 0])
+
+
+def _neutral(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> tuple[Array, Array, Array]:
+    """Mean wavelengths, throughput, no shares."""
+    mean, throughput = light.mean_wavelengths(instrument, plan), instrument.throughput.at(x, y)
+    return mean, throughput, jnp.zeros(len(throughput) ** 2)
 
 
 def _vectors(
@@ -256,29 +238,25 @@ def _summed(
     stretch: Scalar,
 ) -> _Banded:
     """The same at wavelengths times a factor, without the differences between beams."""
-    states, conditions = [state for state, _, _ in plan.settings], plan.conditions
+    conditions = plan.conditions
     if "temperature" not in conditions.planned:  # the thermal change of one kelvin
         warm = jnp.full_like(plan.wavelength, REFERENCE_TEMPERATURE + 1.0)
         conditions = Conditions(conditions.band_width, {**conditions.planned, "temperature": warm})
 
-    def stations(instrument: Instrument) -> list[list[fold.Station]]:
-        common, *arms = trains(instrument).values()
-        spectrum = stretch * light.node_wavelengths(instrument, plan), conditions
-        first, ray = fold.stations(common, Ray.entering(*at, spectrum))
-        return [first, *(fold.stations(arm, ray)[0] for arm in arms)]
+    def path_of(instrument: Instrument) -> fold.Fold:
+        ray = Ray.entering(*at, (stretch * light.node_wavelengths(instrument, plan), conditions))
+        return fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, plan.moving, plan.states)
 
     def solved(sizes: Float[Array, " t"]) -> tuple[fold.Solved, Float[Array, "b n"]]:
         changed = moved(sizes)
-        all_stations = list(itertools.chain(*stations(changed)))
-        return fold.solved(all_stations, plan.moving, states), light.band_weights(changed, plan)
+        return path_of(changed).solved(), light.band_weights(changed, plan)
 
     single, together = sizes
     nothing = jnp.zeros(single + together)
     (matrices, weights), push = jax.linearize(solved, nothing)
     slopes, weight_slopes = jax.vmap(push)(jnp.eye(len(nothing)))
-    common, *arms = stations(neutral := moved(nothing))
-    analysers, all_stations = [arm.analyser for arm in neutral.arms], list(itertools.chain(common, *arms))
-    folded = fold.around(common, arms, analysers, matrices, plan.moving, states, len(plan.wavelength))
+    path = path_of(neutral := moved(nothing))
+    folded = path.around(matrices, len(plan.wavelength))
     sides = [
         (behind, ahead)
         for folded_train in folded
@@ -298,9 +276,7 @@ def _summed(
         behind, ahead = sides[number]
 
         def change(tangents: fold.Solved) -> Float[Array, "c n r 4"]:
-            matrix = fold.stacked(
-                tangents, number, all_stations[number][0], plan.moving, states, jnp.zeros((4, 4))
-            )
+            matrix = path.stacked(tangents, number, out=jnp.zeros((4, 4)))
             assert matrix is not None
             return behind @ matrix @ ahead
 
@@ -310,13 +286,13 @@ def _summed(
     moments = weights, weights * (wavelength / neutral.units.wavelength - 1.0)
     inserted = _inserted(plan, moments, _places(neutral), folded)
     plates = [jnp.zeros((0, len(gaps), single, *sums(weights, rows).shape))]
-    for number, (element, ray) in enumerate(all_stations):
+    for number, (element, ray) in enumerate(path.stations):
         if _is_plate(element):
             change = pushed(number, slice(single))
             waves = jax.vmap(fringe, (0, None))(gaps, ray)
             plates.append(jax.vmap(lambda wave, change=change: sums(wave * weights, change))(waves)[None])
     overall = sum(
-        (pushed(number, slice(single, None)) for number in range(len(all_stations))),
+        (pushed(number, slice(single, None)) for number in range(len(path.stations))),
         jnp.zeros((together, *rows.shape)),
     )
     shifted = jax.vmap(lambda slope: sums(slope, rows))(weight_slopes[single:])

@@ -170,18 +170,6 @@ class MoonSky(Source):
         return qu
 
 
-class StandardChange(Component):
-    """Change of q (axis 0) or u (1) of one value of a standard in single exposures."""
-
-    size: Scalar
-    value: int = eqx.field(static=True)
-    axis: int = eqx.field(static=True)
-
-    def factor(self, exposures: ExposureArrays) -> Float[Array, " e"]:
-        """Factor of the size in every exposure."""
-        raise NotImplementedError
-
-
 class Standards(Source):
     """Catalogue Stokes parameters of the standard stars.
 
@@ -210,7 +198,7 @@ class Standards(Source):
     stars: tuple[int, ...] = eqx.field(static=True, default=())
     unknown: tuple[int, ...] = eqx.field(static=True, default=())
     angle: Scalar | None = number(unit="deg", about="added to all position angles", default=None)
-    changes: tuple[StandardChange, ...] = ()
+    changes: tuple[Any, ...] = ()  # `effects.numbers.GrownStandard`
 
     name: ClassVar[str] = "standard"
     kind: ClassVar[str] = "standard"

@@ -53,8 +53,9 @@ class Model(Displayed):
         effects = ", ".join(self.effect_names) or "none beyond the base model"
         counts = f"{len(self.parameters)} parameters, {len(self.free)} free"
         rows = tuple(
-            (p.name, with_minus_sign(f"{p.start + 0.0:.6g}"), p.unit, _prior_of(p), p.state, p.about)
+            (p.name, with_minus_sign(f"{p.start + 0.0:.6g}"), p.unit, prior, p.state, p.about)
             for p in sorted(self.parameters, key=lambda p: p.name.startswith("standard."))
+            for prior in ("" if p.prior is None else with_error(p.prior[0] + 0.0, p.prior[1]),)
             if p.part != THROUGHPUT
         )
         hidden = len(self.positions(THROUGHPUT))
@@ -197,10 +198,6 @@ class Model(Displayed):
         if values is None or not isinstance(values, jax.Array):
             values = np.asarray(self.start if values is None else values, float)
         return with_values(self.template)(values)
-
-
-def _prior_of(p: Parameter) -> str:
-    return "" if p.prior is None else with_error(p.prior[0] + 0.0, p.prior[1])
 
 
 def _wave_plates(instrument: Instrument) -> Iterator[tuple[str, WavePlate]]:

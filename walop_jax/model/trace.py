@@ -83,14 +83,11 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
 
     # One Stokes vector per node, and its average over the band.
     wavelength, weight = light.node_wavelengths(instrument, plan), light.band_weights(instrument, plan)[0]
-    train, (state, *_) = light.divided(instrument), plan.settings[0]
-    common, ray = fold.stations(
-        (*train.leading, *train.banded), Ray.entering(x, y, (wavelength, plan.conditions))
-    )
-    arms = [fold.stations(tuple(arm.train()), ray)[0] for arm in instrument.arms]
-    ahead, *inside = fold.in_state(common, arms, plan.moving, state)
+    ray = Ray.entering(x, y, (wavelength, plan.conditions))
+    path = fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, plan.moving, plan.states)
+    ahead, *inside = path.in_first_state()
     nodes = jnp.broadcast_to(beam, (len(wavelength), 4))
-    for (element, _), matrix in zip(common, ahead, strict=True):
+    for (element, _), matrix in zip(path.common, ahead, strict=True):
         nodes = _through(matrix, nodes)
         if matrix is not None or element.moves:
             stages.append(_one(element.name, _about(element, plan), weight @ nodes))
@@ -123,7 +120,7 @@ def _about(element: Element, plan: Plan) -> str:
     """Remark on an element: its description, or its position."""
     if element.moves is None:
         return type(element).__doc__ or ""
-    (angle,) = fold.positions(element, plan.moving, [plan.settings[0][0]])
+    (angle,) = fold.positions(element, plan.moving, plan.states[:1])
     return "out of the beam" if angle is None else f"at {angle:g}°"
 
 

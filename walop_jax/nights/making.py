@@ -13,6 +13,7 @@ import functools
 import hashlib
 import importlib
 import importlib.util
+import os
 import pickle
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -29,6 +30,7 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.base_model import model_like
 from walop_jax.io.code import files_of_users, run_file
 from walop_jax.io.errors import DataError, fail
+from walop_jax.model.compiled import switch_on
 from walop_jax.model.specification import Model
 from walop_jax.nights.equations import (
     Candidates,
@@ -212,20 +214,23 @@ def mapped(
         return map(function, tasks)
     if not tasks:
         return ()
-    code = files_of_users()
+    start = os.getpid(), files_of_users()
     return executor.map(
-        _there, *zip(*((code, pickle.dumps((function, task))) for task in tasks), strict=True)
+        _there, *zip(*((start, pickle.dumps((function, task))) for task in tasks), strict=True)
     )
 
 
-def _there(code: tuple[str, ...], work: bytes) -> Any:
-    _run_files(code)
+def _there(start: tuple[int, tuple[str, ...]], work: bytes) -> Any:
+    _prepare(*start)
     function, task = pickle.loads(work)
     return function(task)
 
 
 @functools.lru_cache(maxsize=1)
-def _run_files(code: tuple[str, ...]) -> None:
+def _prepare(parent: int, code: tuple[str, ...]) -> None:
+    """Set a process up: as a command does, unless it is the session that asks, and with the code of users."""
+    if os.getpid() != parent:
+        switch_on()
     for path in code:
         run_file(path, "start the workers where this file can be read")
 
@@ -246,8 +251,11 @@ def executor_of(
         raise fail("Dask is not installed", advice="pip install 'walop-jax[cluster]'")
     dask, config = map(importlib.import_module, ("distributed", "dask.config"))
     with contextlib.ExitStack() as hold:
-        # Every night travels with the model: some hundred kilobytes each, of which Dask would warn.
-        hold.enter_context(config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}))
+        # Every night travels with the model, some hundred kilobytes, of which Dask would warn. And Dask makes workers
+        # return memory at once, to ask for it again: these thresholds malloc(3) reaches by itself.
+        of_worker = "distributed.nanny.pre-spawn-environ.MALLOC_{}_THRESHOLD_"
+        settings = {of_worker.format("TRIM"): 1 << 26, of_worker.format("MMAP"): 1 << 25}
+        hold.enter_context(config.set({"distributed.admin.large-graph-warning-threshold": "1GB"} | settings))
         if scheduler is None:
             options = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None}
             address = hold.enter_context(dask.LocalCluster(**options))

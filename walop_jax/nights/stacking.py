@@ -10,7 +10,7 @@ import functools
 import hashlib
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
@@ -123,11 +123,19 @@ def stack(
             carried = functools.partial(_carried, maker.like, catalogue) if maker.like is not None else None
             new_breaks, chosen, _ = breaks_of(data, chosen, catalogue, carried)
             breaks += new_breaks
+        before = data.reference
         data, solution, settled = _settled(data, chosen, at_hand, makers)
-        candidates = zip(data.names, chosen, strict=True)
-        moving = {name for name, law in list(candidates)[len(chosen) - data.candidates :] if law is not None}
+        with_laws = zip(data.names, chosen, strict=True)
+        moving = [name for name, law in list(with_laws)[len(chosen) - data.candidates :] if law is not None]
         if at_hand and moving:
-            data = _with_candidates_anew(data, solution, at_hand, makers, frozenset(moving))
+            # Their columns are those of where the nights were, as far as they do not follow the parameters: what that
+            # leaves is a product of the way since and of their amplitudes.
+            values, sigma = _in_units(data, solution)
+            ways = _farthest(data, solution, before, at_hand)
+            at = [data.names.index(name) for name in moving]
+            sizes = 1.0 + np.abs(values / sigma)[:, at].sum(axis=1)
+            order = sorted(ways, key=lambda u: -ways[u] * sizes[u])
+            data, *_ = _linearised(data, solution, chosen, order, at_hand, makers, frozenset(moving))
             data, solution, settled = _settled(data, chosen, at_hand, makers)
     except UndeterminedError as error:
         raise _undetermined(data, error) from None
@@ -241,68 +249,77 @@ def _settled(
 ) -> tuple[Together, Solution, bool]:
     """Linearise nights at the common solution until that would not move it by `EXACT` errors; whether it would not.
 
-    Those that lie farthest from the solution are linearised there first, the n-th of them to see: were each of the rest
-    as far from linear, how far would all together move the solution? As far as may be, and the rest stays as it is.
     A missing effect may lead ever farther away: the search ends where all nights come no closer.
     """
     solution, anew, enough, farthest = solved(data, laws), list[int](), False, np.inf
     for _ in range(ROUNDS):
-        values, sigma = _in_units(data, solution)
-        # Candidates have no place in the model: their part stays first-order, at 0.
-        away = (np.abs(values - data.reference) / sigma)[:, data.has_value].max(axis=1)
-        again = [
-            u for u in np.argsort(-away, kind="stable")
-            if away[u] > FAR and data.nights[u].key in at_hand
-        ]  # fmt: skip
+        away = _farthest(data, solution, data.reference, at_hand)
+        again = {u: distance for u, distance in away.items() if distance > FAR}
         if not again or (enough and not set(again) & set(anew)):
             return data, solution, True
-        if float(away.max()) >= farthest:
+        if max(away.values()) >= farthest:
             break
-        farthest = float(away.max())
-        nights, anew, enough = list(data.nights), [], False
-        for begin in (0, *(2**k for k in range(len(again).bit_length()))):
-            if not (batch := again[begin : max(1, 2 * begin)]):
-                break
-            points = [dict(zip(data.names, values[u].tolist(), strict=True)) for u in batch]
-            tasks = [Task(at_hand[nights[u].key], nights[u], at) for u, at in zip(batch, points, strict=True)]
-            *earlier, (last,) = makers.make(tasks)
-            for u, (night,) in zip(batch, earlier, strict=False):
-                nights[u] = night
-            seeing = len(batch) == max(1, begin)  # the first, second, fourth …: solving costs time as well
-            before = values
-            if seeing and begin > 0:
-                before, _ = _in_units(trial := together(nights), solved(trial, laws))
-            nights[u := batch[-1]] = last
-            anew += batch
-            data = together(nights)
-            solution = solved(data, laws)
-            if seeing:
-                after, _ = _in_units(data, solution)
-                remaining = np.full((len(nights), 1), len(again) - begin - len(batch))
-                remaining[u] = min(remaining[u], 1)  # its own values move with no other night
-                if enough := bool(np.all(remaining * np.abs(after - before) <= EXACT * sigma)):
-                    break
+        farthest = max(away.values())
+        data, solution, anew, enough = _linearised(data, solution, laws, again, at_hand, makers)
     return data, solution, False
 
 
-def _with_candidates_anew(
+def _farthest(
     data: Together,
     solution: Solution,
+    places: Float[np.ndarray, "u n"],
+    at_hand: Mapping[tuple[str, int], Data],
+) -> dict[int, float]:
+    """Distances (standard errors) of nights whose data are at hand from places to the solution, the farthest first."""
+    values, sigma = _in_units(data, solution)
+    # Candidates have no place in the model: their part stays first-order, at 0.
+    away = (np.abs(values - places) / sigma)[:, data.has_value].max(axis=1)
+    order = np.argsort(-away, kind="stable").tolist()
+    return {u: float(away[u]) for u in order if data.nights[u].key in at_hand}
+
+
+def _linearised(
+    data: Together,
+    solution: Solution,
+    laws: Sequence[Law | None],
+    again: Collection[int],
     at_hand: Mapping[tuple[str, int], Data],
     makers: Makers,
-    candidates: frozenset[str],
-) -> Together:
-    """The nights linearised at the solution, with candidates that have a law."""
-    values, _ = _in_units(data, solution)
-    nights = list(data.nights)
-    units = [u for u, night in enumerate(nights) if night.key in at_hand]
-    points = [dict(zip(data.names, values[u].tolist(), strict=True)) for u in units]
-    tasks = [
-        Task(at_hand[nights[u].key], nights[u], at, candidates) for u, at in zip(units, points, strict=True)
-    ]
-    for u, (night,) in zip(units, makers.make(tasks), strict=True):
-        nights[u] = night
-    return together(nights)
+    candidates: frozenset[str] = frozenset(),
+) -> tuple[Together, Solution, list[int], bool]:
+    """Linearise nights `again` at a solution, with candidates: which were, and whether the rest may stay as they are.
+
+    They come in their order, the n-th of them to see: were each of the rest as far from linear, how far would all
+    together move the solution? Up to `EXACT` errors the rest stays.
+    """
+    values, sigma = _in_units(data, solution)
+    nights, order, anew, enough = list(data.nights), list(again), list[int](), False
+    for begin in (0, *(2**k for k in range(len(order).bit_length()))):
+        if not (batch := order[begin : max(1, 2 * begin)]):
+            break
+        points = [dict(zip(data.names, values[u].tolist(), strict=True)) for u in batch]
+        tasks = [
+            Task(at_hand[nights[u].key], nights[u], at, candidates)
+            for u, at in zip(batch, points, strict=True)
+        ]
+        *earlier, (last,) = makers.make(tasks)
+        for u, (night,) in zip(batch, earlier, strict=False):
+            nights[u] = night
+        seeing = len(batch) == max(1, begin)  # the first, second, fourth …: solving costs time as well
+        before, _ = _in_units(data, solution)
+        if seeing and begin > 0:
+            before, _ = _in_units(trial := together(nights), solved(trial, laws))
+        nights[u := batch[-1]] = last
+        anew += batch
+        data = together(nights)
+        solution = solved(data, laws)
+        if seeing:
+            after, _ = _in_units(data, solution)
+            remaining = np.full((len(nights), 1), len(order) - begin - len(batch))
+            remaining[u] = min(remaining[u], 1)  # its own values move with no other night
+            if enough := bool(np.all(remaining * np.abs(after - before) <= EXACT * sigma)):
+                break
+    return data, solution, anew, enough
 
 
 def _in_units(

@@ -123,7 +123,7 @@ def _maps(
     for row, title in zip(axes, maps, strict=True):
         for axis in row:
             if axis.get_subplotspec().is_first_col():
-                axis.set_ylabel(f"{title}\n\nY (deg)", fontsize=FONT)
+                axis.set_ylabel(f"{title}\n\nY (deg)")
     colour_bar(figure, tiles, axes, label, pad=0.015, aspect=18 * len(maps), fraction=0.03)
     return figure
 
@@ -159,13 +159,13 @@ def signature_figure(
             axis.axhline(0.0, color=QUIET, lw=0.8, zorder=0)
             axis.errorbar(x, dots, error, fmt="o", ms=3, lw=0.8, color="0.15", label="data", zorder=3)
         upper[k].plot(x, explained, color=BEFORE, lw=1.4, label="effect", zorder=2)
-        upper[k].set_title(camera, fontsize=FONT)
-        lower[k].set_xlabel(label, fontsize=FONT)
+        upper[k].set_title(camera)
+        lower[k].set_xlabel(label)
         if angular:
             angle_ticks(lower[k].xaxis, figure, lower[k].get_subplotspec().get_gridspec().ncols)
-    upper[0].set_ylabel("residual (σ)", fontsize=FONT)
-    lower[0].set_ylabel("remaining (σ)", fontsize=FONT)
-    figure.legend(*upper[0].get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=2, loc=ABOVE)
+    upper[0].set_ylabel("residual (σ)")
+    lower[0].set_ylabel("remaining (σ)")
+    figure.legend(*upper[0].get_legend_handles_labels(), frameon=False, ncols=2, loc=ABOVE)
     return figure
 
 
@@ -217,10 +217,9 @@ def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
     explains = ratio < 1.0 + width
     for chosen, marker, colour in ((~explains, "o", BEFORE), (explains, "s", AFTER)):
         axis.plot(ratio[chosen], place[chosen], marker, color=colour, ms=7, lw=0, zorder=3)
-    axis.set_xscale("log")
     low, high = min(float(ratio.min()), 1.0 - width), max(float(ratio.max()), 1.0 + width)
     margin = (high / low) ** 0.12
-    axis.set_xlim(low / margin, high * margin**2)
+    axis.set(xscale="log", xlim=(low / margin, high * margin**2), xlabel="χ² per degree of freedom")
     for y, value in zip(place, ratio, strict=True):
         axis.annotate(
             f"{value:.4g}", (value, y), (9, -8), textcoords="offset points", fontsize=8, va="center"
@@ -228,7 +227,6 @@ def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
     axis.set_yticks(place, names)
     axis.set_ylim(len(ratio) - 0.5, -0.5)
     axis.tick_params(labelsize=SMALL)
-    axis.set_xlabel("χ² per degree of freedom", fontsize=FONT)
     plain_ticks(axis.xaxis)
     for side in ("top", "right", "left"):
         axis.spines[side].set_visible(False)
@@ -259,13 +257,13 @@ def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
         axis.vlines(place, before[rows], after[rows], color=QUIET, lw=1, zorder=1)
         axis.plot(place, before[rows], "o", color=BEFORE, ms=size, mfc="white", label="starting model")
         axis.plot(place, after[rows], "s", color=AFTER, ms=size - 0.5, label="final model")
-        axis.set_xlabel(group, fontsize=FONT)
+        axis.set_xlabel(group)
     top = float(np.max(before, initial=1.0))
     if top > 5.0:
         axes[0].set_yscale("log")
         plain_ticks(axes[0].yaxis)
-    axes[0].set_ylabel("mean squared residual /\nwhat noise alone gives", fontsize=FONT)
-    axes[-1].legend(frameon=False, fontsize=SMALL, loc="best")
+    axes[0].set_ylabel("mean squared residual /\nwhat noise alone gives")
+    axes[-1].legend(frameon=False, loc="best")
     return figure
 
 
@@ -308,7 +306,7 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     colour_bar(figure, shown, axis, "error of q, u (%)")
     axis.plot(found.x[~good], found.y[~good], "x", color="0.5", ms=4, label="u not measured in one exposure")
     if not good.all():
-        figure.legend(frameon=False, fontsize=SMALL, loc=ABOVE)
+        figure.legend(frameon=False, loc=ABOVE)
     return figure
 
 
@@ -338,10 +336,9 @@ def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     rows = [f"{name}  {number}" for name, number in zip(names, numbers, strict=True)] if narrow else names
     axis.set_xticks(range(count), numbers if narrow else names, rotation=90, fontsize=SMALL)
     axis.set_yticks(range(count), rows, fontsize=SMALL)
-    axis.set_ylabel("effect present\n(at its detection limit)", fontsize=FONT)
-    axis.set_xlabel("could be mistaken for", fontsize=FONT)
+    axis.set(xlabel="could be mistaken for", ylabel="effect present\n(at its detection limit)")
     if omitted := len(found.effects) - count:
-        axis.set_title(f"{omitted} other effects:{gap}more than {_STEPS[-1]:g} σ from all", fontsize=FONT)
+        axis.set_title(f"{omitted} other effects:{gap}more than {_STEPS[-1]:g} σ from all")
     label = f"separation (σ),{gap}below {thresholds.SEPARATION:g}: can be mistaken"
     if narrow:
         colour_bar(figure, shown, [axis], label, location="bottom", aspect=30)

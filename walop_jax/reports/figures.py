@@ -24,7 +24,6 @@ from walop_jax.reports.style import (
     ABOVE,
     AFTER,
     DIVERGING,
-    FONT,
     PAGE,
     SEQUENTIAL,
     SMALL,
@@ -145,10 +144,9 @@ def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n
         axis.text(0.03, 0.97, tail, transform=axis.transAxes, va="top", fontsize=SMALL)
     t = np.linspace(-4.0, 4.0, 201)
     axis.plot(t, np.exp(-0.5 * t**2) / np.sqrt(2 * np.pi), color="C3", lw=1.2, label="noise alone")
-    axis.set_xlabel("residual / its expected width", fontsize=FONT)
-    axis.set_ylabel("density", fontsize=FONT)
+    axis.set(xlabel="residual / its expected width", ylabel="density")
     axis.set_ylim(top=0.55)  # room for the legend above the curve
-    axis.legend(frameon=False, fontsize=SMALL, loc="upper right")
+    axis.legend(frameon=False, loc="upper right")
 
 
 @styled
@@ -182,12 +180,9 @@ def modulation_figure(
             axis.plot(
                 e.clp_angle[rows], (first - second) / (first + second), "os^Dv"[k % 5], ms=4, label=where
             )
-        axis.set_xlabel("polariser angle (deg)", fontsize=FONT)
-        axis.set_ylabel(name, fontsize=FONT)
+        axis.set(xlabel="polariser angle (deg)", ylabel=name)
         angle_ticks(axis.xaxis, figure, arms)
-    figure.legend(
-        *panels[0, 0].get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=2, loc=ABOVE
-    )
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), frameon=False, ncols=2, loc=ABOVE)
     return figure
 
 
@@ -316,11 +311,9 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
         goal, 1.01, f"goal {goal:.3g} %", fontsize=SMALL, transform=right.get_xaxis_transform(), ha="center",
         va="bottom",
     )  # fmt: skip
-    right.set_xscale("log")
-    right.set_xlim(edges[0], max(edges[-1], 1.5 * goal))
+    right.set(xscale="log", xlim=(edges[0], max(edges[-1], 1.5 * goal)))
     plain_ticks(right.xaxis)
-    right.set_xlabel("error of p (%)", fontsize=FONT)
-    right.set_ylabel("share of the field (%)", fontsize=FONT)
+    right.set(xlabel="error of p (%)", ylabel="share of the field (%)")
     return figure
 
 

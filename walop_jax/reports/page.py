@@ -10,12 +10,12 @@ import dataclasses
 import functools
 import io
 import re
+import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jinja2
-from matplotlib.figure import Figure
 
 from walop_jax.calibration.product import read_product
 from walop_jax.calibration.thresholds import GOAL
@@ -33,13 +33,7 @@ from walop_jax.reports.named import draw
 from walop_jax.reports.posterior_figures import unit_in_words
 from walop_jax.reports.run import FigureSource, RunContents, read_limits
 from walop_jax.reports.style import PAGE, WIDTHS, Canvas
-from walop_jax.reports.wording import (
-    CAPTIONS,
-    data_in_words,
-    effect_in_words,
-    names_in_words,
-    symbols_in_words,
-)
+from walop_jax.reports.wording import data_in_words, effect_in_words, names_in_words, symbols_in_words
 from walop_jax.science.commissioning import is_go, requirement_advice, requirement_rows, requirements
 from walop_jax.science.field_accuracy import FieldAccuracy
 
@@ -113,22 +107,25 @@ def filled(head: Display, sections: Iterable[Section], *, good: bool, **content:
     return re.sub(r"(?<=\d) (?=[%σ±])|(?<=[=±≤]) (?=\d)", "\N{NO-BREAK SPACE}", text)
 
 
-def embedded(figure: Figure) -> str:
-    """A figure as a data URI (SVG, letters as outlines): for an image inside a page."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format="svg", metadata={"Date": None})
-    return "data:image/svg+xml;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+@functools.cache
+def captions() -> Mapping[str, str]:
+    """Captions of figures by name, and of pictures by file."""
+    return tomllib.loads((TEMPLATES / "captions.toml").read_text(encoding="utf-8"))
 
 
-def png(content: bytes) -> str:
-    """A PNG as a data URI."""
-    return "data:image/png;base64," + base64.b64encode(content).decode("ascii")
+def embedded(content: bytes, kind: str = "png") -> str:
+    """A picture as a data URI: for an image inside a page."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def picture(name: str, drawn_on: Callable[[Canvas], Any], **words: str) -> Picture:
-    """A figure, wide and narrow, with its caption."""
-    wide, narrow = embedded(drawn_on(PAGE)), embedded(drawn_on(NARROW))
-    return Picture(wide, CAPTIONS[name].format(**words), name in SMALL, narrow)
+    """A figure, wide and narrow (SVG, letters as outlines), with its caption."""
+    images = []
+    for canvas in (PAGE, NARROW):
+        stream = io.BytesIO()
+        drawn_on(canvas).savefig(stream, format="svg", metadata={"Date": None})
+        images.append(embedded(stream.getvalue(), "svg+xml"))
+    return Picture(images[0], captions()[name].format(**words), name in SMALL, images[1])
 
 
 def drawn(source: FigureSource, names: Sequence[str], missing: list[str], **words: str) -> list[Picture]:
@@ -164,22 +161,15 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
         accuracy = _accuracy(run)
         head = head if accuracy is None else _with_goal(head, accuracy)
     missing = [*run.missing]
+    error_maps = _accuracy_pictures(run, missing) if trusted else ()
     origin = "" if run.product is None or not run.product.origin else f"; data from {run.product.origin}"
     sampled = run.product is not None and run.product.verdict.covariance_from == "posterior"
     when = "" if run.product is None else run.product.date.replace("T", " at ")
     date = f", {'sampled' if sampled else 'fitted'} on {when} UTC" if when else ""
     sections = (
         Section("commissioning", "Go or no-go", requirements_shown),
-        Section(
-            "accuracy",
-            "Accuracy of p over the field",
-            pictures=_accuracy_pictures(run, missing) if trusted else (),
-        ),
-        *(
-            []
-            if run.product is None
-            else [Section("data", "The data", Display("", data_in_words(run.product)))]
-        ),
+        Section("accuracy", "Accuracy of p over the field", pictures=error_maps),
+        Section("data", "The data", Display("", () if run.product is None else data_in_words(run.product))),
         *([] if diagnosis is None else _diagnosed(run, head, missing)),
         Section("residuals", "Residuals before and after", pictures=_residual_pictures(run, missing)),
         *([] if diagnosis is None else [_candidates(run)]),
@@ -387,10 +377,9 @@ def _posterior(run: RunContents) -> Section:
     """The verdict on the chains, intervals, and the corner plot."""
     shown = None if run.sample is None else display_of(run.sample, run.source.folder / "sample.json")
     names = [] if shown is None else [row[0] for row in shown.rows]
-    drawn = (
-        [] if run.corner is None else [Picture(png(run.corner), CAPTIONS["corner"] + symbols_in_words(names))]
-    )
-    return Section("posterior", "Posterior", shown, drawn)
+    words = captions()["corner"] + symbols_in_words(names)
+    pictures = [] if run.corner is None else [Picture(embedded(run.corner), words)]
+    return Section("posterior", "Posterior", shown, pictures)
 
 
 def _parameters(run: RunContents, shown: Display) -> Section:
@@ -436,24 +425,17 @@ def in_greek(text: str) -> str:
 # -------------------------------------------------------------------------------------------------- other results
 
 
-class OtherPage(NamedTuple):
-    """A page about no fit: its title, and the key of its document that says whether it can be relied on."""
-
-    title: str
-    trust: str = ""
-
-
 OTHERS = {
-    "comparison": OtherPage("Paper II and the joint model", "trusted"),
-    "epoch": OtherPage("An old calibration and new data", "fits"),
-    "plan": OtherPage("Which calibration exposures to take"),
-    "limits": OtherPage("What these data can show"),
-    "survey": OtherPage("Many nights of one instrument", "trusted"),
-    "watch": OtherPage("Is the calibration still valid?", "holds"),
-    "affected": OtherPage("Catalogues that a new calibration changes"),
-    "commissioning": OtherPage("Go or no-go", "go"),
+    "comparison": ("Paper II and the joint model", "trusted"),
+    "epoch": ("An old calibration and new data", "fits"),
+    "plan": ("Which calibration exposures to take", ""),
+    "limits": ("What these data can show", ""),
+    "survey": ("Many nights of one instrument", "trusted"),
+    "watch": ("Is the calibration still valid?", "holds"),
+    "affected": ("Catalogues that a new calibration changes", ""),
+    "commissioning": ("Go or no-go", "go"),
 }
-"""Pages by the name of their document (`io.names.DOCUMENTS`)."""
+"""Pages about no fit by the name of their document (`io.names.DOCUMENTS`): title, key that says if it is good."""
 
 
 def kind_of_run(folder: Path) -> str:
@@ -468,14 +450,13 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
 
     Raises `DataError` for a document that cannot be read or lacks contents of the page.
     """
-    page, missing = OTHERS[kind], []
+    (title, key), missing = OTHERS[kind], []
     document = RunFolder(folder).document(DOCUMENTS[kind], ("shown",))
     head = display_of(document, folder / DOCUMENTS[kind])
     pictures = _pictures(folder, kind, document, missing)
-    limits = None
-    if kind == "plan" and (folder / LIMITS).exists():
-        limits = read_limits(folder / LIMITS).display()
-    good = bool(document.get(page.trust, True)) and bool(document.get("new_trusted", True))
+    limited = kind == "plan" and (folder / LIMITS).exists()
+    limits = read_limits(folder / LIMITS).display() if limited else None
+    good = bool(document.get(key, True)) and bool(document.get("new_trusted", True))
     text = filled(
         head,
         (
@@ -485,7 +466,7 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
         ),
         good=good,
         untrusted=not document.get("trusted", document.get("new_trusted", True)),
-        title=page.title,
+        title=title,
         about="",
         first="",
         doubts=[warning for warning in document.get("warnings", ()) if warning not in head.notes],
@@ -528,12 +509,12 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
         except DataError as error:
             missing.append(f"Parameters against time are not drawn: {error}.")
         return [*results, picture("nights", functools.partial(survey_figures.nights_figure, document))]
-    names = [name for name in CAPTIONS if name.endswith(".png") and name.startswith(kind)]
-    existing = [name for name in names if (folder / name).exists()]
-    missing += [f"{name} is not there." for name in names if name not in existing]
-    one_above_the_other = kind == "watch"  # whole on a narrow screen
-    return [
-        Picture(png((folder / name).read_bytes()), CAPTIONS[name], one_above_the_other) for name in existing
+    names = {name: words for name, words in captions().items() if re.fullmatch(rf"{kind}.*\.png", name)}
+    missing += [f"{name} is not there." for name in names if not (folder / name).exists()]
+    return [  # panels of watch are below each other: whole on a narrow screen
+        Picture(embedded((folder / name).read_bytes()), words, small=kind == "watch")
+        for name, words in names.items()
+        if (folder / name).exists()
     ]
 
 

@@ -96,10 +96,9 @@ def retardance_wavelength_figure(calibration: Calibration, on: Canvas = PAGE) ->
         for n, (place, curve) in enumerate(zip(places, curves, strict=True)):
             style = ("-", "--", "-.", ":", (0, (4, 4)))[n]
             axis.plot(1e3 * line, curve, linestyle=style, color=f"C{n}", lw=1.3, label=place)
-        axis.set_title(PLATES.get(name, name), fontsize=FONT)
-        axis.set_xlabel("wavelength (nm)", fontsize=FONT)
-    axes[0, 0].set_ylabel("retardance (deg)", fontsize=FONT)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=3, loc=ABOVE)
+        axis.set(title=PLATES.get(name, name), xlabel="wavelength (nm)")
+    axes[0, 0].set_ylabel("retardance (deg)")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), frameon=False, ncols=3, loc=ABOVE)
     return figure
 
 
@@ -190,13 +189,10 @@ def transmission_figure(
         )
     below.axhline(0.0, color="0.6", lw=0.8)
     where = with_minus_sign(f"({block.x[point]:+.2f}°, {block.y[point]:+.2f}°)")
-    above.set_title(f"{where}, {filter_name}", fontsize=FONT, loc="left")
-    above.set_ylabel("share of the light", fontsize=FONT)
-    below.set_ylabel("residual (%)", fontsize=FONT)
-    below.set_xlabel("polariser angle (deg)", fontsize=FONT)
-    figure.legend(
-        *above.get_legend_handles_labels(), frameon=False, fontsize=SMALL, ncols=len(names), loc=ABOVE
-    )
+    above.set_title(f"{where}, {filter_name}", loc="left")
+    above.set_ylabel("share of the light")
+    below.set(xlabel="polariser angle (deg)", ylabel="residual (%)")
+    figure.legend(*above.get_legend_handles_labels(), frameon=False, ncols=len(names), loc=ABOVE)
     angle_ticks(below.xaxis, figure, 1)
     return figure
 
@@ -221,13 +217,12 @@ def histogram_figure(comparison: Comparison) -> Figure:
                 values = np.clip(100 * getattr(place, method)[:, k], *_RANGE)
                 axis.hist(values, bins, histtype="step", color=_COLOURS[method], label=_NAMES[method], lw=1.5)
             axis.axvline(100 * GOAL, color="0.5", lw=0.8, ls=":", label="goal 0.1 %")
-            axis.set_xscale("log")
+            axis.set(xscale="log", title=f"{QUANTITIES[k]}, {title}")
             plain_ticks(axis.xaxis)
-            axis.set_title(f"{QUANTITIES[k]}, {title}", fontsize=FONT)
-        row[0].set_ylabel("field points", fontsize=FONT)
+        row[0].set_ylabel("field points")
     for axis in axes[1]:
-        axis.set_xlabel("rms error (%); the end bins hold all beyond", fontsize=FONT)
-    axes[0, 0].legend(frameon=False, fontsize=SMALL, loc="upper right")
+        axis.set_xlabel("rms error (%); the end bins hold all beyond")
+    axes[0, 0].legend(frameon=False, loc="upper right")
     return figure
 
 
@@ -259,18 +254,17 @@ def offset_figure(comparison: Comparison) -> Figure:
             (offsets.along_three, "three", "tab:blue"),
         ):
             axis.plot(100 * along[:, c], 100 * offsets.found[:, c], ".", ms=4, color=color, label=label)
-        axis.legend(fontsize=SMALL, title="directions", title_fontsize=SMALL)
+        axis.legend(title="directions", title_fontsize=SMALL)
         edge = 105 * np.abs(offsets.found[:, c]).max()
         axis.plot([-edge, edge], [-edge, edge], color="0.6", lw=0.8)
-        axis.set_xlabel(f"Δ{name} from the weakest directions (%)", fontsize=FONT)
-        axis.set_ylabel(f"Δ{name} fitted as in Paper II (%)", fontsize=FONT)
+        words = f"Δ{name} from the weakest directions (%)", f"Δ{name} fitted as in Paper II (%)"
+        axis.set(xlabel=words[0], ylabel=words[1])
     labels = ("as published", "noise-free states", "one unpolarised\nexposure added")
     for c, name, shift in ((0, "q", -0.15), (1, "u", 0.15)):
         sizes = [np.sqrt(np.mean(v[:, c] ** 2)) for v in (offsets.found, offsets.noiseless, offsets.anchored)]
         right.bar(np.arange(3) + shift, 100 * np.array(sizes), 0.28, label=f"Δ{name}")
-    right.set_yscale("log")
+    right.set(yscale="log", ylabel="rms over the grid (%)")
     right.set_xticks(range(3), labels, fontsize=SMALL)
-    right.set_ylabel("rms over the grid (%)", fontsize=FONT)
     right.legend(fontsize=FONT)
     return figure
 
@@ -282,17 +276,15 @@ def spectral_figure(comparison: Comparison) -> Figure:
     lines = comparison.lines
     for column, label in ((2, "$m_{22}$: q to q"), (6, "$m_{33}$: u to u"), (5, "$m_{32}$: q to u")):
         left.plot(1000 * lines[:, 0], lines[:, column], label=label, lw=1.2)
-    left.set_xlabel("wavelength (nm)", fontsize=FONT)
-    left.set_title("at the corner of the field where colour matters most", fontsize=FONT)
+    left.set(xlabel="wavelength (nm)", title="at the corner of the field where colour matters most")
     left.legend(fontsize=FONT)
     spread = np.clip(100 * comparison.colours, 1e-5, None)
     bins = np.geomspace(spread.min() * 0.9, spread.max() * 1.1, 30)
     for c, name in ((0, r"$\Delta q_m$"), (1, r"$\Delta u_m$")):
         right.hist(spread[:, c], bins, histtype="step", lw=1.5, label=name)
     right.axvline(0.05, color="0.5", ls=":", lw=0.8)
-    right.set_xscale("log")
-    right.set_xlabel("largest change with the colour of a star, p = 1 % (%)", fontsize=FONT)
-    right.set_ylabel("grid points", fontsize=FONT)
+    colour = "largest change with the colour of a star, p = 1 % (%)"
+    right.set(xscale="log", xlabel=colour, ylabel="grid points")
     right.legend(fontsize=FONT)
     return figure
 

@@ -46,8 +46,9 @@ AFTER = "#2166ac"
 QUIET = "0.8"
 ABOVE: Any = "outside upper center"  # of a legend
 MOST_VECTOR = 2000  # points above which tiles are drawn as pixels
-SETTINGS: dict[Any, Any] = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.hashsalt": "walop-jax"}
-"""Beside the defaults of matplotlib; without the last no two pages of a run are the same."""
+SIZES: dict[Any, Any] = {"axes.titlesize": FONT, "axes.labelsize": FONT, "legend.fontsize": SMALL}
+SETTINGS: dict[Any, Any] = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.hashsalt": "walop-jax", **SIZES}
+"""Beside the defaults of matplotlib; without the hashsalt no two pages of a run are the same."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -171,7 +172,11 @@ class Canvas:
 
     def single(self, width: float, height: float) -> tuple[Any, Axes]:
         """A figure with one panel: `ax` itself where it is given."""
-        return self.panels(width, height) if self.ax is None else (self.ax.get_figure(), self.ax)
+        if self.ax is None:
+            return self.panels(width, height)
+        for label in (self.ax.xaxis.label, self.ax.yaxis.label):
+            label.set_fontsize(FONT)
+        return self.ax.get_figure(), self.ax
 
 
 PAGE = Canvas()
@@ -182,34 +187,27 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def draw(*args: P.args, **options: P.kwargs) -> T:
-        axes = (arg.ax for arg in (*args, *options.values()) if isinstance(arg, Canvas))
-        if any(ax is not None for ax in axes):
-            return function(*args, **options)
+        canvases = [arg for arg in (*args, *options.values()) if isinstance(arg, Canvas)]
+        if any(canvas.ax is not None for canvas in canvases):
+            with matplotlib.rc_context(SIZES):
+                return function(*args, **options)
         with own_style():
-            figure = function(*args, **options)
-            if any(isinstance(arg, Canvas) and arg.width is not None for arg in (*args, *options.values())):
-                _in_print(figure)
+            figure: Any = function(*args, **options)
+            if any(canvas.width is not None for canvas in canvases):  # all type has the size of print
+                for axis in figure.axes:
+                    axis.tick_params(axis="both", which="both", labelsize=PRINTED, length=2)
+                for text in figure.findobj(Text):
+                    if len(text.get_text()) != 1:  # but the signs of tiles
+                        text.set_fontsize(PRINTED)
             return figure
 
     return draw
 
 
-def _in_print(figure: Any) -> None:
-    """Set all type of a figure to the size of print, but for the signs of tiles."""
-    for axis in figure.axes:
-        axis.tick_params(axis="both", which="both", labelsize=PRINTED, length=2)
-    for text in figure.findobj(Text):
-        if len(text.get_text()) != 1:
-            text.set_fontsize(PRINTED)
-
-
 def field_axes(axis: Axes, title: str = "") -> None:
     """Make axes a map of the field."""
-    axis.set_title(title, fontsize=FONT)
-    axis.set_xlabel("X (deg)", fontsize=FONT)
-    axis.set_ylabel("Y (deg)", fontsize=FONT)
+    axis.set(title=title, xlabel="X (deg)", ylabel="Y (deg)", aspect="equal")
     axis.tick_params(labelsize=SMALL)
-    axis.set_aspect("equal")
 
 
 def field_limits(low: float, high: float) -> tuple[float, float]:
@@ -326,7 +324,7 @@ def calendar(axis: Axes, mjd: Any) -> bool:
     axis.xaxis.set_major_locator(locator)
     axis.xaxis.set_major_formatter(ConciseDateFormatter(locator))
     axis.xaxis.get_offset_text().set_fontsize(FONT)
-    axis.set_xlabel("date (UTC)", fontsize=FONT)
+    axis.set_xlabel("date (UTC)")
     return True
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from walop_jax.reports.style import AFTER, BEFORE, FONT, PAGE, QUIET, SMALL, Canvas, calendar, day_of, styled
+from walop_jax.reports.style import AFTER, BEFORE, PAGE, QUIET, SMALL, Canvas, calendar, day_of, styled
 from walop_jax.science.quality import ERRORS, GAIN, OUTSIDE, Limits
 from walop_jax.science.watch_found import Watch
 
@@ -71,7 +71,7 @@ def nights_figure(document: Mapping[str, Any], on: Canvas = PAGE) -> Figure:
     axis.axhspan(-2.0, 2.0, color=QUIET, lw=0)
     axis.scatter(day_of(mjd), excess, s=6, color=np.where(excess > 5.0, BEFORE, AFTER).tolist())
     _events(axis, document["events"])
-    axis.set_ylabel("(χ² − dof)/σ", fontsize=FONT)
+    axis.set_ylabel("(χ² − dof)/σ")
     calendar(axis, mjd)
     return figure
 
@@ -95,10 +95,10 @@ def watch_figure(found: Watch) -> Figure:
         axis.errorbar(time, gain, error, fmt="o", ms=3, lw=1, color=colour)
         for change in found.changes:
             axis.axvline(float(day_of(change.time)), color=BEFORE, lw=0.8, ls="--")
-        axis.set_ylabel(f"{found.cameras[k]} (%)", fontsize=FONT)
-    axes[0, 0].set_title("gain since the calibration; grey: steps too small to be detected", fontsize=FONT)
+        axis.set_ylabel(f"{found.cameras[k]} (%)")
+    axes[0, 0].set_title("gain since the calibration; grey: steps too small to be detected")
     if not calendar(axes[-1, 0], found.time):
-        axes[-1, 0].set_xlabel("number of the exposure group", fontsize=FONT)
+        axes[-1, 0].set_xlabel("number of the exposure group")
     return figure
 
 
@@ -134,7 +134,7 @@ def quality_figure(table: Any, limits: Limits) -> Figure:
         axis.set_ylabel(label, fontsize=SMALL)
         if len(names) > 1:
             above = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
-            axis.legend(ncol=len(names), fontsize=SMALL, frameon=False, **above)
+            axis.legend(ncol=len(names), frameon=False, **above)
     calendar(axes[-1, 0], night)
     return figure
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -128,52 +128,3 @@ def symbols_in_words(names: Sequence[str]) -> str:
             symbol = symbol.replace(code, letter)
         symbols += [f"{symbol} {name}"] if symbol else []
     return f" Symbols: {', '.join(symbols)}." if symbols else ""
-
-
-_RESIDUALS = "Residuals (data − model) over the field in the cameras"
-_NOISE = "noise alone has a standard deviation of about 1 σ. Tiles beyond 3 σ carry their sign."
-CAPTIONS: Mapping[str, str] = {
-    "accuracy": "Standard error of p for one exposure through {filter}, photon noise left out; the white line and the "
-    "dashed line are at the goal. Values above 3 % are shown as 3 %.",
-    "protection": "Protection level: the largest error of q and u that a single systematic error can cause at each "
-    "field point without being detected (99 %).",
-    "separation": "Standard deviations between an effect at its detection limit (row) and another fitted to imitate it "
-    "(column).",
-    "effect": f"{_RESIDUALS}, all with one colour scale: without {{effect}}, the pattern predicted by {{effect}} after "
-    f"refitting all other parameters, and with it. Combination of exposures: {{combination}}; {_NOISE}",
-    "signature": "Signature of {effect}. Dots: residuals averaged over the field, with the field pattern of the effect "
-    "in that camera as weight; errors from the scatter over the field. Line: the part explained by {effect}. Below: "
-    "the remaining residuals. Where a camera is dark its error vanishes with its light: residuals in σ change sign "
-    "there from one angle to the next.",
-    "whole": f"{_RESIDUALS}. Combination of exposures: {{combination}}; {_NOISE}",
-    "ladder": "χ² per degree of freedom from the starting model to the last. In the grey band (5 standard deviations) "
-    "a model explains the data.",
-    "rms": "Rms residual of every field point over all exposures, with the starting and with the final model, one "
-    "colour scale. Noise alone gives 0.87 with four cameras, 0.71 with two (1 where the flux is known).",
-    "shares": "Mean squared residual by group, divided by that of noise, with the starting "
-    "model (open circles) and the final model (squares).",
-    "residuals": "Rms residual of every field point over all exposures, with the instrument as designed and as fitted "
-    "(noise alone gives 1), and the distribution of the residuals of the fit with that of noise.",
-    "matrix": "Zero offset, efficiency and cross-talk over the field in per cent: q_m = m21 + m22 q + m23 u and "
-    "u_m = m31 + m32 q + m33 u, through {filter}, flat photon spectrum, calibration plate out. Ranges are given "
-    "above each map; colour scales are rounded to 1, 2 or 5 so that runs can be compared. The lines bound the "
-    "zone in which a single exposure carries almost no information on u.",
-    "matrix-errors": "Standard errors of the same, one scale; covariance of the {covariance}.",
-    "residual-map": "Residuals of the smooth model in cells of the field, of the matrix through {filter} and of the "
-    "throughput of the cameras relative to each other; χ² per degree of freedom before that correction. All of them "
-    "lie {significance} standard deviations above noise.",
-    "corner": "Posterior of the coefficients that are most correlated among those that the data constrain: contours "
-    "of 39 and 86 %, 1 and 2 σ of two coefficients together.",
-    "planned": "Error of p (%) before and after the plan: median over the instruments drawn, largest of all filters "
-    "and colours. Crosses: one exposure does not measure u there.",
-    "change": "Change of the instrument matrix over the field, new − old, in per cent.",
-    "tracks": "Parameters that change: value under the law and its error (band), values of single nights (dots), "
-    "breaks (dashed) and work on the instrument (dotted).",
-    "nights": "χ² of every night against its expectation, in standard deviations; the band is ±2.",
-    "comparison_histogram.png": "Errors of q, u and p over the field, on the grid points and between them.",
-    "comparison_map.png": "Maps of the errors of q and u of both methods.",
-    "comparison_offset.png": "Where the offsets Δq and Δu of Paper II come from.",
-    "comparison_spectral.png": "Efficiencies across the filter, and the change with the colour of a star.",
-    "watch.png": "Gain of every camera since the calibration, group by group.",
-}
-"""Captions of figures by name, and of pictures by file."""

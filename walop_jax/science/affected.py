@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.fit.verdict import Quality
@@ -79,14 +79,8 @@ class Affected(Displayed):
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
-        return {
-            "old": self.old,
-            "new": self.new,
-            "limit": self.limit,
-            "again": list(self.again),
-            "nights": [night._asdict() for night in self.nights],
-            "warnings": list(self.warnings),
-        }
+        nights = [night._asdict() for night in self.nights]
+        return dataclasses.asdict(self) | {"again": list(self.again), "nights": nights}
 
     def display(self) -> Display:
         """A line for each night, and what must be made again."""
@@ -115,50 +109,29 @@ def affected(
     A star with rows of several nights, which are one result, is one of each of them.
     """
     before, after = results_of(old, catalogue), results_of(new, catalogue)
-    beyond = np.zeros(len(before.qu), bool)
-    beyond[catalogue.star[new.beyond_settings(catalogue.points.settings)]] = True
     evening, star = night_of(catalogue.time, old.site.longitude), catalogue.star
-    dated = np.isin(star, star[np.isfinite(evening)])
+    dated, everyone = np.isin(star, star[np.isfinite(evening)]), np.arange(len(before.qu))
+    beyond = np.isin(everyone, star[new.beyond_settings(catalogue.points.settings)])
+    then, now = (~np.isnan(stars.qu).any(axis=1) for stars in (before, after))
+    every_z = shift(before, after)
+    bad = Quality.NOT_CONVERGED | Quality.UNEXPLAINED
+    verdicts = {int(np.bitwise_and.reduce(stars.flag)) & bad for stars in (before, after)}
     for night in np.unique(evening):
         rows = evening == night if np.isfinite(night) else ~dated
-        if rows.any():
-            of_night = np.isin(np.arange(len(before.qu)), star[rows])
-            yield _night(before, after, of_night, beyond, (name, float(night)), limit)
-
-
-def _night(
-    before: Stars,
-    after: Stars,
-    here: Bool[np.ndarray, " s"],
-    beyond: Bool[np.ndarray, " s"],
-    which: tuple[str, float],
-    limit: float,
-) -> NightShift:
-    measured_before, then = (~np.isnan(stars.qu).any(axis=1) & here for stars in (before, after))
-    measured_twice = measured_before & then
-    z = shift(before, after)[measured_twice]
-    weight = 1.0 / np.diagonal(before.covariance[measured_twice], axis1=1, axis2=2)
-    mean = (
-        np.average((after.qu - before.qu)[measured_twice], axis=0, weights=weight)
-        if measured_twice.any()
-        else np.zeros(2)
-    )
-    median, quantile, largest = np.quantile(z, [0.5, MOST, 1.0]) if z.size else np.zeros(3)
-    lost, gained = int((measured_before & ~then).sum()), int((then & ~measured_before).sum())
-    return NightShift(
-        *which,
-        stars=int(here.sum()),
-        median=float(median),
-        most=float(quantile),
-        largest=float(largest),
-        q=float(mean[0]),
-        u=float(mean[1]),
-        above=int((z > limit).sum()),
-        lost=lost,
-        gained=gained,
-        beyond=int((beyond & here).sum()),
-        again=bool(quantile > limit) or lost + gained > 0 or verdicts_differ(before, after),
-    )
+        if not rows.any():
+            continue
+        here = np.isin(everyone, star[rows])
+        twice = here & then & now
+        weight = 1.0 / np.diagonal(before.covariance[twice], axis1=1, axis2=2)
+        change, z = (after.qu - before.qu)[twice], every_z[twice]
+        mean = np.average(change, axis=0, weights=weight) if z.size else np.zeros(2)
+        median, most, largest = map(float, np.quantile(z, [0.5, MOST, 1.0]) if z.size else np.zeros(3))
+        lost, gained = int((here & then & ~now).sum()), int((here & now & ~then).sum())
+        yield NightShift(
+            name, float(night), int(here.sum()), median, most, largest, float(mean[0]), float(mean[1]),
+            above=int((z > limit).sum()), lost=lost, gained=gained, beyond=int((beyond & here).sum()),
+            again=most > limit or lost + gained > 0 or len(verdicts) > 1,
+        )  # fmt: skip
 
 
 def shift(before: Stars, after: Stars) -> Float[np.ndarray, " s"]:
@@ -169,10 +142,3 @@ def shift(before: Stars, after: Stars) -> Float[np.ndarray, " s"]:
     inverse = np.linalg.inv(before.covariance[measured])
     square[measured] = np.einsum("si,sij,sj->s", change[measured], inverse, change[measured])
     return np.sqrt(square)
-
-
-def verdicts_differ(before: Stars, after: Stars) -> bool:
-    """True if the bits of the verdicts, common to all stars, differ between the calibrations."""
-    bad = Quality.NOT_CONVERGED | Quality.UNEXPLAINED
-    first, second = (int(np.bitwise_and.reduce(stars.flag)) & bad for stars in (before, after))
-    return first != second

@@ -201,7 +201,13 @@ class _Application:
         plain = np.empty((len(rows), vectors.cameras, vectors.plain))
         throughput = np.empty((len(rows), vectors.cameras, vectors.cameras))
         derivative = np.empty((len(rows), 2, len(vectors.parameters)))
+        # Of (q + iu) exp(−2i R), that grows by −2i (q + iu) dR, to ROTATOR; 0 where there is none.
+        turned = 2.0 * np.where(sky[:, None], mixed[..., 1] * s[:, 2:] - mixed[..., 2] * s[:, 1:2], 0.0)
+        acting = {number: turn * turned for number, turn in vectors.turns.items()}
         for k, same in _rows_by_setting(setting_of):
+            for number, added in vectors.added(self.settings[k], x[same], y[same]).items():
+                total = acting.setdefault(number, np.zeros_like(turned))
+                total[same] += np.einsum("rs,rks->rk", s[same], added)
             local = vectors.derivatives(self.settings[k], x[same], y[same], teff[same])
             plain[same], throughput[same] = (np.einsum("rs,rksf->rkf", s[same], slopes) for slopes in local)
             gain = fitted.gain[same]
@@ -214,11 +220,16 @@ class _Application:
             plain[..., p] -= change
             derivative[..., p] -= np.einsum("rik,rk->ri", fitted.gain, change)
         if self.slope.any():
-            derivative += (fitted.gain @ _turned(s, mixed, sky)[..., None]) * self.slope
+            derivative += (fitted.gain @ turned[..., None]) * self.slope
         derivative = np.add.reduceat(-derivative, first)
-        hidden = _hidden(
-            vectors, derivative, self.shift_by_effects(rows, s, mixed, sky, fitted.gain, first, x, y)
-        )
+
+        def change_of(weights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r k"]:
+            return np.einsum("rc,rcks,rs->rk", weights, spectra, s, optimize=True)
+
+        def shift(change: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "s 2"]:
+            return calibration_shift(fitted.gain, change[..., None], star)[..., 0]
+
+        hidden = _hidden(vectors, derivative, {number: shift(change) for number, change in acting.items()})
         root = derivative @ vectors.root
         calibration = root @ root.swapaxes(1, 2)
         structure = vectors.calibration.verdict.structure
@@ -228,13 +239,6 @@ class _Application:
             gain_shift = calibration_shift(fitted.gain, lit[:, :, None] * np.eye(vectors.cameras), star)
             square = structure.gain**2 + structure.response**2 * np.sum(fitted.qu**2, axis=1)
             calibration = calibration + square[:, None, None] * (gain_shift @ gain_shift.swapaxes(1, 2))
-
-        def change_of(weights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r k"]:
-            return np.einsum("rc,rcks,rs->rk", weights, spectra, s, optimize=True)
-
-        def shift(change: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "s 2"]:
-            return calibration_shift(fitted.gain, change[..., None], star)[..., 0]
-
         nothing = np.zeros_like(calibration)
         spectrum, colour = nothing, np.zeros((len(rows), vectors.cameras, 2))
         teff_err = catalogue.teff_err[rows]
@@ -259,33 +263,6 @@ class _Application:
             flag=flag,
         )
         return _Block(rows, star, stars, fitted, on_sky, sigma, plain, throughput, colour, derivative)
-
-    def shift_by_effects(
-        self,
-        rows: Int[np.ndarray, " r"],
-        s: Float[np.ndarray, "r 3"],
-        there: Float[np.ndarray, "r k 3"],
-        sky: Bool[np.ndarray, " r"],
-        gain: Float[np.ndarray, "r 2 k"],
-        first: Int[np.ndarray, " s"],
-        x: Float[np.ndarray, " r"],
-        y: Float[np.ndarray, " r"],
-    ) -> dict[int, Float[np.ndarray, "s 2"]]:
-        """Shift of q and u of every star by effects that could hide and act on its light (`AnalysisVectors.acting`).
-
-        `s` are the Stokes parameters of the rows in the instrument frame, `there` the vectors.
-        """
-        vectors, lit = self.vectors, {}
-        for k, same in _rows_by_setting(self.setting_of[rows]):
-            for number, added in vectors.added(self.settings[k], x[same], y[same]).items():
-                total = lit.setdefault(number, np.zeros((len(rows), vectors.cameras)))
-                total[same] = np.einsum("rs,rks->rk", s[same], added)
-        for number, turn in vectors.turns.items():
-            lit[number] = lit.get(number, 0.0) + turn * _turned(s, there, sky)
-        return {
-            number: np.add.reduceat(-(gain @ change[..., None])[..., 0], first)
-            for number, change in lit.items()
-        }
 
     def outside(self, rows: Int[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:
         """Rows beyond the field of the instrument, or too far beyond that of the calibration to mean anything."""
@@ -544,19 +521,12 @@ def _disagree(
 # ---------------------------------------------------------------------------------- effects beyond the optics
 
 
-def _turned(
-    s: Float[np.ndarray, "r 3"], there: Float[np.ndarray, "r k 3"], sky: Bool[np.ndarray, " r"]
-) -> Float[np.ndarray, "r k"]:
-    """Derivative of the counts to ROTATOR: (q + iu) exp(−2i R) grows by −2i (q + iu) dR; 0 where there is none."""
-    return 2.0 * np.where(sky[:, None], there[..., 1] * s[:, 2:] - there[..., 2] * s[:, 1:2], 0.0)
-
-
 def _hidden(
     vectors: AnalysisVectors, derivative: Float[np.ndarray, "s 2 n"], acting: Mapping[int, np.ndarray]
 ) -> Float[np.ndarray, "s 2"]:
     """Largest shift of q and u by one of the mistakes that would not have been found; NaN where not computed.
 
-    `acting` are the shifts by those that act on starlight, by number: the parameters make up for a part of them.
+    `acting` are the shifts by those that act on starlight (`AnalysisVectors.acting`): parameters make up for a part.
     """
     hidden = vectors.calibration.hidden
     if hidden is None or not len(hidden):

@@ -142,12 +142,7 @@ class CatalogueCheck:
     @property
     def holds(self) -> bool:
         """True if calibration and errors stand."""
-        return self.holds_elsewhere and not self.places and not self.sky_is_left
-
-    @property
-    def sky_is_left(self) -> bool:
-        """True if polarised light of the sky is left in the stars."""
-        return self.sky is not None and self.sky.found
+        return self.holds_elsewhere and not self.places and not (self.sky is not None and self.sky.found)
 
     @property
     def holds_elsewhere(self) -> bool:

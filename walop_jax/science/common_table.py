@@ -12,8 +12,12 @@ description.
 
 from __future__ import annotations
 
+import csv
+import functools
+import io
 import os
 from collections.abc import Mapping
+from importlib.resources import files
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +32,6 @@ from walop_jax.sky.moon import sky_to_instrument
 
 REFERENCE = "Panopoulou et al. 2025, ApJS 276, 15"
 MJD_ZERO = 2400000.5
-_ERROR, _SYSTEMATIC = "stat.error;phys.polarization.stokes", "stat.error.sys;phys.polarization.stokes"
 _SAME = 1e-6  # of fractions that are computed in two ways
 _SAME_ANGLE = 1e-3  # deg, likewise
 
@@ -43,49 +46,15 @@ class CommonColumn(NamedTuple):
     needed: bool = True
 
 
-COLUMNS: Mapping[str, CommonColumn] = {
-    "Name": CommonColumn("", "meta.id;meta.main", "designation by the position, ICRS"),
-    "GaiaID": CommonColumn("", "meta.id", "source identifier, of Gaia", "SOURCE_ID", False),
-    "RAJ2000": CommonColumn("deg", "pos.eq.ra;meta.main", "right ascension, ICRS", "RA"),
-    "DEJ2000": CommonColumn("deg", "pos.eq.dec;meta.main", "declination, ICRS", "DEC"),
-    "GLON": CommonColumn("deg", "pos.galactic.lon", "Galactic longitude"),
-    "GLAT": CommonColumn("deg", "pos.galactic.lat", "Galactic latitude"),
-    "Gmag": CommonColumn("mag", "phot.mag;em.opt", "magnitude G of Gaia", "PHOT_G_MEAN_MAG", False),
-    "Plx": CommonColumn("mas", "pos.parallax.trig", "parallax", "PARALLAX", False),
-    "e_Plx": CommonColumn("mas", "stat.error;pos.parallax.trig", "standard error of Plx", "PARALLAX_ERROR", False),
-    "Filter": CommonColumn("", "meta.id;instr.filter", "filter", "FILTER"),
-    "Inst": CommonColumn("", "meta.id;instr", "instrument"),
-    "JD": CommonColumn("d", "time.epoch", "Julian date of mid-exposure, UTC", "", False),
-    "q": CommonColumn("", "phys.polarization.stokes.Q", "Q/I, north through east, IAU"),
-    "u": CommonColumn("", "phys.polarization.stokes.U", "U/I, north through east, IAU"),
-    "e_q": CommonColumn("", f"{_ERROR}.Q", "standard error of q: photons and calibration"),
-    "e_u": CommonColumn("", f"{_ERROR}.U", "standard error of u: photons and calibration"),
-    "cov_qu": CommonColumn("", "stat.covariance;phys.polarization.stokes", "covariance of q and u"),
-    "e_q_sys": CommonColumn("", f"{_SYSTEMATIC}.Q", "share of the calibration in e_q, colours included"),
-    "e_u_sys": CommonColumn("", f"{_SYSTEMATIC}.U", "share of the calibration in e_u, colours included"),
-    "cov_qu_sys": CommonColumn("", "stat.covariance;phys.polarization.stokes", "share of the calibration in cov_qu"),
-    "q_hid": CommonColumn("", f"{_SYSTEMATIC}.Q", "shift by a mistake that may hide, not in e_q", "Q_HIDDEN"),
-    "u_hid": CommonColumn("", f"{_SYSTEMATIC}.U", "shift by a mistake that may hide, not in e_u", "U_HIDDEN"),
-    "Pol": CommonColumn("", "phys.polarization.linear", "degree of polarisation, as measured", "P"),
-    "e_Pol": CommonColumn("", "stat.error;phys.polarization.linear", "standard error of Pol", "P_ERR"),
-    "PolDeb": CommonColumn("", "phys.polarization.linear", "degree of polarisation without its bias", "P_DEBIASED"),
-    "PA": CommonColumn("deg", "pos.posAng;phys.polarization.linear", "position angle, north through east, IAU", "EVPA"),
-    "e_PA": CommonColumn("deg", "stat.error;pos.posAng", "standard error of PA", "EVPA_ERR"),
-    "q_gal": CommonColumn("", "phys.polarization.stokes.Q", "q from Galactic north through Galactic east"),
-    "u_gal": CommonColumn("", "phys.polarization.stokes.U", "u from Galactic north through Galactic east"),
-    "e_q_gal": CommonColumn("", f"{_ERROR}.Q", "standard error of q_gal"),
-    "e_u_gal": CommonColumn("", f"{_ERROR}.U", "standard error of u_gal"),
-    "cov_qu_gal": CommonColumn("", "stat.covariance;phys.polarization.stokes", "covariance of q_gal and u_gal"),
-    "PA_gal": CommonColumn("deg", "pos.posAng;phys.polarization.linear", "position angle from Galactic north"),
-    "chi2": CommonColumn("", "stat.fit.chi2", "chi squared of the measurements of the star", "CHI2"),
-    "dof": CommonColumn("", "stat.fit.dof", "degrees of freedom of chi2", "DOF"),
-    "Nobs": CommonColumn("", "meta.number", "measurements that were combined", "NROWS"),
-    "Flag": CommonColumn("", "meta.code.qual", "quality bits of walop-jax, 0 is good", "FLAG"),
-}  # fmt: skip
-UNITS = {entry.of: entry.unit for entry in COLUMNS.values()} | {"ROTATOR": "deg", "MJD": "d"}
-"""Units of columns of `apply`."""
+@functools.cache
+def columns() -> Mapping[str, CommonColumn]:
+    """The columns by name, in their order (`common_table.csv`)."""
+    text = (files("walop_jax.science") / "common_table.csv").read_text("utf-8")
+    _, *rows = csv.reader(io.StringIO(text))
+    return {name: CommonColumn(*words, needed=bool(needed)) for name, *words, needed in rows}
+
+
 _WHOLE = ("dof", "Nobs", "Flag")
-_TEXTS = ("Name", "Filter", "Inst")
 
 
 def to_galactic(
@@ -108,8 +77,10 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
         if name not in present:
             raise fail("the column is missing", file=source.path, column=name, advice=advice)
 
+    units = {entry.of: entry.unit for entry in columns().values()} | {"ROTATOR": "deg", "MJD": "d"}
+
     def number(name: str) -> np.ndarray:
-        return numeric_column(source, name, Column("float", UNITS.get(name, ""), missing=np.nan))
+        return numeric_column(source, name, Column("float", units.get(name, ""), missing=np.nan))
 
     values = {
         name: number(name)
@@ -153,7 +124,7 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
         cells[f"cov_qu{end}"] = matrix[:, 0, 1]
     for end, pair in (("", qu), ("_gal", qu_gal)):
         cells[f"q{end}"], cells[f"u{end}"] = pair.T
-    for name, entry in COLUMNS.items():
+    for name, entry in columns().items():
         if name == "Filter":
             cells[name] = numeric_column(source, entry.of, Column("str", missing="SDSS-r"))[keep]
         elif name == "GaiaID" and entry.of in present:
@@ -162,15 +133,15 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
         elif entry.of in present and name not in cells:
             column = number(entry.of)[keep]
             cells[name] = column.astype(np.int64) if name in _WHOLE else column
-    columns = {
-        name: (cells[name], entry.unit, entry.about) for name, entry in COLUMNS.items() if name in cells
+    described = {
+        name: (cells[name], entry.unit, entry.about) for name, entry in columns().items() if name in cells
     }
     carried = ("CALHASH", "PESTIM", "HOLDS", "TRUSTED", "ERRFROM")
     meta = {key: source.table.meta[key] for key in carried if key in source.table.meta}
     cards = {"POLCCONV": "IAU", "TIMESYS": "UTC", "RADESYS": "ICRS", "REFERENC": REFERENCE}
-    table = astropy_table(columns, {**cards, **meta})
+    table = astropy_table(described, {**cards, **meta})
     for name, column in table.columns.items():
-        column.meta["ucd"] = COLUMNS[name].ucd
+        column.meta["ucd"] = columns()[name].ucd
     return table, tuple(remarks)
 
 
@@ -208,11 +179,11 @@ def check_common_table(table: Any) -> tuple[str, ...]:
         table = read_input_table(table, ("Pol",)).table
     faults = [
         f"{name}: the column is missing"
-        for name, entry in COLUMNS.items()
+        for name, entry in columns().items()
         if entry.needed and name not in table.colnames
     ]
     for name in table.colnames:
-        column, entry = table[name], COLUMNS.get(name)
+        column, entry = table[name], columns().get(name)
         if not column.description:
             faults.append(f"{name}: has no description")
         if entry is not None and str(column.unit or "") != entry.unit:
@@ -228,10 +199,10 @@ def check_common_table(table: Any) -> tuple[str, ...]:
 
 def _wrong_numbers(table: Any) -> tuple[str, ...]:
     """Sentences on rows whose numbers contradict each other."""
-    texts = (*_TEXTS, "GaiaID")
+    texts = ("Name", "Filter", "Inst", "GaiaID")
     c = {
         name: np.ma.filled(np.ma.asarray(table[name], float), np.nan)
-        for name in COLUMNS
+        for name in columns()
         if name in table.colnames and name not in texts
     }
     qu, p = np.stack([c["q"], c["u"]], axis=1), np.hypot(c["q"], c["u"])

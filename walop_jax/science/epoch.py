@@ -24,7 +24,7 @@ independent measurements; where neither has measured anything V vanishes, and su
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -240,10 +240,14 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
     p_value = _of_several(min(float(special.chdtrc(measured.directions, measured.chi2)), largest.p_value), 2)
     of_all = np.zeros_like(new.covariance)
     of_all[np.ix_(b, b)] = covariance
+    doubts = ["these are the data from which the old calibration was made: nothing can have moved"] * same
+    if not same and special.chdtr(measured.directions, measured.chi2) < COPIES:
+        chi2 = f"χ² = {measured.chi2:.2g} in {measured.directions} directions"
+        doubts = [f"the two data sets agree too well to be independent ({chi2}): is one a copy of the other?"]
     return Epoch(
         fits=p_value > CHANCE,
         new_trusted=result.trusted,
-        warnings=(*result.warnings, *_too_alike(measured.chi2, measured.directions, same)),
+        warnings=(*result.warnings, *doubts),
         added=added,
         same=same,
         p_value=p_value,
@@ -262,18 +266,6 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
 def _of_several(p: float, number: int) -> float:
     """Chance that the smallest of several p-values is as small (Šidák)."""
     return float(-np.expm1(number * np.log1p(-p))) if p < 1.0 else 1.0
-
-
-def _too_alike(test: float, directions: int, same: bool) -> Iterator[str]:
-    """A sentence where two sets are one, or agree better than independent ones ever do."""
-    if same:
-        yield "these are the data from which the old calibration was made: nothing can have moved"
-        return
-    if special.chdtr(directions, test) < COPIES:
-        yield (
-            f"the two data sets agree too well to be independent (χ² = {test:.2g} in {directions} directions): is one "
-            "a copy of the other?"
-        )
 
 
 def shared_parameters(old: Model, new: Model) -> list[str]:

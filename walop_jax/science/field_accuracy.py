@@ -127,13 +127,6 @@ class FieldAccuracy:
         """Median over the field."""
         return float(np.median(self.error))
 
-    @property
-    def apart_from(self) -> str:
-        """Restriction of the error of p where the data do not measure everything that matters; empty: none."""
-        if all(mistake.ahead for mistake in self.not_measured):
-            return " behind the telescope" if self.not_measured else ""
-        return " apart from quantities not measured"
-
     def document(self) -> dict[str, object]:
         """As plain data, `accuracy_of_p` of summary.json; shares, not per cent."""
         return {
@@ -148,8 +141,11 @@ class FieldAccuracy:
         """The answer in a few lines: accuracy, its limits, mistakes that could hide; of a `complete` model or not."""
         if not self.trusted:
             return (("p of a star", "not known: the calibration is not trusted"),)
-        median_error = f"{two_digits(100 * self.median)} %{self.apart_from} (median error for p ≤ 5 %)"
+        apart = " behind the telescope" if self.not_measured else ""
+        if not all(mistake.ahead for mistake in self.not_measured):
+            apart = " apart from quantities not measured"
         goal, lacks = f"{100 * self.goal:.3g} %", self.shortfalls
+        median_error = f"{two_digits(100 * self.median)} %{apart} (median error for p ≤ 5 %)"
         median_error += f"; below {goal} over {100 * self.share:.0f} % of the field"
         lines = [("p of a star", median_error if complete else f"{median_error}, if nothing were missing")]
         if complete:

@@ -98,11 +98,6 @@ class PossibleChange(NamedTuple):
         return tuple(self.name.split("+")) if self.camera else ()
 
     @property
-    def of_gain(self) -> bool:
-        """True if cameras have changed as a whole."""
-        return self.kind in ("gain", "arm")
-
-    @property
     def thing(self) -> tuple[str, str]:
         """Kind and name of the change, whatever its course in time."""
         return self.kind, self.name

@@ -59,17 +59,12 @@ def extents(catalogue: Catalogue) -> Float[np.ndarray, " s"]:
     return np.maximum(ends[0] + ends[1], ends[2] + ends[3])
 
 
-def at_several_places(catalogue: Catalogue) -> Bool[np.ndarray, " n"]:
-    """Rows of stars that are seen at several places of the field."""
-    return (extents(catalogue) > APART)[catalogue.star]
-
-
 def overlap(calibration: Calibration, catalogue: Catalogue, *, force: bool = False) -> Overlap | None:
     """Comparison of q and u of stars at several places, each row by itself; None where no star is seen so.
 
     Of more than `STAR_SAMPLE` rows the first are compared. Raises `DataError` as `apply` does.
     """
-    chosen = at_several_places(catalogue)
+    chosen = (extents(catalogue) > APART)[catalogue.star]
     chosen &= catalogue.star < np.sort(catalogue.star[chosen])[:STAR_SAMPLE].max(initial=-1) + 1
     if not chosen.any() or not np.isfinite(catalogue.rotator[chosen]).any():
         return None

@@ -280,12 +280,7 @@ def fitted(seen: Seen, camera: int, start: Place) -> Place:
     x, y, size, *edge = start
 
     def place(moved: Float[np.ndarray, " 3"]) -> Place:
-        return (
-            x + size * float(moved[0]),
-            y + size * float(moved[1]),
-            size * float(np.exp(moved[2])),
-            *edge,
-        )
+        return (x + size * float(moved[0]), y + size * float(moved[1]), size * float(np.exp(moved[2])), *edge)
 
     def misfit(moved: Float[np.ndarray, " 3"]) -> float:
         return float(moved @ moved) - share_of(seen, camera, profile(seen.x, seen.y, place(moved)))[2]

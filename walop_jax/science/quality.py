@@ -70,6 +70,16 @@ class Standard(NamedTuple):
     catalogue: Float[np.ndarray, " 2"]
     variance: Float[np.ndarray, " 2"]
 
+    @property
+    def difference(self) -> Float[np.ndarray, " 2"]:
+        """Measured less catalogue."""
+        return self.measured - self.catalogue
+
+    @property
+    def total(self) -> Float[np.ndarray, "2 2"]:
+        """Covariance of the difference."""
+        return self.covariance + np.diag(self.variance)
+
 
 def standards(calibration: Calibration) -> list[Standard]:
     """The standards of a calibration as all else has measured them; none that the data do not measure."""
@@ -91,11 +101,12 @@ def standards(calibration: Calibration) -> list[Standard]:
     return measured_stars
 
 
-def _mean(values: Sequence[float], variances: Sequence[float]) -> tuple[float, float]:
-    """Weighted mean and its standard error; NaN of nothing."""
-    if not values:
+def _mean(measured: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Weighted mean of values with variances, and its standard error; NaN of nothing."""
+    if not measured:
         return np.nan, np.nan
-    weight = 1.0 / np.array(variances)
+    values, variances = np.transpose(measured)
+    weight = 1.0 / variances
     return float(np.sum(weight * values) / weight.sum()), float(weight.sum() ** -0.5)
 
 
@@ -108,23 +119,12 @@ def numbers_of(stars: Sequence[Standard]) -> dict[str, float]:
         p = np.hypot(*star.catalogue)
         along = star.catalogue / p
         across = np.array([-along[1], along[0]])
-        total = star.covariance + np.diag(star.variance)
-        angle.append(
-            (np.rad2deg(0.5 * across @ star.measured / p), np.rad2deg(0.5 / p) ** 2 * across @ total @ across)
-        )
-        ratio.append((along @ star.measured / p, along @ total @ along / p**2))
-    zero = [
-        _mean(
-            [float((star.measured - star.catalogue)[k]) for star in zeros],
-            [float(star.covariance[k, k] + star.variance[k]) for star in zeros],
-        )
-        for k in range(2)
-    ]
-    chi2 = [
-        (d := star.measured - star.catalogue) @ np.linalg.solve(star.covariance + np.diag(star.variance), d)
-        for star in stars
-    ]
-    angles, ratios = (_mean([value for value, _ in pairs], [v for _, v in pairs]) for pairs in (angle, ratio))
+        turn = np.rad2deg(0.5 / p)
+        angle.append((np.rad2deg(0.5 * across @ star.measured / p), turn**2 * across @ star.total @ across))
+        ratio.append((along @ star.measured / p, along @ star.total @ along / p**2))
+    zero = [_mean([(float(star.difference[k]), float(star.total[k, k])) for star in zeros]) for k in range(2)]
+    chi2 = [star.difference @ np.linalg.solve(star.total, star.difference) for star in stars]
+    angles, ratios = _mean(angle), _mean(ratio)
     return {
         "NSTD": len(polarised),
         "ANGLE": angles[0],
@@ -150,10 +150,9 @@ def quality_row(
     if accuracy is None:
         field = field_accuracy(calibration)
         accuracy = {} if field is None else {"median": field.median, "hidden": field.hidden}
-    of_field = {
-        name: np.nan if (value := accuracy.get(name)) is None else float(value)
-        for name in ("median", "hidden")
-    }
+    median, hidden = (
+        np.nan if (value := accuracy.get(name)) is None else float(value) for name in ("median", "hidden")
+    )
     mjd = exposures.mjd[np.isfinite(exposures.mjd)]
     night = night_of(mjd, calibration.site.longitude)
     series = np.asarray(calibration.model.instrument(calibration.values).throughput.coefficients)[:, 0]
@@ -170,8 +169,8 @@ def quality_row(
         "TRUSTED": verdict.trusted,
         "CHI2DOF": verdict.chi2 / max(verdict.dof, 1),
         **numbers_of(standards(calibration)),
-        "ACCURACY": of_field["median"],
-        "HIDDEN": of_field["hidden"],
+        "ACCURACY": median,
+        "HIDDEN": hidden,
         **{f"{GAIN}_{name.upper()}": float(gain) for name, gain in gains},
     }
 
@@ -293,15 +292,19 @@ def _medians_before(values: Float[np.ndarray, " n"], alike: Sequence[object]) ->
     return medians
 
 
-def append(path: str | os.PathLike[str], new: Any, limits: Limits) -> tuple[Any, list[str]]:
+def append(path: str | os.PathLike[str] | None, new: Any, limits: Limits) -> tuple[Any, list[str]]:
     """Add nights to the table in a file, which is made if it is not there; the whole table, and remarks.
 
-    Nothing is lost where it is killed, and of two processes the second one is notified of the first.
+    Nothing is lost where it is killed, and of two processes the second one is notified of the first. Without a file
+    the table is that of the new nights.
     """
+    if path is None:
+        table, remarks = joined(new[:0], new)
+        return judge(table, limits), remarks
     table_format(path)
     target = check_output(path, overwrite=True)
     with locked(target.parent / f".walop-quality-{target.name}-lock", path):
-        table, remarks = joined(read_nights(target), new) if target.exists() else joined(new[:0], new)
+        table, remarks = joined(read_nights(target) if target.exists() else new[:0], new)
         table = judge(table, limits)
         write_table(target, table, overwrite=True)
     return table, remarks

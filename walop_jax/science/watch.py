@@ -560,7 +560,8 @@ class Watching:
             variances = np.diag(blocks[:, k, :, k])
             gain[:, k] = slopes[:, k] / np.where(variances > 0, variances, np.inf)
             for change in changes:
-                may = [e for e in change.alike if e.of_gain and self.cameras[k] in e.members]
+                of_gain = (entry for entry in change.alike if entry.kind in ("gain", "arm"))
+                may = [entry for entry in of_gain if self.cameras[k] in entry.members]
                 mine = min(may, key=lambda entry: len(entry.name), default=None)
                 gain[:, k] += 0.0 if mine is None else mine.size * mine.history.over(self.time)
             error[:, k] = np.where(variances > 0, variances, np.nan) ** -0.5

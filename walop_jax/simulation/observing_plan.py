@@ -300,13 +300,9 @@ class ObservingPlan:
             x = np.linspace(0.0, self.field, self.grid)
             y = np.zeros_like(x)
         else:
-            edge = np.linspace(-self.field, self.field, self.grid) if self.grid > 1 else np.zeros(1)
-            y, x = (a.ravel() for a in np.meshgrid(edge, edge, indexing="ij"))
+            x, y = _square(self.field, self.grid)
         if self.standards:
-            n = self.standard_grid
-            last = round(_STANDARD_EDGE * self.field, 9)
-            edge = np.linspace(-last, last, n) if n > 1 else np.zeros(1)
-            star_y, star_x = (a.ravel() for a in np.meshgrid(edge, edge, indexing="ij"))
+            star_x, star_y = _square(round(_STANDARD_EDGE * self.field, 9), self.standard_grid)
             x, y = np.append(x, star_x), np.append(y, star_y)
         if self.zero_stars:
             spread = np.mod(np.arange(1, self.zero_stars + 1)[:, None] * _SPREAD, 1.0)
@@ -435,6 +431,12 @@ class ObservingPlan:
             cameras=self.design.cameras.names,
             units=self.design.units,
         )
+
+
+def _square(edge: float, count: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Places of a square raster out to ± edge, or its centre; X runs fastest."""
+    side = np.linspace(-edge, edge, count) if count > 1 else np.zeros(1)
+    return np.tile(side, count), np.repeat(side, count)
 
 
 def filter_curve(curve: str | FilterCurve) -> FilterCurve:

@@ -32,12 +32,15 @@ from walop_jax.data.checks import EPHEMERIS_MJD
 from walop_jax.data.records import Site
 from walop_jax.io.errors import fail
 
+Values = Float[np.ndarray, " e"]
+"""One of every exposure; angles in degrees, times in UTC days (MJD)."""
+
 
 def moon_sky(
-    mjd: Float[np.ndarray, " e"],
-    ra: Float[np.ndarray, " e"],
-    dec: Float[np.ndarray, " e"],
-    rotator: Float[np.ndarray, " e"],
+    mjd: Values,
+    ra: Values,
+    dec: Values,
+    rotator: Values,
     site: Site,
     x: Float[np.ndarray, " p"],
     y: Float[np.ndarray, " p"],
@@ -53,9 +56,7 @@ def moon_sky(
     return rayleigh_sky(*body_direction("moon", mjd, site), ra, dec, rotator, x, y)
 
 
-def body_direction(
-    name: str, mjd: Float[np.ndarray, " e"], site: Site
-) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
+def body_direction(name: str, mjd: Values, site: Site) -> tuple[Values, Values]:
     """Return right ascension and declination (degrees, GCRS axes) of the Moon, or the Sun, as seen from the site.
 
     The Moon is 60 Earth radii away: its parallax of up to a degree makes the site matter. `mjd` in UTC days.
@@ -89,9 +90,7 @@ def body_direction(
         return np.asarray(body.ra.deg, dtype=np.float64), np.asarray(body.dec.deg, dtype=np.float64)
 
 
-def altitude(
-    mjd: Float[np.ndarray, " e"], ra: Float[np.ndarray, " e"], dec: Float[np.ndarray, " e"], site: Site
-) -> Float[np.ndarray, " e"]:
+def altitude(mjd: Values, ra: Values, dec: Values, site: Site) -> Values:
     """Return the altitude (deg) of directions (deg) at UTC days, without refraction, to the precession since 2000.
 
     sin h = sin φ sin δ + cos φ cos δ cos H, H the hour angle (Meeus 1998, Astronomical Algorithms, equation 13.6).
@@ -103,11 +102,8 @@ def altitude(
 
 
 def offset_direction(
-    ra: Float[np.ndarray, " e"],
-    dec: Float[np.ndarray, " e"],
-    position_angle: Float[np.ndarray, " e"],
-    separation: Float[np.ndarray, " e"],
-) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
+    ra: Values, dec: Values, position_angle: Values, separation: Values
+) -> tuple[Values, Values]:
     """Return right ascension and declination of the points that far from others, north through east; all in degrees."""
     from astropy.coordinates import offset_by
 
@@ -115,7 +111,7 @@ def offset_direction(
     return np.mod(direction[0].deg, 360.0), np.asarray(direction[1].deg)
 
 
-def local_sidereal_time(mjd: Float[np.ndarray, " e"], longitude: float) -> Float[np.ndarray, " e"]:
+def local_sidereal_time(mjd: Values, longitude: float) -> Values:
     """Return the local mean sidereal time (deg) at UTC days and a longitude (deg, east positive), to a few arcsec.
 
     Source: Meeus 1998, Astronomical Algorithms, equation 12.4, without its terms in T². UTC stands for UT1, so that the
@@ -141,11 +137,11 @@ def _offline() -> Iterator[None]:
 
 
 def rayleigh_sky(
-    moon_ra: Float[np.ndarray, " e"],
-    moon_dec: Float[np.ndarray, " e"],
-    ra: Float[np.ndarray, " e"],
-    dec: Float[np.ndarray, " e"],
-    rotator: Float[np.ndarray, " e"],
+    moon_ra: Values,
+    moon_dec: Values,
+    ra: Values,
+    dec: Values,
+    rotator: Values,
     x: Float[np.ndarray, " p"],
     y: Float[np.ndarray, " p"],
 ) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e"]]:

@@ -41,7 +41,7 @@ import numpy as np
 
 from walop_jax.io.code import classes_of
 from walop_jax.io.errors import fail
-from walop_jax.io.text import parse_toml
+from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.effects.change import Change
 from walop_jax.model.effects.entry import NO_STANDARD, Entry, Member, Named
@@ -159,11 +159,7 @@ def _texts(value: Any) -> tuple[str, ...]:
 
 def own_entries(path: str | os.PathLike[str]) -> tuple[EffectKind, ...]:
     """The effects of a user's TOML file. Raises `DataError`, with file, entry and key, for invalid entries."""
-    try:
-        with open(path, encoding="utf-8") as file:
-            text = file.read()
-    except OSError as error:
-        raise fail(f"cannot be read: {error.strerror}", file=path) from error
+    text = read_text(path)
     try:
         return entries(parse_toml(text))
     except ValueError as error:

@@ -81,31 +81,26 @@ def _harmonic(wave: str, order: str, prefix: str) -> Factor:
 
 def _span(start: str, stop: str) -> Factor:
     """1 from one time to another (hours since the first exposure), 0 elsewhere."""
-    words = f"from {start} to {stop} h after the first exposure"
-
-    def value(at: Any, _: Units) -> Any:
-        return ((at.hours >= float(start)) & (at.hours < float(stop))) * 1.0
-
-    return Factor(f"hours {start} to {stop}", EXPOSURE, words, ONCE_MORE, value, "hours", (start, stop))
+    return Factor(
+        f"hours {start} to {stop}", EXPOSURE, f"from {start} to {stop} h after the first exposure", ONCE_MORE,
+        lambda at, _: ((at.hours >= float(start)) & (at.hours < float(stop))) * 1.0, "hours", (start, stop),
+    )  # fmt: skip
 
 
 def _exposure(number: str) -> Factor:
     """1 in one exposure of the list, counted from 0; 0 in all others."""
-    words = f"in exposure {number} of the list (the first is 0)"
-
-    def value(at: Any, _: Units) -> Any:
-        return (at.number == int(number)) * 1.0
-
-    return Factor(f"exposure {number}", EXPOSURE, words, ONCE_MORE, value, "exposure", (number,))
+    return Factor(
+        f"exposure {number}", EXPOSURE, f"in exposure {number} of the list (the first is 0)", ONCE_MORE,
+        lambda at, _: (at.number == int(number)) * 1.0, "exposure", (number,),
+    )  # fmt: skip
 
 
 def _kind(name: str) -> Factor:
     """1 in exposures of a KIND, 0 in all others."""
-    test = "the same field points in exposures of another KIND"
-    words = f"in exposures of KIND {name}"
     return Factor(
-        f"kind {name}", EXPOSURE, words, test, lambda at, _: at.of_kind(name) * 1.0, "kind", (name,)
-    )
+        f"kind {name}", EXPOSURE, f"in exposures of KIND {name}", "the same field points in exposures of another KIND",
+        lambda at, _: at.of_kind(name) * 1.0, "kind", (name,),
+    )  # fmt: skip
 
 
 def _side(prefix: str) -> Factor:
@@ -157,8 +152,9 @@ FORMS: Mapping[str, tuple[str, Callable[..., Factor]]] = {
 # ------------------------------------------------------------------------------------------------------ plain ones
 
 
-def _plain() -> Mapping[str, Factor]:
-    factors = (
+PLAIN: Mapping[str, Factor] = {
+    item.text: item
+    for item in (
         Factor("x", FIELD, f"growing with X {AT}", MORE_POINTS, lambda at, units: at.x / units.field),
         Factor("y", FIELD, f"growing with Y {AT}", MORE_POINTS, lambda at, units: at.y / units.field),
         Factor(
@@ -210,11 +206,8 @@ def _plain() -> Mapping[str, Factor]:
             "counts", COUNTS, "growing with the counts (at 10⁶ electrons)", "the same exposures at another flux",
             lambda at, _: 1.0,
         ),
-    )  # fmt: skip
-    return {item.text: item for item in factors}
-
-
-PLAIN = _plain()
+    )
+}  # fmt: skip
 """Factors without a number of their own, by text."""
 
 

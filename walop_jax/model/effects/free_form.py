@@ -18,6 +18,7 @@ Revealed by any data that no model explains
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any, ClassVar, Self
 
@@ -140,30 +141,15 @@ class FreeForm(Effect):
 
     def labels(self, field: str) -> Sequence[str]:
         """Names such as "vectors.n0.q.p12"; "harmonics.n3.4theta.sin.p10"; "exposures.7.n1" counts positions."""
-        if not getattr(self, field).size:
-            return []
-        if field == "exposures":
-            return [
-                f"{field}.{i}.{camera}"
-                for i in range(len(self.exposures))
-                for camera in _cameras(self.exposures.shape[1])
-            ]
-        if field == "fine":
-            inner = _tags(_FINE_TERMS)
-        elif field == "vectors":
-            inner = [f"{element}.{tag}" for element in "qu" for tag in _tags(_SMOOTH_TERMS)]
-        else:
-            inner = [
-                f"{h}theta.{wave}.{tag}"
-                for h in HARMONICS
-                for wave in ("cos", "sin")
-                for tag in _tags(_GRADIENT_TERMS)
-            ]
-        return [
-            f"{field}.{camera}.{suffix}"
-            for camera in _cameras(getattr(self, field).shape[0])
-            for suffix in inner
-        ]
+        shape = getattr(self, field).shape
+        waves = [f"{h}theta.{wave}" for h in HARMONICS for wave in ("cos", "sin")]
+        parts: Sequence[Sequence[str]] = {
+            "vectors": (_cameras(shape[0]), "qu", _tags(_SMOOTH_TERMS)),
+            "harmonics": (_cameras(shape[0]), waves, _tags(_GRADIENT_TERMS)),
+            "fine": (_cameras(shape[0]), _tags(_FINE_TERMS)),
+            "exposures": ([str(i) for i in range(shape[0])], _cameras(shape[1])),
+        }[field]
+        return [".".join((field, *label)) for label in itertools.product(*parts)]
 
     def patch(self, instrument: Instrument) -> Instrument:
         """Add the blocks: smooth and fine patterns to the cameras, harmonics and single exposures to the exposures."""

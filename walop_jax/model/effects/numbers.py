@@ -26,9 +26,9 @@ from walop_jax.model.effects.change import (
 from walop_jax.model.effects.factors import EXPOSURE, FIELD, WAVELENGTH
 from walop_jax.model.elements.wave_plate import Grown, WavePlate
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.light_path import NoSuchPlaceError
-from walop_jax.model.parameters import unknown_name
-from walop_jax.model.sources import ExposureArrays, MoonPatches, StandardChange, Standards
+from walop_jax.model.light_path import NoSuchPlaceError, Scalar
+from walop_jax.model.parameters import Component, unknown_name
+from walop_jax.model.sources import ExposureArrays, MoonPatches, Standards
 
 OF_QU = ("polarisation q", "polarisation u")
 OF_SOURCES = (*OF_QU, "polarisation")
@@ -37,13 +37,6 @@ PLACES = {
     "rotator": {SKY: ("", "rotator_zero"), Standards.name: (Standards.name, "angle")},
 }
 """Places of numbers of the instrument as a whole: their part, and its field."""
-
-
-def _number(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    """Add to a number of the polariser, which has the name of the kind."""
-    for change, size in terms:
-        instrument = instrument.changed(change.place, **{change.kind: add(size)})
-    return instrument
 
 
 _FIELD = ("even", "tilt", "r2")
@@ -63,8 +56,11 @@ def _with_ray(instrument: Instrument, change: Change) -> Grows:
     return Grows((FIELD, WAVELENGTH, EXPOSURE), moves or "", tried)
 
 
-def _of_plate(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    """Add to a number of a wave plate, or of one of its layers: a constant, or an amplitude with factors."""
+def _number(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+    """Add to a number with the name of the kind: of the polariser, of a wave plate or of one of its layers.
+
+    With factors, that of a plate grows.
+    """
     for change, size in terms:
         if not change.factors:
             instrument = instrument.changed(change.place, **{change.kind: add(size)})
@@ -134,9 +130,12 @@ def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return instrument
 
 
-class GrownStandard(StandardChange):
-    """A change of a standard with time, or from filter to filter."""
+class GrownStandard(Component):
+    """Change of q (axis 0) or u (1) of one value of a standard with time, or from filter to filter."""
 
+    size: Scalar
+    value: int = eqx.field(static=True)
+    axis: int = eqx.field(static=True)
     change: Change = eqx.field(static=True)
 
     def factor(self, exposures: ExposureArrays) -> Float[Array, " e"]:
@@ -155,7 +154,7 @@ def _slots_of_source(instrument: Instrument, change: Change) -> list[SlotTerm]:
 NUMBERS = {"axis": "angle", "cut": "angle", "thickness": "length", "thermal": "number"}
 """Numbers of wave plates and of their layers (µm, deg), with their amplitudes."""
 KINDS |= {
-    name: Kind(amplitude, _of_plate, grows=_with_ray, slots=itself("number"))
+    name: Kind(amplitude, _number, grows=_with_ray, slots=itself("number"))
     for name, amplitude in NUMBERS.items()
 }
 OF_POLARISER = ("extinction", "ellipticity")

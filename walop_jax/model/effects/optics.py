@@ -121,8 +121,9 @@ class Terms(Element):
         return matrix_of(sizes, ray.x, ray.y)
 
 
-class PolariserFilm(Component):
-    """Changes of the polariser: a layer directly behind it, at its angle and only when it is in."""
+class Film(Component):
+    """Changes of light that vary from exposure to exposure: of that from the sky, ahead of the polariser, or of that
+    behind the polariser, at its angle and only when it is in."""
 
     amplitudes: tuple[Scalar, ...]
     changes: tuple[Change, ...] = eqx.field(static=True)
@@ -133,7 +134,13 @@ class PolariserFilm(Component):
         """Stokes vectors behind it at a field point, one per exposure."""
         terms = zip(self.changes, self.amplitudes, strict=True)
         sizes = [(change, size * in_exposures(change, exposures, x, y)) for change, size in terms]
-        return jnp.einsum("est,et->es", matrix_of(sizes, x, y), light)
+        acting = [(change, size) for change, size in sizes if change.kind not in ADDED]
+        if acting:
+            light = jnp.einsum("est,et->es", matrix_of(acting, x, y), light)
+        for change, size in sizes:
+            if change.kind in ADDED:
+                light = light.at[:, 1 + "qu".index(change.kind[-1])].add(size * light[:, 0])
+        return light
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,26 +152,6 @@ class Inside:
     def __call__(self, at: Any) -> Any:
         """Its value in every exposure."""
         return np.isfinite(at.angle(self.prefix)) * 1.0
-
-
-class SkyFilm(PolariserFilm):
-    """Changes of light from the sky ahead of the polariser, variable from exposure to exposure."""
-
-    def through(
-        self, light: Float[Array, "e 4"], exposures: ExposureArrays, x: Scalar, y: Scalar
-    ) -> Float[Array, "e 4"]:
-        """Stokes vectors of light from the sky at a field point, one per exposure."""
-        sizes = [
-            (change, size * in_exposures(change, exposures, x, y))
-            for change, size in zip(self.changes, self.amplitudes, strict=True)
-        ]
-        acting = [(change, size) for change, size in sizes if change.kind not in ADDED]
-        if acting:
-            light = jnp.einsum("est,et->es", matrix_of(acting, x, y), light)
-        for change, size in sizes:
-            if change.kind in ADDED:
-                light = light.at[:, 1 + "qu".index(change.kind[-1])].add(size * light[:, 0])
-        return light
 
 
 class Displaced(Element):
@@ -243,6 +230,10 @@ def _is_ahead(instrument: Instrument, change: Change) -> bool:
     return polariser is not None and change.where == "ahead of" and change.place == polariser.name
 
 
+def _with_sky_film(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
+    return instrument.changed("", sky_films=lambda films: (*films, Film(**_columns(terms))))
+
+
 def _differs(instrument: Instrument, terms: Sequence[Term]) -> bool:
     """True for changes ahead of the polariser that vary from exposure to exposure."""
     with_exposure = any(item.depends_on == EXPOSURE for change, _ in terms for item in change.grows_with)
@@ -253,10 +244,9 @@ def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """One more element at the place; in the beam together with a moving element or polariser of that place."""
     change, polariser = terms[0][0], instrument.polariser
     if _differs(instrument, terms):
-        return instrument.changed("", sky_films=lambda films: (*films, SkyFilm(**_columns(terms))))
+        return _with_sky_film(instrument, terms)
     if change.where == "of" and polariser is not None and change.place == polariser.name:
-        film = PolariserFilm(**_columns(terms))
-        return instrument.changed(change.place, films=lambda films: (*films, film))
+        return instrument.changed(change.place, films=lambda films: (*films, Film(**_columns(terms))))
     moves = instrument.element(change.place).moves if change.where == "of" else None
     element = Terms(name="described", moves=moves, **_columns(terms))
     return beside(instrument, element, change.where, change.place)
@@ -279,8 +269,8 @@ def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
 def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """(0, q, u, 0) per unit of light added, as mirrors of a telescope do to weakly polarised light."""
     if _is_ahead(instrument, terms[0][0]) and any(change.factors for change, _ in terms):
-        return instrument.changed("", sky_films=lambda films: (*films, SkyFilm(**_columns(terms))))
-    components: dict[str, Any] = {"q": jnp.zeros(()), "u": jnp.zeros(())}
+        return _with_sky_film(instrument, terms)
+    components: dict[str, Any] = dict.fromkeys("qu", jnp.zeros(()))
     for item, size in terms:
         components[item.kind[-1]] = components[item.kind[-1]] + size
     element = AddedPolarisation(name="described", **components)

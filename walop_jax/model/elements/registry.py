@@ -7,40 +7,26 @@ from collections.abc import Sequence
 
 from walop_jax.io.code import classes_of
 from walop_jax.io.errors import fail
+from walop_jax.model.elements import geometry, simple, spectral, wave_plate
 from walop_jax.model.elements.base import Element
-from walop_jax.model.elements.geometry import PupilMapping, Wedge
-from walop_jax.model.elements.simple import (
-    AddedPolarisation,
-    Analyser,
-    AnalysisVector,
-    Collimator,
-    Depolariser,
-    Diattenuator,
-    Polariser,
-    RadialRetarder,
-    Retarder,
-    Rotator,
-)
-from walop_jax.model.elements.spectral import FieldDiattenuator, Mirror, SpectralElement
-from walop_jax.model.elements.wave_plate import WavePlate
 
 ELEMENTS: tuple[type[Element], ...] = (
-    Polariser,
-    Collimator,
-    RadialRetarder,
-    PupilMapping,
-    Wedge,
-    WavePlate,
-    Retarder,
-    Rotator,
-    Diattenuator,
-    Depolariser,
-    AddedPolarisation,
-    SpectralElement,
-    FieldDiattenuator,
-    Mirror,
-    AnalysisVector,
-    Analyser,
+    simple.Polariser,
+    simple.Collimator,
+    simple.RadialRetarder,
+    geometry.PupilMapping,
+    geometry.Wedge,
+    wave_plate.WavePlate,
+    simple.Retarder,
+    simple.Rotator,
+    simple.Diattenuator,
+    simple.Depolariser,
+    simple.AddedPolarisation,
+    spectral.SpectralElement,
+    spectral.FieldDiattenuator,
+    spectral.Mirror,
+    simple.AnalysisVector,
+    simple.Analyser,
 )
 
 

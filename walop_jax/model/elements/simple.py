@@ -178,7 +178,7 @@ class Polariser(Element):
     extinction: Scalar = number(unit="", about="ε, unwanted over wanted transmission")
     zero: Scalar | None = number(unit="deg", about="added to the encoder reading", default=None)
     ellipticity: Scalar | None = number(unit="", about="circular polarisation behind it", default=None)
-    films: tuple[Any, ...] = ()  # layers behind it (`effects.optics.PolariserFilm`)
+    films: tuple[Any, ...] = ()  # layers behind it (`effects.optics.Film`)
 
     kind: ClassVar[str] = "polariser"
     reference: ClassVar[str] = "Goldstein 2003, Polarized Light, ch. 9"
