@@ -8,7 +8,7 @@ import functools
 import inspect
 import types
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any, ForwardRef, get_args, get_origin
 
 import jaxtyping
 from beartype import BeartypeConf, beartype
@@ -76,7 +76,10 @@ def _resolved(annotation: Any, function: Callable[..., Any]) -> Any:
     key = function.__module__, annotation
     if key not in _RESOLVED:
         try:
-            _RESOLVED[key] = eval(annotation, function.__globals__, vars(builtins))
+            hint = eval(annotation, function.__globals__, vars(builtins))
         except Exception:
             return Any
+        while get_origin(hint) is Annotated:
+            hint = get_args(hint)[0]
+        _RESOLVED[key] = Any if isinstance(hint, ForwardRef) else hint
     return _RESOLVED[key]

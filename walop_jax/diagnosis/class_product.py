@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.score import Matrix, Vector
 from walop_jax.fit.refit import FitResult

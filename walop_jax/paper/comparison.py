@@ -20,10 +20,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.accuracy import LARGEST_P, STARS, sample_stars
+from walop_jax.calibration.accuracy import GOAL, LARGEST_P, SMALLEST_DETERMINANT, STARS, sample_stars
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.thresholds import GOAL, SMALLEST_DETERMINANT
 from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import DEFAULT_FILTER, Settings

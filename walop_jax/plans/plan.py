@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.inspection import about_exposures
 from walop_jax.data.user_tables import InputTable
 from walop_jax.io.display import Display, Displayed

@@ -352,10 +352,6 @@ class InExposures:
         """Positions in the list."""
         return np.arange(len(self.exposures.hours))
 
-    def of_kind(self, name: str) -> Any:
-        """True in exposures of a KIND."""
-        return self.exposures.of_kind(name)
-
     def angle(self, prefix: str) -> Any:
         """Angle (rad) of the polariser or of another moving element; NaN where it is out."""
         angle = self.exposures.clp_angle

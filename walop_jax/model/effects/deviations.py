@@ -60,10 +60,10 @@ class Deviations(Effect):
     """Deviations from descriptions: any change of polarisation at some places, cubic over the field; other changes."""
 
     sizes: Float[Array, "a g p"] = param(
-        unit="", about="share, or retardance in rad", source=f"{SOURCE}; width: expected size", width=0.003
+        "", "share, or retardance in rad", f"{SOURCE}; width: expected size", width=0.003
     )
     amounts: Float[Array, " n"] = param(
-        unit="", about="amplitude of another change", source=f"{SOURCE}; width: that of its kind", width=1.0
+        "", "amplitude of another change", f"{SOURCE}; width: that of its kind", width=1.0
     )
     places: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
     sentences: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
