@@ -200,10 +200,10 @@ MOST_LINES = {
     "calibration": 2655,
     "posterior": 2205,
     "science": 6110,
-    "diagnosis": 7650,
+    "diagnosis": 7580,
     "nights": 2810,
-    "plans": 2315,
-    "paper": 815,
+    "plans": 2305,
+    "paper": 810,
     "reports": 2860,
     "commands": 4645,
 }
